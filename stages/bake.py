@@ -186,19 +186,18 @@ def run(job: Job) -> None:
 
 def _size_limit(job: Job, s: Scene, *, whole: bool) -> float:
     """MiB that the asset may have; where it is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other cores."""
-    from stages.baking.resolution import budget_of, timed_budget
+    from stages.baking.resolution import size_limits
     from stages.cores import count_cores
     from stages.scratch import note, noted
 
     settings: BakeSettings = job.settings
-    packed, seconds = settings.layout == "packed", given(settings.time_budget)
-    mib = budget_of(s, given(settings.max_mib), packed=packed)
+    seconds = given(settings.time_budget)
+    mib, timed = size_limits(settings, s, job.device, count_cores(), whole=whole)
     if seconds is None or settings.max_mib != "auto" or job.device != "cpu":
         return mib
     found = noted(job.work / SIZE_NOTE, float, job.warn)
     if found is not None:
         return found
-    timed = timed_budget(mib, seconds, count_cores(), whole=whole, packed=packed)
     if timed < mib:
         job.say(f"of {mib:g} MiB, about {timed:.3g} can be refined in {seconds:g} s")
     note(job.work / SIZE_NOTE, timed)

@@ -50,6 +50,7 @@ from stages.scratch import note, noted, once
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
+    from stages.memory.need import Need
 
 MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
 MAX_FIELD_RAYS = 400_000  # of all of them together, then
@@ -90,6 +91,7 @@ Measured = str | float | dict[str, int | float | None] | None  # the name of a v
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset import format
+    from stages.memory.need import refuse_what_does_not_fit
 
     inputs = inputs_of(EvaluateInputs, job.inputs)
 
@@ -99,25 +101,23 @@ def run(job: Job) -> None:
         return load_renderer(inputs.train.folder, job.device)
 
     tree = format.load(inputs.bake.asset).to(job.device)
-    _refuse_large_views(tree, inputs, job)
+    refuse_what_does_not_fit(job, needed(tree, job.settings, inputs, job.device), "Lower poses.max_image_size or bake.max_mib.")
     region = read_json(inputs.mesh.report).get("region", "foreground")
     evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree), refinement_of(inputs.bake))
 
 
-def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> None:
-    """UsageError where views of this size do not fit into memory."""
+def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
+    """What comparing its views with photographs takes of memory."""
     from stages.io.scene import load
-    from stages.memory.need import refuse_what_does_not_fit
     from stages.memory.rendering import views_needed
 
     cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
-    scale = given(job.settings.field_image_scale)
+    scale = given(settings.field_image_scale)
     most = max(camera.width * camera.height for camera in cameras)
     rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
-    if job.settings.strips == "on":
+    if settings.strips == "on":
         rays = max(rays, min(most, STRIP_RAYS))
-    need = views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, job.device, mesh=mesh_bytes(inputs.mesh))
-    refuse_what_does_not_fit(job, need, "Lower poses.max_image_size or bake.max_mib.")
+    return views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, device, mesh=mesh_bytes(inputs.mesh))
 
 
 def evaluate(

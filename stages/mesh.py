@@ -21,9 +21,11 @@ from stages.meshing.timing import Stopwatch
 
 if TYPE_CHECKING:
     from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import NerfTree
     from efficientnerf.surface.agreement import AssetView
     from efficientnerf.surface.mesh import Mesh
     from stages.io.exporters.writing import SourceFrame
+    from stages.memory.need import Need
 
 
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
@@ -207,6 +209,14 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
     job.say("no faces", faces=0, components=0, watertight=False)
 
 
+def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
+    """What meshing and texturing it take of memory."""
+    from stages.memory.surface import surface_needed
+
+    texture = 0 if settings.texture == "off" else settings.texture_size
+    return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
+
+
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
@@ -215,7 +225,6 @@ def run(job: Job) -> None:
     from stages.io.exporters.writing import source_frame
     from stages.io.png import write_png
     from stages.memory.need import refuse_what_does_not_fit
-    from stages.memory.surface import surface_needed
 
     outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
     refuse_normal_map_without_texture(settings)
@@ -223,10 +232,7 @@ def run(job: Job) -> None:
     whole = load(inputs.bake.asset)
     tree = restricted(whole, settings.region)
     frame = source_frame(tree.metadata)
-    need = surface_needed(
-        tree, texture=0 if settings.texture == "off" else settings.texture_size, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map
-    )
-    refuse_what_does_not_fit(job, need, "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
+    refuse_what_does_not_fit(job, needed(tree, settings, inputs), "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
     seen: list[AssetView] = []
     share = 1.0 if settings.texture == "off" else SURFACE_SHARE
     border = whole.region if settings.region == "foreground" else None

@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.stage import Stage
 from stages.memory.disk import space_needed
+from stages.memory.plan import memory_needed
 
 
 @dataclass(frozen=True)
@@ -20,12 +21,14 @@ class Workflow:
     presets  the folder of its presets, TOML files
     child    the module that runs its stages in processes of their own; see `pipeline.executors.serving`
     space    (stage, run, its sources, settings by stage, bytes of memory or None) -> bytes that the stage writes
+    memory   (stage, run, its sources, settings by stage, device) -> bytes that the stage takes; None: not known, it has a share of its worker's
     """
 
     stages: tuple[Stage, ...]
     presets: Path
     child: str = "workflows.fleet.child"
     space: Callable[[str, Path, Sequence[Path], Mapping[str, Any], int | None], int] = lambda *_: 0
+    memory: Callable[[str, Path, Sequence[Path], Mapping[str, Any], str], int | None] = lambda *_: None
 
 
 # Modules of `stages`, in order.
@@ -40,4 +43,4 @@ NAMES = (
     "points",  # bake -> PLY
 )
 STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}").STAGE for name in NAMES)
-WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets", space=space_needed)
+WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets", space=space_needed, memory=memory_needed)

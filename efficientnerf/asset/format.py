@@ -21,6 +21,7 @@ from efficientnerf.asset.file.layouts import LAYOUTS
 from efficientnerf.asset.file.memory import check_memory, needed
 from efficientnerf.asset.file.metadata import MAJOR, STEP_MINOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of, step_size_of
 from efficientnerf.asset.file.serialisation import WRITERS, written_as
+from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import STEP_SIZE, NerfTree
 
 __all__ = ["LAYOUTS", "WRITERS", "FormatError", "contents", "describe", "load", "save", "serialize"]
@@ -242,6 +243,40 @@ def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]
         name: {"dtype": header.tensors[name][0], "shape": list(header.tensors[name][1]), "sha256": digests.get(name)} for name in _tensors_of(header.meta)
     }
     return {key: value for key, value in header.meta.items() if key != "sha256"}, tensors
+
+
+def outline(path: str | Path) -> NerfTree:
+    """The tree of a file with arrays that have their sizes and no values, from the header alone: for what it will take of memory."""
+    header = _open(path)
+    name, meta = header.name, header.meta
+    shapes, kinds = _held(header)
+    bricks, brick = _bricks(shapes), int(meta["brick"])
+    voxels = bricks * brick**3 if layout_of(meta) == "full" else shapes["voxel.density"][0]
+    harmonics: np.ndarray | PaletteHarmonics = _sized((voxels, (int(meta["sh_degree"]) + 1) ** 2, 3), "<f4")
+    if "voxel.base" in shapes:
+        tables = _sized(shapes["base.table"], "<f4"), _sized(shapes["voxel.sh"], kinds["voxel.sh"]), _sized(shapes["sh.palette"], "<f4")
+        harmonics = PaletteHarmonics(_sized(shapes["voxel.base"], "u1"), *tables, tuple(meta["sh_groups"]))
+    grids = [Cascade(grid.shape, grid.voxel, np.asarray(grid.bounds_min, np.float64), _sized(grid.shape, "<i4")) for grid in whole_scene.grids_of(meta)]
+    return NerfTree(
+        shape=grids[0].shape,
+        brick=brick,
+        voxel=float(meta["voxel"]),
+        bounds_min=grids[0].bounds_min,
+        brick_index=grids[0].brick_index,
+        voxel_index=_sized((bricks, brick**3), "<i4"),
+        density_values=_sized((voxels,), "<f4"),
+        harmonics=harmonics,
+        metadata={key: value for key, value in meta.items() if key not in STRUCTURE},
+        ndc=ndc_of(name, meta),
+        lookup=lookup_of(name, meta),
+        step_size=step_size_of(name, meta),
+        outer=tuple(grids[1:]),
+    )
+
+
+def _sized(shape: tuple[int, ...], kind: Any) -> np.ndarray:
+    """An array of this shape that takes the memory of one number."""
+    return np.broadcast_to(np.zeros((), kind), shape)
 
 
 def describe(path: str | Path) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from pipeline.run import Run
 from pipeline.runner import run_stages
 from pipeline.sharing import take_over
 from pipeline.stage import Stage
+from pipeline.text import printable
 
 
 class Program(Protocol):
@@ -40,7 +41,10 @@ class Program(Protocol):
         """What fleet.json shows of a run as it is now: "metrics", "bytes", "verdict"."""
 
     def space(self, run: Path, stage: str, memory: int | None) -> int:
-        """Bytes that a stage which has to run writes at its peak, in this much memory."""
+        """Bytes that a stage which runs next writes at its peak, in this much memory."""
+
+    def memory(self, run: Path, stage: str, device: str) -> int | None:
+        """Bytes that a stage which runs next takes at its peak, by what those before it made; None where that is not known."""
 
     def is_finished(self, run: Path) -> bool:
         """Whether the pages about a run are there and newer than its stages."""
@@ -103,7 +107,7 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
         for text in program.prepare(path, request["scene"]):
             channel.send({"event": "warning", "stage": "", "text": text, "time": time.time()})
         found = _survey(program, path)
-        return {"stages": found, "finished": program.is_finished(path), **_space(program, path, found, request["memory"]), **program.describe(path)}
+        return {"stages": found, "finished": program.is_finished(path), **_estimates(program, path, found, request, channel), **program.describe(path)}
     if request["kind"] == "finish":
         program.finish(path)
         return {"resident": resident(), **program.describe(path)}
@@ -115,12 +119,24 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     outcome = run_stages(Run.open(path), program.stages, only=name, device=request["device"], memory=memory, report=channel.send)[0]
     surveyed = _survey(program, path)
     made = next(each for each in surveyed if each["name"] == name)
-    return {**made, "action": outcome.action, **_space(program, path, surveyed, request["memory"]), **program.describe(path)}
+    return {**made, "action": outcome.action, **_estimates(program, path, surveyed, request, channel), **program.describe(path)}
 
 
-def _space(program: Program, path: Path, surveyed: Sequence[dict[str, Any]], memory: int | None) -> dict[str, Any]:
-    """What the stages that are left write; the next one's is known best, for what it reads is there."""
-    return {"space": {found["name"]: program.space(path, found["name"], memory) for found in surveyed if not found["fresh"]}}
+def _estimates(program: Program, path: Path, surveyed: Sequence[dict[str, Any]], request: dict[str, Any], channel: _Channel) -> dict[str, Any]:
+    """What the next stage writes and takes: what it reads is there. One of which that cannot be told is admitted without: a word about it, no failure."""
+    name = next((found["name"] for found in surveyed if not found["fresh"]), None)
+    if name is None:
+        return {}
+    stage, facts = next(each for each in program.stages if each.name == name), request["next"]
+    found: dict[str, Any] = {}
+    try:
+        found["space"] = {name: program.space(path, name, facts["memory"])}
+        memory = program.memory(path, name, facts["device"] if stage.uses_device else "cpu")
+        found["memory"] = {} if memory is None else {name: memory}
+    except Exception as error:
+        text = f"{name}: what it takes cannot be told before ({type(error).__name__}: {printable(str(error), 300)})"
+        channel.send({"event": "message", "stage": name, "text": text, "time": time.time()})
+    return found
 
 
 def _survey(program: Program, path: Path) -> list[dict[str, Any]]:

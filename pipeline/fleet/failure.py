@@ -3,8 +3,8 @@
 its process crashed                           once more, on another worker if there is one
 its worker died                               the same, and then failed: stages run in processes of their own, so that it says little of the scene
 nothing more is heard of it                   again: the scheduler of Dask has gone
-memory ran out                                once more, in half of the memory
-it needs more memory than its share           once more, in what it needs, if a worker has that
+memory ran out                                once more, in half of the memory; where that is too little to begin with, alone on the largest worker
+it needs more memory than it was given        once more, in what it needs, if a worker has that
 its run is locked                             again, until the lock is given back or the lease expires
 the disk is full, its run stayed locked       failed: by circumstances; the fleet's command tries it again
 anything else, or the same once more          quarantined: by itself; only `retry` tries it again
@@ -24,6 +24,7 @@ LOCKED_SECONDS = 600.0  # that a run may stay locked by another process; a lease
 LOCKED_PAUSE = 2.0
 _HEADROOM = 1.05  # of a stated need: buffers of files and pipes
 _LEAST = 64 * 2**20  # bytes; less memory is no memory
+_MOST_ENLARGED = 3  # times that a stage may find that it needs more than it has: as it begins, and once it has counted what it will make
 
 
 @dataclass
@@ -31,7 +32,8 @@ class Attempts:
     """Failures so far of the stage that a scene is at.
 
     lost_on  the workers on which it was lost
-    memory   bytes that it is to run in, where they are not the worker's share
+    memory   bytes that it is to run in, where they are not those of its estimate or the worker's share
+    alone    whether it had a worker for itself after memory ran out
     """
 
     crashes: int = 0
@@ -40,6 +42,7 @@ class Attempts:
     locked_since: float | None = None
     lost_on: tuple[str, ...] = ()
     memory: int | None = None
+    alone: bool = False
 
     @property
     def count(self) -> int:
@@ -69,7 +72,7 @@ def remedy(what: str, result: Mapping[str, Any], attempts: Attempts, *, worker: 
     if kind == "memory" or ended_for_memory:
         return _out_of_memory(what, text, attempts, given)
     if kind == "refused":
-        return _refused(text, int(result.get("needed") or 0), attempts, largest)
+        return _refused(what, text, int(result.get("needed") or 0), attempts, given, largest)
     if kind == "unheard":
         return Remedy("later", text)
     if kind == "locked":
@@ -95,11 +98,15 @@ def _out_of_memory(what: str, text: str, attempts: Attempts, given: int | None) 
     return Remedy("quarantined", f"{what}: memory ran out{' again' if attempts.out_of_memory > 1 else ''}{shown} ({text.rstrip('.')}).")
 
 
-def _refused(text: str, needed: int, attempts: Attempts, largest: int | None) -> Remedy:
-    asked = int(_HEADROOM * needed)
-    if attempts.enlarged or not needed or attempts.out_of_memory or (largest is not None and needed > largest):
+def _refused(what: str, text: str, needed: int, attempts: Attempts, given: int | None, largest: int | None) -> Remedy:
+    fits = needed > (given or 0) and (largest is None or needed <= largest)
+    if attempts.out_of_memory and not attempts.alone and fits and largest is not None:
+        attempts.alone, attempts.memory = True, largest
+        return Remedy("again", f"{what}: memory ran out, and with less it does not begin. It is tried once more, alone on a worker.")
+    if attempts.out_of_memory or not fits or attempts.enlarged == _MOST_ENLARGED:
         before = "memory ran out, and with less it does not begin: " if attempts.out_of_memory else ""
         return Remedy("quarantined", before + text)
     attempts.enlarged += 1
+    asked = int(_HEADROOM * needed)
     attempts.memory = asked if largest is None else min(asked, largest)
     return Remedy("again", text)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,12 @@ from pipeline.errors import Interrupted, RunLocked, StageFailed
 from pipeline.executors.memory import size_text
 from pipeline.fleet import disk, requests
 from pipeline.fleet.absence import Absence
+from pipeline.fleet.admission import Admission
 from pipeline.fleet.failure import LOCKED_PAUSE, Attempts, remedy
 from pipeline.fleet.forecast import forecast_seconds
-from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, FleetState, FleetWord, Scene, SceneState, StageState, Totals, Verdict, write_fleet
-from pipeline.fleet.workers import Demand, Message, Room, Task, Worker, Workers
+from pipeline.fleet.progress import Progress
+from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, FleetState, FleetWord, Scene, SceneState, StageState, Totals, write_fleet
+from pipeline.fleet.workers import Demand, Message, Task, Worker, Workers
 from pipeline.text import printable
 
 Report = Callable[[dict[str, Any]], None]
@@ -35,33 +37,6 @@ class StageOf:
 
     name: str
     uses_device: bool = False
-
-
-@dataclass
-class _Progress:
-    """A scene as it is being run.
-
-    todo      stages that are not up to date, in order; None before its run is prepared
-    finished  whether its pages are written
-    space     bytes that its stages write, by name
-    """
-
-    state: SceneState
-    number: int
-    todo: list[str] | None = None
-    finished: bool = False
-    task: Task | None = None
-    stop_reason: str | None = None
-    not_before: float = 0.0
-    last_worker: str | None = None
-    attempts: Attempts = field(default_factory=Attempts)
-    lines: list[str] = field(default_factory=list)
-    space: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def what(self) -> str:
-        """The stage to run next, or "prepare" or "finish"."""
-        return "prepare" if self.todo is None else self.todo[0] if self.todo else "finish"
 
 
 class Scheduler:
@@ -87,11 +62,12 @@ class Scheduler:
         self.device = device
         self.state = FleetState(started=_now(), executor=workers.executor, slots=0, scenes=list(states))
         self._report, self._written, self._stop, self._lost = report, written, stop, lost
-        self._all = {state.name: _Progress(state, number) for number, state in enumerate(states)}
+        self._all = {state.name: Progress(state, number) for number, state in enumerate(states)}
         self._open = [each for each in self._all.values() if each.state.state != "quarantined"]
-        self._tasks: dict[int, _Progress] = {}
-        self._room = Room()
+        self._tasks: dict[int, Progress] = {}
+        self._admission = Admission()
         self._alive: Sequence[Worker] = ()
+        self._largest: int | None = None  # bytes of the largest worker; None where no limit is known
         self._next_number = 0
         self._next_write = self._next_look = 0.0
         self._absence = Absence(queued=workers.queued)
@@ -147,6 +123,8 @@ class Scheduler:
         if (why := self._lost()) is not None:
             raise RunLocked(why)
         self._alive = self.workers.alive()
+        limits = [worker.memory for worker in self._alive]
+        self._largest = None if None in limits else max((limit or 0 for limit in limits), default=None)
         self.state.slots = sum(worker.capacity for worker in self._alive)
         self._look_for_workers(now)
         self._take_requests()
@@ -186,74 +164,65 @@ class Scheduler:
                     self._give_up(each, "failed", "cancelled.")
 
     def _admit(self) -> None:
-        """Start what there is room for: stages that use a device first, then scenes that have begun, then in the manifest's order."""
+        """Start what there is room for: what has waited for room first, then stages that use a device, then scenes that have begun, in the manifest's order."""
         now = time.monotonic()
-        full: set[Demand] = set()
-        cramped: list[_Progress] = []
+        cramped: list[Progress] = []
         too_much = math.inf  # bytes to write for which the disk has no room
-        open_to_all = list(self._alive)
-        for each in sorted((each for each in self._open if each.task is None and each.not_before <= now), key=self._order):
-            demand = self._demand(each)
-            if demand in full or not self._has_its_share(each):
-                continue
-            others = [worker for worker in open_to_all if worker.name not in each.attempts.lost_on]
-            place = self._room.place(demand, others or open_to_all, each.last_worker)
+        waiting = {each.number: each for each in self._open if each.task is None and each.not_before <= now and self._has_its_share(each)}
+        self._admission.look(self._alive, waiting)
+        first = self._admission.waited_for()
+        for each in sorted(waiting.values(), key=lambda each: (each.number not in first, *self._order(each))):
+            place = self._admission.place(each.number, self._demand(each), avoided=each.attempts.lost_on, preferred=each.last_worker)
             need = each.space.get(each.what, 0)
             if place is not None and ((self._tasks and need >= too_much) or not self._has_disk(each, need)):
                 too_much = min(too_much, need)  # where nothing runs each is looked at: what it has written already counts
                 cramped.append(each)
             elif place is not None:
                 self._start(each, *place)
-            elif demand.memory is not None and open_to_all:
-                # What needs more than a share would wait for ever beside those that do not: the largest worker is left to it.
-                open_to_all.remove(max(open_to_all, key=lambda worker: worker.memory or 0))
-            elif len(others) == len(open_to_all):
-                full.add(demand)
         for each in cramped if not self._tasks else ():  # nothing that runs will give any of it back
             shown = f"{each.what}: writes about {size_text(each.space[each.what])}; {size_text(disk.free_space(self.fleet))} are free in {self.fleet}."
             self._give_up(each, "failed", f"{shown} Make room, and go on.")
 
-    def _has_disk(self, each: _Progress, need: int) -> bool:
+    def _has_disk(self, each: Progress, need: int) -> bool:
         """Whether the disk has room for so many bytes of its stage, beside what those that run will write."""
         if not need:
             return True
         running = [(self.fleet / other.state.run, other.space.get(str(other.task.request.get("stage")), 0)) for other in self._tasks.values() if other.task]
         return disk.has_room(disk.free_space(self.fleet), (self.fleet / each.state.run, need), running)
 
-    def _order(self, each: _Progress) -> tuple[bool, bool, int]:
+    def _order(self, each: Progress) -> tuple[bool, bool, int]:
         uses = each.what in self.stages and self.stages[each.what].uses_device
         return not (uses and self.device == "cuda"), each.todo is None, each.number
 
-    def _demand(self, each: _Progress) -> Demand:
-        stage, memory = self.stages.get(each.what), each.attempts.memory
-        if memory is not None and (largest := self._largest()) is not None:  # the worker that had more may have gone: what the stage needs it says itself
-            memory = min(memory, largest)
+    def _demand(self, each: Progress) -> Demand:
+        """What it waits for: what its stage takes, or all of the largest worker where that is less. The worker that had more may have gone."""
+        stage, memory = self.stages.get(each.what), each.bytes_needed()
+        if memory is not None and self._largest is not None:
+            memory = min(memory, self._largest)
         return Demand(uses_gpu=self.device == "cuda" and stage is not None and stage.uses_device, memory=memory)
 
-    def _largest(self) -> int | None:
-        """Bytes of the largest worker; None where no limit is known."""
-        if any(worker.memory is None for worker in self._alive):
-            return None
-        return max((worker.memory or 0 for worker in self._alive), default=None)
-
-    def _has_its_share(self, each: _Progress) -> bool:
+    def _has_its_share(self, each: Progress) -> bool:
         """Whether the scene that makes the next artifact for this one, too, has done so, or never will."""
         donor = self._donor(each)
         return donor is None or donor.state.state not in ("waiting", "running") or (donor.todo is not None and each.what not in donor.todo)
 
-    def _donor(self, each: _Progress) -> _Progress | None:
+    def _donor(self, each: Progress) -> Progress | None:
         return self._all.get(each.state.shares.get(each.what, ""))
 
-    def _start(self, each: _Progress, worker: Worker, memory: int | None, gpu: int | None) -> None:
-        request: dict[str, Any] = {"kind": each.what, "run": str(self.fleet / each.state.run)}
+    def _start(self, each: Progress, worker: Worker, memory: int | None, gpu: int | None) -> None:
+        memory = each.attempts.memory if memory is None else memory
+        request: dict[str, Any] = {"kind": each.what, "run": str(self.fleet / each.state.run), "next": {"device": self.device, "memory": self._largest}}
         if each.what == "prepare":
             scene = each.state.scene()
             plain = {"name": scene.name, "sources": list(scene.sources), "settings": scene.settings, "preset": scene.preset, "seed": scene.seed}
-            request |= {"scene": plain, "memory": memory}
+            request |= {"scene": plain}
         elif each.what in self.stages:
             donor = self._donor(each)
             facts = {"stage": each.what, "device": self.device if self.stages[each.what].uses_device else "cpu", "memory": memory}
             request |= {"kind": "stage", "donor": None if donor is None else str(self.fleet / donor.state.run), **facts}
+            if (text := each.too_little(memory)) is not None:
+                each.warn(text)
+                self._tell(each, "warning", text=text)
             each.state.stages.setdefault(each.what, StageState()).state = "running"
             each.state.stages[each.what].worker = worker.name
         self._next_number += 1
@@ -262,7 +231,7 @@ class Scheduler:
         each.state.stage = each.what if each.what in self.stages else None
         each.lines = []
         self._tasks[each.task.number] = each
-        self._room.take(each.task)
+        self._admission.take(each.task)
         self._changed = True
         self.workers.start(each.task)
 
@@ -276,41 +245,23 @@ class Scheduler:
             return False
         task, each.task = each.task, None
         del self._tasks[task.number]
-        self._room.give(task)
+        self._admission.give(task)
         self._changed = True
-        self._record(each, message.content)
+        each.record(message.content, self.stages)
         if message.content.get("ok"):
             self._done(each, task, message.content)
         else:
             self._failed(each, task, message.content)
         return True
 
-    def _event(self, each: _Progress, event: dict[str, Any]) -> None:
+    def _event(self, each: Progress, event: dict[str, Any]) -> None:
         text = printable(event.get("text") or "", LONGEST_LINE)
         if event.get("event") in ("message", "warning", "stage_failed") and text:
             each.lines = [*each.lines, text][-MOST_LINES:]
-        if event.get("event") == "warning" and text not in each.state.warnings:
-            each.state.warnings = [*each.state.warnings, text][:MOST_LINES]
-            self._changed = True
+        self._changed |= event.get("event") == "warning" and each.warn(text)
         self._tell(each, event.pop("event", "message"), **event)
 
-    def _record(self, each: _Progress, result: Mapping[str, Any]) -> None:
-        """What an answer says of the run: what its stages took, what they made."""
-        for found in [*result.get("stages", []), *([result] if "fresh" in result else [])]:
-            if found.get("name") not in self.stages or not found.get("fresh"):
-                continue
-            worker = each.state.stages[found["name"]].worker if found["name"] in each.state.stages else None
-            numbers = {name: found.get(name) or 0 for name in ("seconds", "cpu_seconds", "peak_memory")}
-            each.state.stages[found["name"]] = StageState("done", worker=worker, **numbers)
-        each.state.seconds = sum(stage.seconds for stage in each.state.stages.values() if stage.state == "done")
-        each.space = result.get("space") or each.space
-        if "metrics" in result:
-            each.state.metrics = dict(result["metrics"] or {})
-            each.state.bytes = int(result.get("bytes") or 0)
-            verdict = result.get("verdict")
-            each.state.verdict = None if verdict is None else Verdict(printable(verdict["grade"], 200), printable(verdict["summary"], 4 * LONGEST_LINE))
-
-    def _done(self, each: _Progress, task: Task, result: Mapping[str, Any]) -> None:
+    def _done(self, each: Progress, task: Task, result: Mapping[str, Any]) -> None:
         kind = task.request["kind"]
         each.attempts, each.state.attempts, each.state.stage, each.state.reason = Attempts(), 0, None, None
         if kind == "prepare":
@@ -332,7 +283,7 @@ class Scheduler:
         elif each.stop_reason is not None:
             self._give_up(each, "failed", each.stop_reason)
 
-    def _failed(self, each: _Progress, task: Task, result: Mapping[str, Any]) -> None:
+    def _failed(self, each: Progress, task: Task, result: Mapping[str, Any]) -> None:
         stage = task.request.get("stage")
         if stage in each.state.stages:
             each.state.stages[stage].state = "waiting"
@@ -345,7 +296,7 @@ class Scheduler:
         now = time.monotonic()
         judged = remedy(
             stage or task.request["kind"], result, each.attempts, worker=task.worker,
-            given=task.memory, largest=self._largest(), now=now,
+            given=task.memory, largest=self._largest, now=now,
         )  # fmt: skip
         each.state.attempts = each.attempts.count
         if judged.action in ("failed", "quarantined"):
@@ -358,7 +309,7 @@ class Scheduler:
         if judged.action == "again":  # a stage that was published all the same is skipped
             self._tell(each, "retry", text=judged.reason)
 
-    def _give_up(self, each: _Progress, state: str, reason: str) -> None:
+    def _give_up(self, each: Progress, state: str, reason: str) -> None:
         each.state.state = "failed" if state == "failed" else "quarantined"
         each.state.reason = printable(reason, 4 * LONGEST_LINE)
         each.state.last_lines, each.state.stage, each.state.worker = each.lines, None, None
@@ -399,7 +350,7 @@ class Scheduler:
         self._changed = False
         self._next_write = now + max(WRITE_SECONDS, TIMES * (time.monotonic() - now))
 
-    def _tell(self, each: _Progress, event: str, **facts: Any) -> None:
+    def _tell(self, each: Progress, event: str, **facts: Any) -> None:
         if self._report is not None:
             self._report({"time": time.time(), **facts, "event": event, "scene": each.state.name})
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -95,34 +94,3 @@ class Workers(Protocol):
 
     def close(self) -> None:
         """End all that still runs."""
-
-
-class Room:
-    """What of each worker is taken. Memory is admitted by what stages may take, so that together they never take more than there is."""
-
-    def __init__(self) -> None:
-        self._tasks: dict[str, dict[int, Task]] = defaultdict(dict)
-
-    def take(self, task: Task) -> None:
-        self._tasks[task.worker][task.number] = task
-
-    def give(self, task: Task) -> None:
-        self._tasks[task.worker].pop(task.number, None)
-
-    def on(self, worker: str) -> Sequence[Task]:
-        return tuple(self._tasks[worker].values())
-
-    def place(self, demand: Demand, workers: Sequence[Worker], preferred: str | None = None) -> tuple[Worker, int | None, int | None] | None:
-        """(worker, memory, device) for a demand; None where no worker has room now. Of those with room the preferred one, else the one with least to do."""
-        for worker in sorted(workers, key=lambda each: (each.name != preferred, len(self._tasks[each.name]) / each.capacity)):
-            tasks = self._tasks[worker.name].values()
-            memory = worker.share_of_memory if demand.memory is None else demand.memory
-            if worker.memory is not None and memory is not None and sum(task.memory or 0 for task in tasks) + memory > worker.memory:
-                continue
-            if demand.uses_gpu and worker.gpus:
-                free = sorted({*worker.gpus} - {task.gpu for task in tasks})
-                if free:
-                    return worker, memory, free[0]
-            elif sum(task.gpu is None for task in tasks) < worker.slots:
-                return worker, memory, None
-        return None

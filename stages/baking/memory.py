@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
 
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
@@ -15,7 +16,9 @@ from stages.training.data import channels_of, count_pixels
 from stages.training.pixel_file import PixelFile
 
 if TYPE_CHECKING:
+    from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import PixelRows
+    from efficientnerf.training.settings import TrainSettings
     from stages.bake import BakeSettings
     from stages.baking.plan import Plan
     from stages.io.scene import Scene, View
@@ -28,6 +31,20 @@ PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, thos
 VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 400, 5000
 ERROR_CELL = 48  # bytes of a cell of the error map: two errors, chances, factors and numbers of tiles, and what is made of these
 MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.contributions
+
+
+class AtMost(Protocol):
+    def __call__(self, count: int, *, stored: bool) -> Need:
+        """What baking so many voxels takes; `stored` as for `needed`."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What of a field decides how much is baked: its settings, with numbers for what is "auto", its space, and the degree of its harmonics."""
+
+    settings: TrainSettings
+    space: Space
+    degree: int
 
 
 def voxels_needed(voxels: int, harmonics: int, *, packed: bool = False) -> int:
@@ -85,20 +102,8 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: fl
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
-    from efficientnerf.asset.file.serialisation import most_voxels
-    from stages.baking.pruning import most_children
-    from stages.baking.voxels import MAX_OVERSHOOT
-
-    settings, degree = job.settings, m.fine.degree
-    channels = channels_of(job.inputs["poses"], views)
-    finest, cells = _finest_cells(job, m, s, whole=whole)
-    room = most_voxels(int(mib * 2**20), settings.layout, degree, (1, 1, 1), settings.brick_size)
-    voxels = min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3)
-
-    def at_most(count: int, *, stored: bool) -> Need:
-        about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": degree, "whole": whole, "device": job.device}
-        return needed(settings, m.settings, views, channels, **about, stored=stored)
-
+    settings, channels = job.settings, channels_of(job.inputs["poses"], views)
+    finest, voxels, at_most = most_needed(settings, Trained(m.settings, m.space, m.fine.degree), s, views, channels, mib, splits, whole, job.device)
     stored = not has_room(job, at_most(voxels, stored=False))
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
@@ -108,7 +113,31 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: fl
     return rows
 
 
-def _finest_cells(job: Job, m: Any, s: Scene, *, whole: bool) -> tuple[int, int]:
+def most_needed(
+    settings: BakeSettings, trained: Trained, s: Scene, views: Sequence[View], channels: int, mib: float, splits: int, whole: bool, device: str
+) -> tuple[int, int, AtMost]:
+    """What baking takes at most, before its voxels are counted.
+
+    mib      that the asset may have
+    splits   how often voxels will be split
+    returns  voxels along the finest grid in question; how many are baked at most; and a function from a number of voxels to what it takes
+    """
+    from efficientnerf.asset.file.serialisation import most_voxels
+    from stages.baking.pruning import most_children
+    from stages.baking.voxels import MAX_OVERSHOOT
+
+    finest, cells = _finest_cells(settings, trained, s, whole=whole)
+    room = most_voxels(int(mib * 2**20), settings.layout, trained.degree, (1, 1, 1), settings.brick_size)
+    voxels = min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3)
+
+    def at_most(count: int, *, stored: bool) -> Need:
+        about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": trained.degree, "whole": whole, "device": device}
+        return needed(settings, trained.settings, views, channels, **about, stored=stored)
+
+    return finest, voxels, at_most
+
+
+def _finest_cells(settings: BakeSettings, trained: Trained, s: Scene, *, whole: bool) -> tuple[int, int]:
     """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
     from efficientnerf.asset.bake import grid_of
     from efficientnerf.settings import given
@@ -116,13 +145,13 @@ def _finest_cells(job: Job, m: Any, s: Scene, *, whole: bool) -> tuple[int, int]
     from stages.baking.voxels import finest_choice
     from stages.baking.whole_scene import grids_of
 
-    settings = job.settings
-    finest = finest_choice(settings, m, s).resolution
+    bounds, discretise = trained.space.bounds, given(trained.settings.discretise)
+    finest = finest_choice(settings, trained, s).resolution
     if not whole:
-        return finest, math.prod(grid_of(m.space.bounds, finest, settings.brick_size)[0])
+        return finest, math.prod(grid_of(bounds, finest, settings.brick_size)[0])
     count = given(settings.cascades) or MAX_CASCADES
-    cells = sum(math.prod(shape) for shape, _, _ in grids_of(m.space.bounds, finest, settings.brick_size, count, None))
-    stated = given(settings.resolution) or given(settings.max_resolution) or given(m.settings.discretise)
+    cells = sum(math.prod(shape) for shape, _, _ in grids_of(bounds, finest, settings.brick_size, count, None))
+    stated = given(settings.resolution) or given(settings.max_resolution) or discretise
     return finest, cells if stated else min(cells, 2 * MAX_CELLS)  # coarse cells are more by those that make grids fit each other
 
 

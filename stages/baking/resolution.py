@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.settings import given
+
 if TYPE_CHECKING:
+    from stages.bake import BakeSettings
     from stages.framing.forward_facing import ForwardFacing
     from stages.io.scene import Scene
 
@@ -87,14 +90,14 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
 
 
-def budget_of(s: Scene, given: float | None, *, packed: bool = False) -> float:
-    """MiB that an asset may have: those given, or else MAX_MIB. In normalised device coordinates, where nothing is empty
+def budget_of(s: Scene, stated: float | None, *, packed: bool = False) -> float:
+    """MiB that an asset may have: those stated, or else MAX_MIB. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
     large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
-    if given is None and packed:
+    if stated is None and packed:
         return math.ceil(budget_of(s, None) / 3)
-    if given is not None or s.forward is None:
-        return MAX_MIB if given is None else given
+    if stated is not None or s.forward is None:
+        return MAX_MIB if stated is None else stated
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
     return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
 
@@ -103,6 +106,15 @@ def timed_budget(mib: float, seconds: float, cores: int, *, whole: bool, packed:
     """MiB of those that an asset may have, which can be refined in so many seconds: fewer voxels that rays have met often are better than more of them."""
     timed = max(MIN_TIMED_MIB, (SCENE_TIMED_MIB if whole else TIMED_MIB) * seconds * cores)
     return min(mib, timed / 3 if packed else timed)
+
+
+def size_limits(settings: BakeSettings, s: Scene, device: str, cores: int, *, whole: bool) -> tuple[float, float]:
+    """MiB that an asset may have; and, where that is left to us, no more than can be refined in bake.time_budget."""
+    packed, seconds = settings.layout == "packed", given(settings.time_budget)
+    mib = budget_of(s, given(settings.max_mib), packed=packed)
+    if seconds is None or settings.max_mib != "auto" or device != "cpu":
+        return mib, mib
+    return mib, timed_budget(mib, seconds, cores, whole=whole, packed=packed)
 
 
 def ndc_pixel(s: Scene, forward: ForwardFacing) -> float:

@@ -61,7 +61,7 @@ def _working_images(own: Any, sources: Sequence[Path]) -> int:
     from stages.sfm.ladder import features_for
     from stages.video.panorama import VIEWS
 
-    pictures = [path for source in sources for path in _files(source) if path.suffix.lower() in IMAGE_SUFFIXES]
+    pictures = [path for source in sources for path in files_below(source) if path.suffix.lower() in IMAGE_SUFFIXES]
     count = (len(pictures) or own.frames) * (VIEWS if own.lens == "equirectangular" else 1)
     images = count * int(PIXEL * ASPECT * (own.max_image_size**2 + own.feature_image_size**2))
     if pictures:
@@ -77,10 +77,10 @@ def _training(own: Any, run: Path, memory: int | None) -> int:
 
 
 def _bytes_below(folders: Sequence[Path]) -> int:
-    return sum(os.stat(path).st_size for folder in folders for path in _files(folder))
+    return sum(os.stat(path).st_size for folder in folders for path in files_below(folder))
 
 
-def _files(place: Path) -> list[Path]:
+def files_below(place: Path) -> list[Path]:
     """The plain files below a folder, links left out; of a file itself."""
     if place.is_file():
         return [place]

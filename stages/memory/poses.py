@@ -22,6 +22,11 @@ def decoding_needed(sizes: Sequence[tuple[int, int]]) -> Need:
     return Need({"a photograph": DECODED * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
 
 
+def video_needed(sizes: Sequence[tuple[int, int]]) -> Need:
+    """What it takes to decode videos of these sizes, one at a time."""
+    return Need({"frames of a video": FRAME * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
+
+
 def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int) -> Need:
     """What it takes to find the cameras of photographs of these sizes.
 
@@ -50,8 +55,7 @@ def refuse_large_photographs(job: Job, sizes: Sequence[tuple[int, int]]) -> None
 
 def refuse_large_videos(job: Job, sizes: Sequence[tuple[int, int]]) -> None:
     """UsageError where the frames of a video do not fit into memory while it is decoded."""
-    most = max((width * height for width, height in sizes), default=0)
-    refuse_what_does_not_fit(job, Need({"frames of a video": FRAME * most, "libraries": IMAGING}), "Export the video at a lower resolution.")
+    refuse_what_does_not_fit(job, video_needed(sizes), "Export the video at a lower resolution.")
 
 
 def reading_threads(job: Job, sizes: Sequence[tuple[int, int]], threads: int) -> int:

@@ -117,13 +117,20 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
 
 def rows_for_training(job: Job, folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space) -> PixelRows | None:
     """`place_pixels` for the stage train; `settings` as for `needed`."""
-    channels = channels_of(folder, views)
-    coarse_samples = given(settings.num_coarse_samples) or space.num_coarse_samples
-    intervals = space.max_intervals(space.sampled_length(None) / coarse_samples)
-    voxels = given(settings.occupancy_resolution) or space.occupancy_resolution
-    here, there = (needed(settings, views, channels, intervals, voxels, stored=stored, device=job.device) for stored in (False, True))
+    here, there = (training_needed(folder, views, settings, space, stored=stored, device=job.device) for stored in (False, True))
     stored = not has_room(job, here)
     tables = f"train.log2_hashmap_size ({settings.log2_hashmap_size}), " if settings.field == "hash" else ""
     batch = "train.max_rays_per_batch" if settings.sample_batch_size == "off" else "train.sample_batch_size"
     remedy = f"Lower {tables}{batch} ({getattr(settings, batch[6:])}) or poses.max_image_size."
-    return place_pixels(job, there if stored else here, views, channels, remedy, stored=stored)
+    return place_pixels(job, there if stored else here, views, channels_of(folder, views), remedy, stored=stored)
+
+
+def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space, *, stored: bool, device: str) -> Need:
+    """What the stage train takes; `settings` and `stored` as for `needed`.
+
+    folder  of the scene
+    """
+    coarse_samples = given(settings.num_coarse_samples) or space.num_coarse_samples
+    intervals = space.max_intervals(space.sampled_length(None) / coarse_samples)
+    voxels = given(settings.occupancy_resolution) or space.occupancy_resolution
+    return needed(settings, views, channels_of(folder, views), intervals, voxels, stored=stored, device=device)

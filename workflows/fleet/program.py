@@ -51,14 +51,18 @@ class WorkflowProgram:
         return {"metrics": shown, "bytes": size, "verdict": camera_verdict(run)}
 
     def space(self, run: Path, stage: str, memory: int | None) -> int:
-        """0 where it cannot be known: the stage is admitted as if it wrote nothing, and tells what is wrong."""
+        opened, settings = self._opened(run)
+        return self.workflow.space(stage, run, tuple(opened.sources.values()), settings, memory)
+
+    def memory(self, run: Path, stage: str, device: str) -> int | None:
+        opened, settings = self._opened(run)
+        return self.workflow.memory(stage, run, tuple(opened.sources.values()), settings, device)
+
+    def _opened(self, run: Path) -> tuple[Run, dict[str, Any]]:
+        """A run, and the settings of its stages by their names."""
         opened = Run.open(run)
         kinds = {each.name: each.settings for each in self.stages}
-        settings: dict[str, Any] = {name: settings_from(kind, opened.settings.get(name, {}), where=name) for name, kind in kinds.items()}
-        try:
-            return self.workflow.space(stage, run, tuple(opened.sources.values()), settings, memory)
-        except OSError:
-            return 0
+        return opened, {name: settings_from(kind, opened.settings.get(name, {}), where=name) for name, kind in kinds.items()}
 
     def is_finished(self, run: Path) -> bool:
         from workflows.report.pages import has_pages

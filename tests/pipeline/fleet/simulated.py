@@ -28,6 +28,7 @@ class Simulated:
 
     answer  what a task answers; None: it goes on until it is stopped or its worker goes
     log     (scene, what, worker) of each task that was started, in order
+    tasks   the same tasks themselves
     most    of memory and stages on each worker at a time, as it was seen
     """
 
@@ -35,6 +36,7 @@ class Simulated:
     answer: Answer = done
     executor: str = "simulated"
     log: list[tuple[str, str, str]] = field(default_factory=list)
+    tasks: list[Task] = field(default_factory=list)
     running: dict[int, Task] = field(default_factory=dict)
     messages: list[Message] = field(default_factory=list)
     most: dict[str, tuple[int, int]] = field(default_factory=dict)
@@ -49,6 +51,7 @@ class Simulated:
         assert task.worker in {worker.name for worker in self.workers}
         assert not any(other.request["run"] == task.request["run"] for other in self.running.values()), "two at once on one run"
         self.running[task.number] = task
+        self.tasks.append(task)
         self.log.append((scene_of(task), what(task.request), task.worker))
         mine = [other for other in self.running.values() if other.worker == task.worker]
         taken = (sum(other.memory or 0 for other in mine), len(mine))

@@ -1,0 +1,248 @@
+"""Admission by memory: what is admitted together fits, everything has its turn, and what fits nowhere runs alone. On simulated workers."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.fleet import scheduler
+from pipeline.fleet.admission import Admission
+from pipeline.fleet.scheduler import Scheduler, StageOf, states_for
+from pipeline.fleet.state import FleetState, Scene, SceneState
+from pipeline.fleet.workers import Demand, Task, Worker
+from tests.pipeline.fleet.simulated import STAGES, Answer, Simulated, done, scene_of, what
+
+GIB = 2**30
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scheduler looks at its workers and writes its file whenever it may."""
+    monkeypatch.setattr(scheduler, "LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(scheduler, "WRITE_SECONDS", 0.0)
+    monkeypatch.setattr(scheduler, "TIMES", 0.0)
+
+
+def run(fleet: Path, workers: Simulated, count: int, **more: Any) -> FleetState:
+    fleet.mkdir(exist_ok=True)
+    states = states_for([Scene(f"s{number}", (f"/shoots/{number}",)) for number in range(count)], None)
+    return Scheduler(fleet, states, [StageOf("poses"), StageOf("train", True), StageOf("bake", True)], workers, **more).run()
+
+
+def taking(needs: dict[tuple[str, str], int], others: int = GIB) -> Answer:
+    """Answers of scenes whose stages say before what they take, and refuse to begin with less than half of it."""
+
+    def answer(task: Task) -> dict[str, Any]:
+        scene = scene_of(task)
+        need = needs.get((scene, what(task.request)), others)
+        if task.request["kind"] == "stage" and task.memory is not None and 2 * task.memory < need:
+            return {"ok": False, "kind": "refused", "text": f"needs {need // 2}.", "needed": need // 2}
+        return done(task, memory={stage: needs.get((scene, stage), others) for stage in STAGES})
+
+    return answer
+
+
+def trainings(workers: Simulated) -> list[str]:
+    return [name for name, stage, _ in workers.log if stage == "train"]
+
+
+def state_of(found: FleetState, name: str) -> SceneState:
+    return next(scene for scene in found.scenes if scene.name == name)
+
+
+def test_no_worker_ever_has_more_than_its_memory_and_every_scene_comes_to_its_end(tmp_path: Path) -> None:
+    for seed in range(40):
+        chance = random.Random(seed)
+        limits = [chance.choice([4, 8, 16, 32]) * GIB for _ in range(chance.randint(1, 4))]
+        gpus = [tuple(range(chance.randint(0, 2))) for _ in limits]
+        workers = Simulated([Worker(f"w{n}", 8, limit, gpus[n], slots=chance.randint(1, 5)) for n, limit in enumerate(limits)])
+        needs = {(f"s{n}", stage): int(chance.choice([0.1, 0.5, 1, 3, 6, 12]) * GIB) for n in range(15) for stage in STAGES}
+        workers.answer = taking(needs)
+        found = run(tmp_path / str(seed), workers, 15, device=chance.choice(["cpu", "cuda"]))
+        hopeless = {scene for (scene, _), need in needs.items() if need > 2 * max(limits)}  # with half of it they would begin
+        assert {scene.name: scene.state for scene in found.scenes if scene.state != "done"} == dict.fromkeys(hopeless, "quarantined")
+        assert all(workers.most[f"w{n}"][0] <= limit for n, limit in enumerate(limits) if f"w{n}" in workers.most)
+
+
+def test_small_stages_run_side_by_side_though_a_share_of_each_is_more(tmp_path: Path) -> None:
+    """Two slots: a large stage has more than its half, and small ones run beside it."""
+    needs = {(f"s{n}", stage): (11 if n % 2 else 3) * GIB for n in range(8) for stage in STAGES}
+    workers = Simulated([Worker("a", 4, 16 * GIB, slots=2)], taking(needs))
+    together: list[set[int]] = []
+    workers.between = lambda: together.append({int(scene_of(task)[1:]) % 2 for task in workers.running.values() if task.request["kind"] == "stage"})
+    assert run(tmp_path, workers, 8).state == "done"
+    assert {0, 1} in together
+    asked = {task.memory for task in workers.tasks if what(task.request) == "train"}
+    assert asked == {int(1.05 * 3 * GIB), int(1.05 * 11 * GIB)}
+    assert not [scene for scene in trainings(workers) if trainings(workers).count(scene) > 1], "none had to be refused first"
+
+
+@pytest.mark.parametrize("slots", [2, 4, 8])
+def test_a_large_stage_does_not_wait_for_all_small_ones(tmp_path: Path, slots: int) -> None:
+    workers = Simulated([Worker("a", 8, 16 * GIB, slots=slots)], taking({("s20", "train"): 15 * GIB}, others=3 * GIB))
+    assert run(tmp_path, workers, 100).state == "done"
+    order = trainings(workers)
+    ready = next(number for number, (name, stage, _) in enumerate(workers.log) if (name, stage) == ("s20", "poses"))
+    begun = next(number for number, (name, stage, _) in enumerate(workers.log) if (name, stage) == ("s20", "train"))
+    assert order.count("s20") == 1
+    assert begun - ready <= 4 * slots, "it began as soon as what ran then had ended"
+
+
+def test_several_that_are_large_have_their_turns(tmp_path: Path) -> None:
+    large = {(f"s{number}", stage): 14 * GIB for number in range(0, 30, 5) for stage in STAGES}
+    workers = Simulated([Worker("a", 8, 16 * GIB, slots=4), Worker("b", 8, 16 * GIB, slots=4)], taking(large, others=2 * GIB))
+    assert run(tmp_path, workers, 30).state == "done"
+    order = trainings(workers)
+    assert order.index("s25") < len(order) - 1
+    assert max(order.index(f"s{number}") - number for number in range(0, 30, 5)) <= 10
+
+
+def test_what_fits_nowhere_runs_alone_with_what_there_is_and_that_is_told(tmp_path: Path) -> None:
+    workers = Simulated([Worker("small", 8, 4 * GIB, slots=2), Worker("large", 8, 16 * GIB, slots=4)], taking({("s3", "train"): 20 * GIB}, others=GIB))
+    beside: list[int] = []
+
+    def between() -> None:
+        if any((scene_of(task), what(task.request)) == ("s3", "train") for task in workers.running.values()):
+            beside.append(sum(task.worker == "large" for task in workers.running.values()))
+
+    workers.between = between
+    told: list[dict[str, Any]] = []
+    found = run(tmp_path, workers, 12, report=told.append)
+    assert found.state == "done"
+    assert set(beside) == {1}
+    task = next(task for task in workers.tasks if (scene_of(task), what(task.request)) == ("s3", "train"))
+    assert (task.worker, task.memory, task.request["memory"]) == ("large", 16 * GIB, 16 * GIB)
+    text = "train: takes about 20.0 GiB, and no worker has more than 16.0 GiB: it runs alone there, with less."
+    assert state_of(found, "s3").warnings == [text]
+    assert [event["text"] for event in told if event["event"] == "warning"] == [text]
+    assert trainings(workers).index("s3") < 11
+
+
+def test_what_cannot_work_with_less_is_set_aside_with_what_it_needs(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 8, 8 * GIB, slots=2)], taking({("s1", "bake"): 40 * GIB}))
+    found = run(tmp_path, workers, 4)
+    assert (state_of(found, "s1").state, state_of(found, "s1").reason) == ("quarantined", f"needs {20 * GIB}.")
+    assert found.totals.done == 3
+
+
+def test_what_is_not_known_has_a_share(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 8, 8 * GIB, slots=4), Worker("b", 8, None, slots=4)])
+    assert run(tmp_path, workers, 20).state == "done"
+    given = {(task.worker, task.request["kind"], task.memory) for task in workers.tasks}
+    assert given >= {("a", "stage", 2 * GIB), ("b", "stage", None), ("a", "prepare", GIB // 2), ("b", "finish", None)}
+
+
+def test_a_limit_that_is_not_known_is_none_whatever_the_estimate(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 8, None, slots=2)], taking({("s0", "train"): 900 * GIB}))
+    found = run(tmp_path, workers, 3)
+    assert found.state == "done"
+    assert {task.request["memory"] for task in workers.tasks if task.request["kind"] == "stage"} == {None}
+    assert not state_of(found, "s0").warnings
+
+
+def test_a_refusal_is_believed_before_the_estimate(tmp_path: Path) -> None:
+    """It may come twice: as the stage begins, and once it has counted."""
+    steps = itertools.chain([6 * GIB, 9 * GIB], itertools.repeat(0))
+
+    def answer(task: Task) -> dict[str, Any]:
+        if what(task.request) == "bake" and (needed := next(steps)):
+            return {"ok": False, "kind": "refused", "text": "too little.", "needed": needed}
+        return done(task, memory={"bake": 2 * GIB})
+
+    workers = Simulated([Worker("a", 8, 16 * GIB, slots=4)], answer)
+    assert run(tmp_path, workers, 1).state == "done"
+    assert [task.memory for task in workers.tasks if what(task.request) == "bake"] == [int(1.05 * each * GIB) for each in (2, 6, 9)]
+
+
+def test_what_ran_out_and_cannot_begin_with_less_is_tried_alone(tmp_path: Path) -> None:
+    first = iter([True])
+
+    def answer(task: Task) -> dict[str, Any]:
+        if (scene_of(task), what(task.request)) != ("s0", "bake"):
+            return done(task, memory=dict.fromkeys(STAGES, 4 * GIB))
+        if next(first, False):
+            return {"ok": False, "kind": "memory", "text": "out of memory."}
+        if (task.memory or 0) < 4 * GIB:
+            return {"ok": False, "kind": "refused", "text": "needs 4.0 GiB.", "needed": 4 * GIB}
+        return done(task)
+
+    workers = Simulated([Worker("a", 8, 16 * GIB, slots=3)], answer)
+    found = run(tmp_path, workers, 6)
+    assert found.state == "done"
+    half = int(1.05 * 4 * GIB) // 2
+    assert [task.memory for task in workers.tasks if (scene_of(task), what(task.request)) == ("s0", "bake")] == [2 * half, half, 16 * GIB]
+
+
+def test_a_worker_that_is_kept_takes_what_leaves_room() -> None:
+    worker = Worker("a", 8, 16, slots=4)
+    admission, numbers = Admission(), itertools.count()
+
+    def begin(who: int, memory: int) -> Task | None:
+        place = admission.place(who, Demand(memory=memory))
+        if place is None:
+            return None
+        task = Task(next(numbers), "a", {}, 1, place[1])
+        admission.take(task)
+        return task
+
+    admission.look([worker], [0, 1, 2, 3, 4])
+    running = begin(0, 10)
+    assert running is not None
+    assert begin(1, 12) is None
+    assert admission.waited_for() == {1}
+    assert begin(2, 5) is None, "there is room for it, but not beside the one that waits"
+    small = begin(3, 4)
+    assert small is not None
+    assert begin(4, 1) is None, "12 and 4 are all there is"
+    admission.give(running)
+    admission.look([worker], [1, 2, 4])
+    assert begin(1, 12) is not None
+    assert admission.waited_for() == set()
+    admission.give(small)
+    admission.look([worker], [2, 4])
+    assert begin(4, 1) is not None
+
+
+def test_what_waits_no_longer_has_nothing_kept() -> None:
+    """It was cancelled, or waits for another scene's artifact; or the worker has gone."""
+    for alive, waiting in (("a", [2]), ("b", [1, 2])):
+        admission = Admission()
+        admission.look([Worker("a", 8, 16, slots=4)], [1])
+        admission.take(Task(0, "a", {}, 1, 10))
+        assert admission.place(1, Demand(memory=12)) is None
+        admission.look([Worker(alive, 8, 16, slots=4)], waiting)
+        assert admission.waited_for() == set()
+        assert admission.place(2, Demand(memory=5)) is not None
+
+
+def test_a_worker_that_lost_it_is_taken_again_where_no_other_is_large_enough() -> None:
+    admission = Admission()
+    workers = [Worker("large", 8, 16), Worker("small", 8, 4)]
+    admission.look(workers, [1])
+    place = admission.place(1, Demand(memory=12), avoided=("large",))
+    assert place is not None
+    assert place[0].name == "large"
+    admission.look(workers, [1])
+    place = admission.place(1, Demand(memory=3), avoided=("large",))
+    assert place is not None
+    assert place[0].name == "small"
+
+
+def test_a_look_at_many_that_wait_asks_few_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = itertools.count()
+    slot = Admission._slot
+    monkeypatch.setattr(Admission, "_slot", lambda *found: (next(asked), slot(*found))[1])
+    for memory, slots in ((8, 1), (100, 50)):  # all slots taken; slots left, and no memory
+        admission = Admission()
+        workers = [Worker(f"w{number}", 8, memory, slots=slots) for number in range(100)]
+        admission.look(workers, range(10_000))
+        for number, worker in enumerate(workers):
+            admission.take(Task(number, worker.name, {}, 1, memory - 3))
+        before = next(asked)
+        for who in range(10_000):
+            assert admission.place(who, Demand(memory=4 + who % 50 if memory > 8 else 1)) is None
+        assert next(asked) - before < 1000
