@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import PositiveInt, setting
+from efficientnerf.settings import Auto, PositiveInt, setting
 from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
 
@@ -21,6 +21,7 @@ class PosesSettings:
     format: Literal["auto", "photographs"] = setting("auto", "What the source is.")
     strict: bool = setting(False, "Whether to refuse.")
     allow_outside: bool = setting(False, "Whether to allow.")
+    llff_factor: PositiveInt | Auto = setting("auto", "Which images.", advanced=True)
     repeat: Annotated[int, Meta(ge=1, le=9)] = setting(1, "How often the text is repeated.")
 
 

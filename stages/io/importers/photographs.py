@@ -97,9 +97,10 @@ def _remark_on_others(source: Source, found: Sequence[Path]) -> None:
     images = (path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and path.parent != here and not _is_beside(path, folder))
     others = one_of_each([path for path in images if not any(_REDUCED.fullmatch(part) for part in path.relative_to(folder).parts)])
     if others:
+        count = f"{len(others)} more images" if len(others) > 1 else "1 more image"
         names = sorted({source.name_of(path.parent) if path.parent != folder else "." for path in others})
         source.remarks[
-            f"{folder}: {len(others)} more images in other folders ({abbreviated(names)}) are not read, for {len(found)} lie directly in "
+            f"{folder}: {count} in other folders ({abbreviated(names)}) {'are' if len(others) > 1 else 'is'} not read, for {len(found)} lie directly in "
             f"{here.name if here != folder else 'it'}. Name the folders as sources of their own, or put the photographs together."
         ] = None
 

@@ -148,6 +148,7 @@ NO_PROFILES = {
     "of inks": (of_inks(power(1.0)), "for CMYK pictures, and this one is RGB"),
     "without tags": (P3[:128] + bytes(4), "damaged"),
     "all black": (of_colours(DISPLAY_P3, lambda values: 0 * values), "damaged: white is not brighter than black"),
+    "of elements": (P3[:132] + b"D2B1" + P3[136:], "of multi-process elements"),
     "too large": (P3 + bytes(9 << 20), "of 9 MiB"),
 }
 

@@ -67,7 +67,7 @@ def test_a_cover_does_not_hide_the_photographs_below(tmp_path: Path) -> None:
 def test_images_is_enough_and_the_cover_is_named(tmp_path: Path) -> None:
     found, said = read(write(tmp_path, "cover.png", "images/1.png", "images/2.png", "images/3.png", "images_4/1.png"))
     assert found == ["images/1.png", "images/2.png", "images/3.png"]
-    assert "1 more images in other folders (.) are not read, for 3 lie directly in images." in said
+    assert "1 more image in other folders (.) is not read, for 3 lie directly in images." in said
 
 
 def test_photographs_in_other_folders_are_named(tmp_path: Path) -> None:
