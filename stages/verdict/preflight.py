@@ -106,6 +106,7 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
         "format": kind,
         "photographs": len(names),
         "looked_at": len(chosen),
+        "left_aside": [] if posed else source.warnings(),
         "sizes": sorted({f"{a}x{b}" for a, b in (each.size for each in small.values())}),
         "overlapping": round(_share_in_largest(len(small), overlaps), 3),
         **_layout(list(small), overlaps),

@@ -78,6 +78,7 @@ def in_words(found: dict[str, Any]) -> list[str]:
         lines.append(printable(f"  {problem['sentence']} {problem['remedy']}", 600))
     if not found["problems"]:
         lines.append("  Nothing stands against them.")
+    lines += [printable(f"  {sentence}", 600) for sentence in found["left_aside"]]
     compared = f", {about['pairs']} pairs compared" if about["pairs"] else ""
     longer = f", up to {duration(about['poses_seconds_at_most'])} where photographs match badly" if about["pairs"] else ""
     room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are"

@@ -34,6 +34,14 @@ def test_check_says_what_is_wrong_and_exits_with_2_where_nothing_can_come_of_it(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]  # nothing is written
 
 
+def test_check_says_what_is_left_aside(enerf: Enerf, tmp_path: Path) -> None:
+    folder = noise(tmp_path / "photos", 4)
+    noise(folder / "more", 2)
+    assert "2 more images in other folders (more) are not read" in enerf("check", folder).out
+    assert len(enerf("check", folder, "--json").object["left_aside"]) == 1
+    assert enerf("check", folder / "more", "--json").object["left_aside"] == []
+
+
 def test_check_refuses_what_is_no_folder_of_photographs(enerf: Enerf, tmp_path: Path) -> None:
     assert enerf("check", tmp_path / "none").code == 2
     assert "no such folder" in enerf("check", tmp_path / "none").err
