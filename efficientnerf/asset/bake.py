@@ -90,11 +90,11 @@ def visible_voxels(
 def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
     """About `count` usable pixels: one at random of each run of `len(pixels) / count`. A fixed one would hit a few columns alone where the run
     divides the width."""
-    total = len(pixels)
+    total = pixels.usable_count
     stride = max(1, total // max(count, 1))
     starts = np.arange(0, total, stride)
     chosen = np.minimum(starts + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(starts)), total - 1)
-    return chosen[pixels.usable_at(chosen)]
+    return pixels.usable_pixels(chosen)
 
 
 def coarsened(

@@ -75,7 +75,7 @@ def foreground_bricks(tree: NerfTree) -> np.ndarray:
     return out
 
 
-MIN_SUPPORT = 3  # views whose rays end in a component: what so many photographs show is never dropped
+MIN_SUPPORT = 3  # views whose rays end in a component, or all where there are fewer: what so many photographs show is never dropped
 SUPPORT_WEIGHT = 0.1  # of a sample that counts as its ray's end
 
 
@@ -90,9 +90,10 @@ def unsupported_components(tree: NerfTree, keep: np.ndarray, share: float, sampl
         return out
     labelled = [_label(tree, cascade.brick_index, keep) for cascade in cascades_of(tree)]
     largest = max(float(voxels.max()) for _, voxels, _ in labelled)
+    support = min(MIN_SUPPORT, len(samples.origin))
     views = _views_of_components(tree, [labels for labels, _, _ in labelled], [len(voxels) for _, voxels, _ in labelled], samples)
     for n, (labels, voxels, cells) in enumerate(labelled):
-        small = (voxels < share * largest * (INTERIOR_RATIO if n else 1.0)) & (views[n] < MIN_SUPPORT)
+        small = (voxels < share * largest * (INTERIOR_RATIO if n else 1.0)) & (views[n] < support)
         rows = tree.voxel_index[cascades_of(tree)[n].brick_index.reshape(-1)[cells[small[labels.reshape(-1)[cells]]]]]
         out[rows[rows >= 0]] = True
     return out & keep

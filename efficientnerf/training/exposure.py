@@ -4,10 +4,15 @@
 
 With the mean fixed, the field is the scene as it was exposed on average, and held-out views are compared without any gain (as peers do). Gains act on
 sRGB values: there a change of exposure is nearly a factor, too, for the curve is nearly a power. Off by default: docs/experiments/losses.md
+
+What is made of the field with the photographs' help is the scene as it was exposed on average, too: it is fitted to the photographs over their gains.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +29,18 @@ def log_gains(learned: Tensor) -> Tensor:
 def exposed(colour: Tensor, view: Tensor, learned: Tensor) -> Tensor:
     """Colours (R, 3) of the scene as photographs `view` (R,) show them."""
     return colour * torch.exp(log_gains(learned))[view]
+
+
+def averaged(colour: Any, gain: Any) -> Any:
+    """Colours (R, 3) of photographs as those of the scene, by their gains (R, 3), arrays or tensors: what was exposed more is darker then, and at most 1."""
+    return (colour / gain).clip(0, 1)
+
+
+def averaged_image(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """The same of a photograph (H, W, 3 or 4) uint8 and its gains (3,); alpha stays."""
+    out = image.copy()
+    out[..., :3] = np.rint(255 * averaged(image[..., :3].astype(np.float32) / np.float32(255), gain.astype(np.float32)))
+    return out
 
 
 def exposure_loss(learned: Tensor) -> Tensor:

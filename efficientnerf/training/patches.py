@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,8 @@ class PatchGrid:
     """All views in tiles of `side` pixels, by which patches are drawn: a tile, then one of the side^2 patches whose lowest corner is in it.
 
     tiles of view v  from first[v] on, rows[v] times columns[v]
-    mean_pixels      of a patch that may be used
+    usable_tiles     (T,) bool: tiles with a patch that has a pixel that may be used; None: all
+    mean_pixels      of a patch of these that may be used
     angle            across a patch, radians, about
 
     What lies beyond the image, or is masked, is left out of a patch. So every pixel that may be used is as probable as any other where all tiles are.
@@ -31,14 +33,24 @@ class PatchGrid:
         self.pixels, self.side = pixels, side
         self.rows, self.columns = ((sides + side - 2) // side + 1 for sides in (pixels.height, pixels.width))
         self.first = np.concatenate([[0], np.cumsum(self.rows * self.columns)]).astype(np.int64)
-        usable = len(pixels) if pixels.usable is None else int(np.unpackbits(pixels.usable, count=len(pixels)).sum())
-        self.mean_pixels = usable / len(self)
+        self.usable_tiles: np.ndarray | None = None if pixels.usable is None else self._usable_tiles(pixels.usable)
+        # Each pixel is in side^2 patches, and each tile has as many.
+        self.mean_pixels = pixels.usable_count / (len(self) if self.usable_tiles is None else int(self.usable_tiles.sum()))
         left, right = (pixels.lens + np.maximum(pixels.knots // 2 - back, 0) for back in (1, 0))
         self.angle = float(side * np.linalg.norm(pixels.lookup[right] - pixels.lookup[left], axis=1).max() / pixels.stride)
 
     def __len__(self) -> int:
         """T."""
         return int(self.first[-1])
+
+    def _usable_tiles(self, bits: np.ndarray) -> np.ndarray:
+        found = np.ones(len(self), bool)
+        for view, (begin, end) in enumerate(itertools.pairwise(self.pixels.offsets.tolist())):
+            mask = np.unpackbits(bits[begin // 8 : -(-end // 8)])[begin % 8 :][: end - begin].reshape(self.pixels.height[view], self.pixels.width[view])
+            if not mask.all():
+                within = _any_within(_any_within(mask.astype(bool), self.side, self.rows[view]).T, self.side, self.columns[view]).T
+                found[self.first[view] : self.first[view + 1]] = within.reshape(-1)
+        return found
 
     def centres(self, tile: np.ndarray) -> np.ndarray:
         """The pixels at the middle of tiles, or where they reach beyond the image the last of a row or column."""
@@ -63,3 +75,13 @@ class PatchGrid:
         sizes = there.sum(axis=(1, 2))
         some = sizes > 0
         return Patches(index[there], np.concatenate([[0], np.cumsum(sizes[some])]).astype(np.int64), tile[some])
+
+
+def _any_within(mask: np.ndarray, side: int, count: int) -> np.ndarray:
+    """(count, columns) bool: whether rows (rows, columns) that patches of a tile reach have anything: the tile's own, and `side` - 1 before."""
+    padded = np.zeros((count * side, mask.shape[1]), bool)
+    padded[: len(mask)] = mask
+    blocks = padded.reshape(count, side, -1)
+    found: np.ndarray = np.logical_or.reduce(blocks, axis=1)
+    found[1:] |= np.logical_or.reduce(blocks[:-1, 1:], axis=1)
+    return found

@@ -6,7 +6,7 @@ R rays, C views, P pixels of all views.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +17,8 @@ from efficientnerf.geometry.cameras import Camera, rays
 
 EXACT = 2**23  # pixels of all lenses together up to which each has a direction of its own (12 bytes each)
 STRIDE = 8  # beyond it: pixels between knots
+LISTED_SHARE = 1 / 8  # of the pixels that masks allow, below which these are listed: else most that are drawn would be thrown away
+PART = 2**24  # pixels whose bits are unpacked at a time
 
 
 class PixelRows(Protocol):
@@ -36,6 +38,7 @@ class Pixels:
 
     images    (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha; an array, or the rows that were given for it
     usable    (P / 8,) uint8 or None: a bit for each pixel, set where masks allow it
+    listed    the pixels that masks allow, in order, where they are few; else None
     lookup    (K, 3) float32: unit directions in the camera at knots, `stride` pixels apart; one table for all views that share a lens
 
     Between knots 8 apart directions are interpolated: with a focal length of f pixels that is off by less than about 8 / f pixels.
@@ -65,6 +68,12 @@ class Pixels:
                 part = np.concatenate([part, np.full((len(part), channels - part.shape[1]), 255, np.uint8)], axis=1)
             self.images[at : at + len(part)] = part
         self.usable = self._usable(masks)
+        self.usable_count = len(self) if self.usable is None else sum(map(len, self._usable_parts()))
+        if not self.usable_count:
+            raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
+        few = self.usable_count < LISTED_SHARE * len(self)
+        kind = np.uint32 if len(self) <= 2**32 else np.int64
+        self.listed = np.concatenate([part.astype(kind) for part in self._usable_parts()]) if few else None
         self.set_cameras(cameras)
 
     def set_cameras(self, cameras: Sequence[Camera]) -> None:
@@ -85,9 +94,25 @@ class Pixels:
             whole = np.unpackbits(bits[first:last])
             whole[at - 8 * first : end - 8 * first] = mask.reshape(-1)
             bits[first:last] = np.packbits(whole)
-        if bits is not None and not np.unpackbits(bits, count=len(self)).any():
-            raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
         return bits
+
+    def _usable_parts(self) -> Iterator[np.ndarray]:
+        """The pixels that masks allow, in order, a part at a time."""
+        assert self.usable is not None
+        for begin in range(0, len(self), PART):
+            count = min(PART, len(self) - begin)
+            yield begin + np.flatnonzero(np.unpackbits(self.usable[begin // 8 : -(-(begin + count) // 8)], count=count))
+
+    def usable_pixels(self, rank: np.ndarray) -> np.ndarray:
+        """The pixels of these ranks (R,), ascending, among all that masks allow."""
+        if self.usable is None:
+            return rank
+        found, first = [], 0
+        for part in self._usable_parts():
+            begin, end = np.searchsorted(rank, [first, first + len(part)])
+            found.append(part[rank[begin:end] - first])
+            first += len(part)
+        return np.concatenate(found)
 
     def _build_lookup(self, cameras: Sequence[Camera]) -> None:
         """The tables of directions, and for each view where its own begins and how many knots a row has."""
@@ -113,10 +138,12 @@ class Pixels:
         """Indices of `count` usable pixels, with replacement; with `middle`, of the middle half of the images' sides where any is usable there."""
         if self.usable is None and not middle:
             return rng.integers(len(self), size=count)
+        if self.listed is not None and not middle:
+            return self.listed[rng.integers(len(self.listed), size=count)].astype(np.int64)
         found = np.empty(0, np.int64)
         while len(found) < count:
-            tried = rng.integers(len(self), size=2 * count)
-            if self.usable is not None:
+            tried = self.choose(2 * count, rng) if self.listed is not None else rng.integers(len(self), size=2 * count)
+            if self.usable is not None and self.listed is None:
                 tried = tried[self.usable_at(tried)]
             if middle:
                 tried = tried[self._in_middle(tried)] if self._in_middle(tried).any() else tried

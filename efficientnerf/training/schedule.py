@@ -52,7 +52,8 @@ class Schedule:
 
     def samples_per_pivot_at(self, step: int) -> int:
         """N_s of a step. Few samples on a ray make many rays in a step, which an early field learns more from."""  # docs/experiments/sampling.md
-        return self.early_samples_per_pivot if self.early_samples_per_pivot and self.fraction(step) < 0.5 else self.samples_per_pivot
+        early = self.early_samples_per_pivot and self.fraction(step) < 0.5
+        return min(self.early_samples_per_pivot, self.samples_per_pivot) if early else self.samples_per_pivot
 
     def with_iterations(self, iterations: int, step: int) -> Schedule:
         """The schedule with another number of iterations from `step` on. What it says of the steps up to `step` stays."""

@@ -62,7 +62,7 @@ class TrainSettings:
     )
     samples_per_pivot: Annotated[int, Meta(ge=1, le=16)] = setting(4, "Fine samples N_s in a pivotal interval.", advanced=True)
     early_samples_per_pivot: Annotated[int, Meta(ge=1, le=16)] | Off = setting(
-        2, "Fine samples N_s in a pivotal interval during the first half of the steps; off: samples_per_pivot throughout.", advanced=True
+        2, "Fine samples N_s in a pivotal interval during the first half of the steps, at most samples_per_pivot; off: that many throughout.", advanced=True
     )
     num_importance_samples: Annotated[int, Meta(ge=1, le=4096)] = setting(
         128, "Fine samples N_f of a ray by importance, with sampling valid and hierarchical; uniform adds them to N_c.", advanced=True

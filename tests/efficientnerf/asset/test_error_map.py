@@ -8,7 +8,7 @@ import pytest
 from efficientnerf.asset.refinement import error_map
 from efficientnerf.asset.refinement.error_map import MOST, Drawn, ErrorMap, count_cells
 from efficientnerf.training.patches import PatchGrid
-from tests.efficientnerf.small_views import views
+from tests.efficientnerf.small_views import SIZES, views
 
 
 def chances(drawn_by: ErrorMap) -> np.ndarray:
@@ -117,3 +117,19 @@ def test_what_no_pixel_shows_is_never_drawn() -> None:
     drawn = made.draw(500, np.random.default_rng(5))
     assert isinstance(drawn, Drawn)
     assert set(grid.pixels.view_of(drawn.patches.pixels)) == {0, 2}
+
+
+def test_of_masks_that_keep_little_no_more_patches_are_drawn_than_are_asked_for() -> None:
+    masks = [np.zeros((h, w), bool) for w, h in SIZES]
+    masks[1][5, 3] = True
+    grid = PatchGrid(views(masks), 2)
+    assert grid.usable_tiles is not None
+    usable = np.flatnonzero(grid.usable_tiles)
+    for met in (None, np.ones(len(grid), bool), ~grid.usable_tiles):  # the last: no ray of a usable pixel meets anything
+        made = ErrorMap(grid, met)
+        assert np.flatnonzero(chances(made)).tolist() == usable.tolist()
+        drawn = made.draw(1000, np.random.default_rng(0)).patches
+        assert 900 < len(drawn.pixels) < 1100
+        assert set(drawn.pixels) == {35 + 5 * 4 + 3}
+    one = np.arange(len(grid)) == usable[1]
+    assert np.flatnonzero(chances(ErrorMap(grid, one))).tolist() == [usable[1]]

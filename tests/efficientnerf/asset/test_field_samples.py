@@ -214,12 +214,14 @@ def test_small_parts_go_unless_three_photographs_show_them(made: Made) -> None:
     solid = tree_from_voxels(shape, voxel, low, np.argwhere(np.ones((12, 12, 12), bool)), np.ones(1728), np.zeros((1728, 1, 3)), brick=BRICK)
     at = low + (high + 0.5) * voxel
 
-    def seen_by(views: int) -> FieldSamples:
+    def seen_by(views: int, of: int = 4) -> FieldSamples:
+        """Rays of the first of a capture's views that end in the speck."""
         count = max(1, views)
         away = np.tile([0.0, 0.0, 1.0], (count, 1)).astype(np.float32)
         shade, ones = np.zeros((count, 3), np.uint8), np.ones(count, np.float32)
+        origin = np.tile((at - away[0]).astype(np.float32), (of, 1))
         return FieldSamples(
-            np.arange(count), np.arange(count, dtype=np.int32), (at - away).astype(np.float32), away, ones, np.zeros((count, 3), np.float16),
+            np.arange(count), np.arange(count, dtype=np.int32), origin, away, ones, np.zeros((count, 3), np.float16),
             np.arange(count + 1), ones * np.float32(0.99 if views else 0.2), ones * np.float32(0.02), ones, ones * np.float32(9), shade,
         )  # fmt: skip
 
@@ -234,5 +236,7 @@ def test_small_parts_go_unless_three_photographs_show_them(made: Made) -> None:
     assert speck.sum() == 1
     for views, dropped in ((0, True), (2, True), (3, False)):
         assert unsupported_components(scene, keep, 0.02, seen_by(views))[speck].all() == dropped
+    for views, of, dropped in ((1, 2, True), (2, 2, False), (0, 1, True), (1, 1, False)):  # all the photographs that there are
+        assert unsupported_components(scene, keep, 0.02, seen_by(views, of))[speck].all() == dropped
     assert not unsupported_components(scene, keep, 0.0, seen_by(0)).any()
     assert unsupported_components(scene, keep, 0.02, seen_by(0)).sum() == 1  # the far voxel stays, though nobody's ray ends there

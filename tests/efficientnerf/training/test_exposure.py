@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from efficientnerf.training.exposure import SCALE, exposed, exposure_loss, log_gains
+from efficientnerf.asset.refinement.targets import Targets
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.training.exposure import SCALE, averaged_image, exposed, exposure_loss, log_gains
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
@@ -63,3 +65,25 @@ def test_differences_between_photographs_are_found() -> None:
 
 def test_scenes_on_a_constant_background_have_none() -> None:
     assert trainer(untrained(exposure="gain"), 8).exposure is None
+
+
+def test_an_asset_is_fitted_to_what_the_field_was_photographs_over_their_gains() -> None:
+    """Photographs of one scene that were exposed differently are alike again, on the host and where pixels were sent to a device."""
+    scene = np.random.default_rng(0).integers(40, 120, (3, 8, 6, 3)).astype(np.uint8)
+    gains = np.array([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0], [2.0, 1.5, 0.75]])
+    seen = [np.rint(image * gain).astype(np.uint8) for image, gain in zip(scene, gains, strict=True)]
+    cameras = [Camera(f"{n}.png", 6, 8, "SIMPLE_PINHOLE", (9.0, 3.0, 4.0), np.eye(4)) for n in range(3)]
+    made = Targets(Pixels(cameras, seen, [None] * 3, np.ones(3), np.full(3, 2.0)), None, np.zeros((4, 8, 3), np.float32), gains=gains)
+    index = np.random.default_rng(1).permutation(3 * 48)[:60]
+    for targets in (made, made.sent("cpu")):
+        truth = np.asarray(targets.of(index)[2].colour)
+        assert truth.dtype == np.float32
+        np.testing.assert_allclose(truth, scene.reshape(-1, 3)[index] / 255, atol=1.1 / 255)
+    plain = replace(made, gains=None).of(index)[2].colour
+    np.testing.assert_array_equal(plain, np.concatenate(seen).reshape(-1, 3)[index].astype(np.float32) / np.float32(255))
+
+
+def test_a_photograph_over_its_gains_keeps_its_alpha_and_is_no_brighter_than_white() -> None:
+    image = np.array([[[100, 200, 10, 7], [255, 255, 255, 255]]], np.uint8)
+    assert averaged_image(image, np.array([2.0, 0.5, 1.0])).tolist() == [[[50, 255, 10, 7], [128, 255, 255, 255]]]
+    assert image[0, 0].tolist() == [100, 200, 10, 7]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.training.patches import PatchGrid
-from tests.efficientnerf.small_views import views
+from tests.efficientnerf.small_views import SIZES, views
 
 
 class EveryPatch:
@@ -33,7 +33,9 @@ def test_pixels_of_a_patch_are_neighbours_in_one_view_and_masks_hold() -> None:
     pixels = views([None, keep, np.zeros((3, 1), bool)])
     grid = PatchGrid(pixels, 3)
     rng = np.random.default_rng(1)
-    found = grid.drawn_from(rng.integers(len(grid), size=round(4000 / grid.mean_pixels)), rng)
+    assert grid.usable_tiles is not None
+    tiles = np.flatnonzero(grid.usable_tiles)
+    found = grid.drawn_from(rng.choice(tiles, round(4000 / grid.mean_pixels)), rng)
     assert abs(len(found.pixels) - 4000) < 400
     assert (np.diff(found.first) > 0).all()
     assert found.first[-1] == len(found.pixels)
@@ -45,3 +47,18 @@ def test_pixels_of_a_patch_are_neighbours_in_one_view_and_masks_hold() -> None:
         y, x = np.divmod(found.pixels[a:b] - pixels.offsets[view], pixels.width[view])
         assert np.ptp(x) < 3
         assert np.ptp(y) < 3
+
+
+@pytest.mark.parametrize("side", [1, 2, 4, 16])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 1.0])
+def test_tiles_are_usable_where_some_patch_of_theirs_has_a_pixel(side: int, share: float) -> None:
+    rng = np.random.default_rng(3)
+    masks = [None if n == 2 and share == 0.5 else rng.random((h, w)) < share for n, (w, h) in enumerate(SIZES)]
+    masks[0] = np.ones((5, 7), bool) if share == 0.05 else masks[0]
+    if share == 0:
+        masks[1] = np.arange(36).reshape(9, 4) == 30
+    pixels = views(masks)
+    grid = PatchGrid(pixels, side)
+    every = grid.drawn_from(np.repeat(np.arange(len(grid)), side**2), EveryPatch(len(grid), side))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(np.flatnonzero(grid.usable_tiles), np.unique(every.tile))
+    assert grid.mean_pixels == pytest.approx(len(every.pixels) / (side**2 * len(np.unique(every.tile))))

@@ -48,6 +48,8 @@ def test_it_learns(field: str, rule: str) -> None:
 def test_intervals_are_sampled_more_finely_in_the_second_half_of_the_schedule() -> None:
     steps = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot=2))
     assert [step.fine for step in steps] == [(2 if step.step < 20 else 5) * step.pivotal for step in steps]
+    few = schedule_of(TrainSettings(samples_per_pivot=1))
+    assert [few.samples_per_pivot_at(step) for step in (1, few.iterations)] == [1, 1]
     constant = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot="off"))
     assert all(step.fine == 5 * step.pivotal > 0 for step in constant)
     # A schedule with a revised number of iterations counts by its own fraction: of 40 steps to step 10, then of 20.
