@@ -6,7 +6,7 @@ import contextlib
 import difflib
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -75,6 +75,7 @@ def run_stages(
     Raises PipelineError. What was published before stays; the next call resumes what was interrupted.
     """
     chosen, forced = _selection(stages, until=until, start=start, only=only, force=force)
+    refuse_what_cannot_work(chosen, run, forced)
     if dry_run:
         if only is not None:
             _warn_of_stale_needs(run, stages, only, report, Hashes(run.cache))
@@ -275,6 +276,20 @@ def verify(run: Run, stages: Sequence[Stage], report: Report | None = None) -> l
     if damaged:
         raise CorruptArtifact(f"{run.path}: {artifact.listed(damaged)} not as written. Make anew what is damaged: {run.how_to_resume()}", tuple(damaged))
     return outcomes
+
+
+def refuse_what_cannot_work(stages: Sequence[Stage], run: Run, forced: Collection[str] = ()) -> None:
+    """Raise the UsageError of a stage that cannot work with the settings of the run (`Stage.check`), unless it does not have to run."""
+    if all(stage.check is None for stage in stages):
+        return
+    settings: dict[str, Any] = {stage.name: settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name) for stage in stages}
+    for stage in stages:
+        try:
+            if stage.check is not None:
+                stage.check(settings)
+        except UsageError:
+            if any(decision.stage == stage.name and not decision.fresh for decision in survey(stages, run, forced=forced)):
+                raise
 
 
 def _outcome(stage: Stage, action: str, reason: str | None, made: Manifest) -> Outcome:

@@ -39,6 +39,8 @@ class Stage:
     reads_source  whether it is handed the source; then the files of the source are part of its request
     source_files  (source, settings) -> the files of the source that matter (cheap: they are hashed, not read); None: every file in it
     uses_device   whether it computes on job.device
+    check         takes the settings of the stages that are considered, by name, its own among them, and raises UsageError where it cannot work with them:
+                  called before the first stage runs, so that hours of the stages before it are not spent in vain. Cheap
     volatile      fnmatch patterns of outputs (relative, posix) that depend on the clock: kept and hashed, but outside the
                   artifact's digest, so that a log does not make later stages stale
     """
@@ -51,6 +53,7 @@ class Stage:
     reads_source: bool = False
     source_files: Callable[[Path, Any], list[Path]] | None = None
     uses_device: bool = False
+    check: Callable[[Mapping[str, Any]], None] | None = None
     volatile: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ The scratch folder keeps what takes long: the visibility of the voxels or the fi
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -35,6 +36,7 @@ PSNR_BYTES = 16  # by which a header grows at most, once the PSNR of what is wri
 if TYPE_CHECKING:
     from efficientnerf.asset.refinement.targets import Targets
     from efficientnerf.training.pixels import Pixels
+    from efficientnerf.training.settings import TrainSettings
     from stages.baking.plan import Plan
     from stages.io.scene import Scene
 
@@ -72,8 +74,8 @@ class BakeSettings:
     )
     weight_threshold: Fraction = setting(
         1e-3,
-        "A voxel is kept where its weight in some pixel exceeds this; in forward-facing scenes those that 4 or more training images have in view are baked"
-        " where it exceeds 30 times this.",
+        "A voxel is kept where its weight in some pixel exceeds this; in forward-facing scenes those that 4 or more training images (half of fewer than 7) have"
+        " in view are baked where it exceeds 30 times this.",
         advanced=True,
     )
     max_mib: Annotated[float, Meta(gt=0.0)] | Auto = setting(
@@ -143,15 +145,14 @@ def run(job: Job) -> None:
     from stages.baking.whole_scene import bounds_are_given
     from stages.evaluation.views import constant_background
     from stages.io import scene
-    from stages.io.field_file import load_renderer
+    from stages.io.field_file import gains_of_views, load_renderer
     from stages.io.refined_cameras import load_scene
     from stages.training.data import pixels_of
 
     settings: BakeSettings = job.settings
     use_all_cores()
     m = load_renderer(job.inputs["train"], job.device).model
-    if m.settings.field == "nerf":
-        raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
+    _refuse_nerf(m.settings)
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
     mib, views = _size_limit(job, s, whole=whole), scene.views_of(s, "train")
@@ -164,7 +165,7 @@ def run(job: Job) -> None:
     refuse_more_than_fits(job, m, views, pixels, plan, mib, splits, room)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
-    targets = _targets(s, pixels, plan)
+    targets = _targets(s, pixels, plan, gains_of_views(job.inputs["train"], views))
     tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, phases, room, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
@@ -182,6 +183,17 @@ def run(job: Job) -> None:
     if whole:
         found |= {"cascades": np.bincount(voxel_cascades(tree), minlength=len(plan.grids)).tolist(), "voxel": tree.voxel}
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _refuse_nerf(trained: TrainSettings) -> None:
+    if trained.field == "nerf":
+        raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where the field is to be trained before, and can't be baked then."""
+    if "train" in settings:
+        _refuse_nerf(settings["train"])
 
 
 def _size_limit(job: Job, s: Scene, *, whole: bool) -> float:
@@ -244,20 +256,21 @@ def _check(job: Job, m: Any, plan: Plan) -> None:
     job.say(f"{resolution} voxels along the longest side ({plan.choice.why}); {plan.voxels:,} voxels{of} are baked")
 
 
-def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
+def _targets(s: Scene, pixels: Pixels, plan: Plan, gains: np.ndarray | None) -> Targets:
     """What the tree is fitted to."""
     from efficientnerf.asset.refinement.targets import Targets
     from stages.evaluation.views import constant_background
 
-    return Targets(pixels, constant_background(s), plan.environment, reaches_infinity=plan.space.reaches_infinity)
+    return Targets(pixels, constant_background(s), plan.environment, reaches_infinity=plan.space.reaches_infinity, gains=gains)
 
 
 STAGE = Stage(
     name="bake",
-    version=15,
+    version=16,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,
     uses_device=True,
+    check=check,
     volatile=(BakeOutputs.log, BakeOutputs.curve, f"{BakeOutputs.previews}/*"),
 )

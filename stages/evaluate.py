@@ -36,7 +36,7 @@ from stages.compiling import compiling_kernels
 from stages.evaluation.asset import EvaluatedAsset, evaluated
 from stages.evaluation.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view
 from stages.evaluation.findings import findings
-from stages.evaluation.lpips_weights import load_lpips
+from stages.evaluation.lpips_weights import find_weights, load_lpips
 from stages.evaluation.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
 from stages.evaluation.refinement import refinement_of
 from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
@@ -83,6 +83,18 @@ class EvaluateSettings:
     lpips_weights: str = setting(
         "auto", "Folder with the weights of LPIPS; auto: torch's cache and the package torchmetrics, which are searched in any case.", advanced=True
     )
+
+
+def networks_of(settings: EvaluateSettings) -> tuple[str, ...]:
+    """Of LPIPS, those that are asked for."""
+    return {"off": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where weights of LPIPS are missing."""
+    own: EvaluateSettings = settings["evaluate"]
+    for network in networks_of(own):
+        find_weights(network, given(own.lpips_weights))
 
 
 Measured = str | float | dict[str, int | float | None] | None  # the name of a view, or its metrics
@@ -144,9 +156,8 @@ def evaluate(
     stride = _field_stride([views[k] for k in drawn], given(settings.field_image_scale))
     surrounded = constant_background(scene) is not None or asset.inner is not None
     rest = None if surrounded else stride_for([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
-    wanted = {"off": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
     composited = surrounded and constant_background(scene) is None
-    perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in wanted}
+    perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in networks_of(settings)}
     figures = []
     for k, view in enumerate(views):
         job.safe_point()
@@ -243,4 +254,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=7, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True)
+STAGE = Stage(name="evaluate", version=7, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True, check=check)

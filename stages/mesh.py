@@ -46,7 +46,7 @@ class MeshSettings:
     max_faces: Annotated[int, Meta(ge=100)] | Literal["20k", "100k", "500k"] = setting(
         200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
     )
-    density_threshold: float | Auto = setting(
+    density_threshold: Annotated[float, Meta(gt=0.0)] | Auto = setting(
         "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
     )
     min_component: Fraction = setting(
@@ -268,4 +268,12 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
 
 
-STAGE = Stage(name="mesh", version=14, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))
+STAGE = Stage(
+    name="mesh",
+    version=15,
+    settings=MeshSettings,
+    needs=needs_of(MeshInputs),
+    run=run,
+    check=lambda settings: refuse_normal_map_without_texture(settings["mesh"]),
+    volatile=(MeshOutputs.timings,),
+)

@@ -30,7 +30,7 @@ class PointsSettings:
         "foreground", "What gets points: the subject with what supports it, its edge clipped (foreground), or the whole scene (all).", advanced=True
     )
     num_points: PositiveInt = setting(200_000, "Number of points.")
-    density_threshold: float | Auto = setting(
+    density_threshold: Annotated[float, Meta(gt=0.0)] | Auto = setting(
         "auto",
         "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes.",
         advanced=True,

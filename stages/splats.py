@@ -79,7 +79,7 @@ def gaussians_of(
     if captured is None or settings.pictures == "asset" or settings.region == "foreground":
         views = renders(tree, render_cameras(tree), progress)
     else:
-        views = photographs(captured[0], load_scene(*captured))
+        views = photographs(captured[0], load_scene(*captured), captured[1])
     try:
         return gaussians_of_asset(tree, views, budget_of(settings, [view.camera.width * view.camera.height for view in views]), progress)
     except NothingToShow as error:
@@ -152,7 +152,7 @@ def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     started = time.monotonic()
     tree = restricted(load(inputs_of(SplatsInputs, job.inputs).bake.asset), settings.region)
     captured = job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage]
-    remedy = f"Lower splats.count ({settings.count}) or poses.max_image_size."
+    remedy = f"Lower splats.count ({settings.count}), poses.max_image_size or bake.max_mib."
     refuse_what_does_not_fit(job, needed(tree, settings, captured), remedy)
     gaussians = gaussians_of(tree, settings, job.reached, captured)
     job.safe_point()
@@ -166,4 +166,4 @@ def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     job.say(f"{len(gaussians)} Gaussians in {time.monotonic() - started:.0f} s", gaussians=len(gaussians))
 
 
-STAGE = Stage(name="splats", version=4, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)
+STAGE = Stage(name="splats", version=5, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)

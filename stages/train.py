@@ -12,26 +12,29 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
+from pipeline.errors import UsageError
 from pipeline.stage import Job, Stage
 from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
 from stages.compiling import clock, compiling_kernels
 from stages.cores import use_all_cores
 from stages.training.budget import UNKNOWN, Budget, training_budget
 from stages.training.checkpoints import Checkpoints
-from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, sparse_depth_of, with_camera_refinement
+from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, refuse_planes_out_of_order, sparse_depth_of, with_camera_refinement
 from stages.training.log import TrainLog
 from stages.training.previews import Previews
 
 if TYPE_CHECKING:
     from efficientnerf.training.loop import Trainer
-    from stages.io.scene import View
+    from efficientnerf.training.sparse_depth import SparseDepthRays
+    from stages.io.scene import Scene, View
 
 
 @compiling_kernels
@@ -53,7 +56,7 @@ def run(job: Job) -> None:
     rows = rows_for_training(job, folder, views, settings, space)
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views, rows)
-    near, far = depth_range(s, pixels, settings)
+    near, far = depth_range(s, pixels, settings, job.warn)
     m = model(space, settings, s.background, job.device, (near, far))
     mask_uncovered_cells(m, views, job)
 
@@ -66,7 +69,7 @@ def run(job: Job) -> None:
     budget = begin_budget(job, t, spent + clock() - began)
 
     log.begin_step()
-    for done in loop.train(t, pixels, sparse_depth_of(folder, s)):
+    for done in loop.train(t, pixels, sparse_depth(job, folder, s, settings)):
         log.end_step(done)
         if budget is not None:
             follow_budget(job, t, budget)
@@ -94,6 +97,22 @@ def run(job: Job) -> None:
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
     previews.publish(outputs.previews, job.warn)
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where near and far planes are stated that cannot be used."""
+    own, poses = settings["train"], settings.get("poses")
+    refuse_planes_out_of_order(own)
+    if own.far_plane != "auto" and poses is not None and poses.space == "contracted":
+        raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
+
+
+def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> SparseDepthRays | None:
+    """Rays to sparse points. It is said where there are points and none of them can be used."""
+    found = sparse_depth_of(folder, s, settings.seed)
+    if found is None and s.points and settings.sparse_depth_loss_weight > 0:
+        job.say("no sparse point lies before enough of the training cameras that observe it: train.sparse_depth_loss_weight has no effect")
+    return found
 
 
 def begin_budget(job: Job, t: Trainer, spent: float) -> Budget | None:
@@ -160,10 +179,11 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
 
 STAGE = Stage(
     name="train",
-    version=4,
+    version=5,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,
     uses_device=True,
+    check=check,
     volatile=(TrainOutputs.log, TrainOutputs.curve, f"{TrainOutputs.previews}/*", TrainOutputs.report),
 )

@@ -13,6 +13,7 @@ from efficientnerf.settings import Auto, given, setting
 from pipeline.stage import Job, Stage
 from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
+from stages.scratch import Warn
 
 if TYPE_CHECKING:
     from efficientnerf.geometry.cameras import Camera
@@ -35,7 +36,9 @@ class TurntableSettings:
     width: Annotated[int, Meta(ge=16, le=8192)] = setting(640, "Width of the frames.", unit="pixels")
     height: Annotated[int, Meta(ge=16, le=8192)] = setting(480, "Height of the frames.", unit="pixels")
     fps: Annotated[int, Meta(ge=1, le=240)] = setting(30, "Frames per second of the video.", advanced=True)
-    background: str = setting(
+    background: Annotated[
+        str, Meta(pattern="^(auto|white|black|transparent|#[0-9a-fA-F]{6})$", description="auto, white, black, transparent or a colour as #rrggbb")
+    ] = setting(
         "auto",
         "Background: white, black, transparent or #rrggbb; the video of a transparent one lies on white; auto: the environment where all of a scene is shown,"
         " else white.",
@@ -71,20 +74,22 @@ def run(job: Job) -> None:
 
     s: TurntableSettings = job.settings
     whole = format.load(inputs_of(TurntableInputs, job.inputs).bake.asset)
-    cameras, tree = cameras_of(whole, s), restricted(whole, s.region).to(job.device)
+    cameras, tree = cameras_of(whole, s, job.warn), restricted(whole, s.region).to(job.device)
     del whole
     remedy = f"Lower turntable.width ({s.width}) or turntable.height ({s.height})."
     refuse_what_does_not_fit(job, frames_needed(tree, s.width * s.height, job.device), remedy)
     render_turntable(tree, job, cameras=cameras)
 
 
-def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
-    """The cameras of the turntable's frames; `tree` has the interface of a NerfTree, with its region."""
+def cameras_of(tree: Any, s: TurntableSettings, warn: Warn = lambda text: None) -> list[Camera]:
+    """The cameras of the turntable's frames; `tree` has the interface of a NerfTree, with its region. A warning for each setting that their path has no use
+    for."""
     from stages.framing.camera_paths import turntable_cameras
 
     return turntable_cameras(
         tree, frames=s.frames, width=s.width, height=s.height, elevation=given(s.elevation), radius=given(s.radius), fov=given(s.fov), sway=given(s.sway),
         path=s.path, surroundings=s.region == "all" and tree.region is not None,
+        unused=lambda name, path: warn(f"turntable.{name}={getattr(s, name):g} has no effect: the camera's path is {path} (turntable.path={s.path})"),
     )  # fmt: skip
 
 

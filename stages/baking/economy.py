@@ -85,7 +85,8 @@ def _coded(job: Job, tree: NerfTree, targets: Targets, size: int) -> NerfTree:
         if rate in (low, high):
             break
     if best is None:
-        job.warn(f"the asset takes {took / 2**20:.2f} MiB, more than bake.max_mib: give it a lower bake.resolution")
+        lower = "bake.resolution" if tree.environment is None else "bake.resolution or bake.environment_size"
+        job.warn(f"the asset takes {took / 2**20:.2f} MiB, more than bake.max_mib: give it a lower {lower}")
         return found
     return best
 

@@ -321,8 +321,8 @@ def _is_whole(tree: NerfTree) -> bool:
 
 
 def refinement_steps(settings: BakeSettings, voxels: int, *, whole: bool) -> int:
-    """Steps of the refinement of so many voxels, of a whole scene or of another."""
-    if (stated := given(settings.refine_steps)) is not None:
+    """Steps of the refinement of so many voxels, of a whole scene or of another; the usual ones where bake.time_budget stands in place of a number of them."""
+    if settings.time_budget == "off" and (stated := given(settings.refine_steps)) is not None:
         return stated
     return usual_steps(voxels, settings.refine_rays_per_batch, whole=whole)
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from efficientnerf.settings import given
+from pipeline.errors import UsageError
 
 if TYPE_CHECKING:
     from stages.bake import BakeSettings
@@ -100,6 +101,21 @@ def budget_of(s: Scene, stated: float | None, *, packed: bool = False) -> float:
         return MAX_MIB if stated is None else stated
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
     return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
+
+
+def refuse_without_room(settings: BakeSettings, mib: float, resolution: int, room: int, *, environment: bool) -> None:
+    """UsageError where an asset of so many MiB has no room for a single voxel beside its coarse cells at the least resolution in question, and, of a whole
+    scene, its environment map. Else the voxels would be dropped one and all, and the field be thought empty."""
+    if room > 0:
+        return
+    beside, lower = f"the coarse cells of {resolution} voxels along the longest side", [] if resolution <= MIN_RESOLUTION else [
+        "bake.resolution" if settings.resolution != "auto" else "train.discretise"
+    ]
+    if environment:
+        beside += f" and an environment map of {settings.environment_size} rows"
+        lower.append(f"bake.environment_size ({settings.environment_size})")
+    remedy = "Raise bake.max_mib (--target-mib)" + (f", or lower {' or '.join(lower)}" if lower else "")
+    raise UsageError(f"bake.max_mib={mib:.3g}: has no room for voxels beside {beside}. {remedy}.")
 
 
 def timed_budget(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:

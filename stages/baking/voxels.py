@@ -28,7 +28,13 @@ MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: 
 OVERSHOOT = 1.7  # the same where the resolution is chosen: few of the dilated voxels show. docs/experiments/bake-resolution.md
 # In normalised device coordinates a voxel that fewer training images have in view counts so many times as much: what shows there at the borders of other views
 # is faint in the field. docs/experiments/bake-resolution.md
-WELL_SEEN_VIEWS, FEW_VIEWS_RATIO = 4, 30.0
+WELL_SEEN_VIEWS, FEW_VIEWS_RATIO = 4, 30.0  # of fewer than 7 training images half of them: else all voxels would be seen by few
+
+
+def well_seen_views(count: int) -> int:
+    """How many of so many training images see a voxel well."""
+    return min(WELL_SEEN_VIEWS, -(-count // 2))
+
 
 
 def voxel_space(job: Job, m: Any) -> Space:
@@ -51,7 +57,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     """The asset's resolution; the visibility of the voxels to bake, which will be split so often to have it, and their coordinates (N, 3)."""
     from efficientnerf.asset import bake
     from efficientnerf.asset.file import serialisation
-    from stages.baking.resolution import affordable_resolution, baked_resolution
+    from stages.baking.resolution import MIN_RESOLUTION, affordable_resolution, baked_resolution, refuse_without_room
 
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick_size
@@ -61,7 +67,10 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
         return serialisation.most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, shape, brick)
 
     finest = choice = finest_choice(settings, m, s)
-    if (given(settings.resolution) or given(m.settings.discretise)) is not None:
+    fixed = (given(settings.resolution) or given(m.settings.discretise)) is not None
+    least = finest.resolution if fixed else MIN_RESOLUTION
+    refuse_without_room(settings, mib, least, room(least), environment=False)
+    if fixed:
         shape, voxel = bake.grid_of(bounds, baked_resolution(choice.resolution, splits), brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         visibility = by_views(job, s, visibility, shape, voxel, space)
@@ -107,12 +116,12 @@ def by_views(job: Job, s: Scene, visibility: Visibility, shape: tuple[int, int, 
 
 
 def seen_by_few(job: Job, s: Scene, ndc: Ndc, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: which points (N, 3) in normalised device coordinates fewer than WELL_SEEN_VIEWS training images have in view, by pixels that are kept."""
+    """(N,) bool: which points (N, 3) in normalised device coordinates fewer training images have in view than `well_seen_views`, by pixels that are kept."""
     from stages.framing.view_coverage import count_views, kept_pixels
     from stages.io import scene
 
     views = scene.views_of(s, "train")
-    return count_views(ndc.world(points), [view.camera for view in views], kept_pixels(job.inputs["poses"], views)) < WELL_SEEN_VIEWS
+    return count_views(ndc.world(points), [view.camera for view in views], kept_pixels(job.inputs["poses"], views)) < well_seen_views(len(views))
 
 
 def finest_choice(settings: BakeSettings, m: Any, s: Scene) -> Choice:
@@ -167,7 +176,14 @@ def _heaviest_voxels(job: Job, visibility: Visibility, shape: tuple[int, int, in
         # Dilated voxels are about in proportion to the visible ones; a little less, so that this ends soon.
         weights = weights[-max(1, int(0.95 * len(weights) * most / len(indices))) :]
         indices = bake.chosen_voxels(visibility, shape, settings.brick_size, float(weights[0]), settings.dilate)
+    if not len(indices) and len(weights):  # of equals all, where none is heavier
+        indices = bake.chosen_voxels(visibility, shape, settings.brick_size, just_below(weights[0]), settings.dilate)
     return indices
+
+
+def just_below(weight: np.float32) -> float:
+    """The next smaller weight, as a threshold that a weight has to exceed."""
+    return float(np.nextafter(weight, np.float32(-1)))
 
 
 CENTRES_PER_BLOCK = 2**20

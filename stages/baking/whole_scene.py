@@ -22,6 +22,7 @@ from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.baking.plan import Plan
 from stages.baking.scratch import read_arrays, write_arrays
+from stages.baking.voxels import just_below
 from stages.io.json_file import read_json
 from stages.scratch import unusable
 
@@ -55,13 +56,18 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
 def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> Plan:
     """The cascades, their voxels, which will be split so often, the region and the environment."""
     from efficientnerf.asset.field_samples import cascade_visibility, environment_beyond, seen_weights
-    from stages.baking.resolution import Choice, affordable_resolution, baked_resolution, finest_of_cascades
+    from stages.baking.resolution import MIN_RESOLUTION, Choice, affordable_resolution, baked_resolution, finest_of_cascades, refuse_without_room
     from stages.baking.voxels import MAX_OVERSHOOT, OVERSHOOT
 
     settings: BakeSettings = job.settings
+    stated, discretise = given(settings.resolution), given(m.settings.discretise)
+    fixed = stated or discretise
+    least = fixed or MIN_RESOLUTION
+    # Before the field is rendered the region is not known: only that its longest side has so many voxels.
+    line: Grid = ((-(-least // settings.brick_size), 1, 1), 1.0, np.zeros(3))
+    refuse_without_room(settings, mib, least, room_of(settings, m, [line], mib), environment=True)
     samples = _samples(job, m, pixels)
     job.safe_point()
-    discretise: int | None = given(m.settings.discretise)
     region = region_of(samples, pixels, s, job.inputs["poses"])
     # A field that was trained on the voxels of its box is baked on these.
     bounds = np.asarray(m.space.bounds if discretise else region.bounds, np.float64)
@@ -84,8 +90,8 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
             last = resolution, grids, seen, chosen_of(seen, grids, settings, settings.weight_threshold)
         return last
 
-    stated = given(settings.resolution)
-    if (fixed := stated or discretise) is not None:
+    refuse_without_room(settings, mib, least, room(least), environment=True)
+    if fixed is not None:
         choice = Choice(fixed, "bake.resolution" if stated else "train.discretise")
     else:
         finest = finest_of_cascades(s, bounds, count, settings.brick_size, given(settings.max_resolution))
@@ -104,8 +110,8 @@ def room_of(settings: BakeSettings, m: Any, grids: Sequence[Grid], mib: float, *
     from efficientnerf.asset.file.serialisation import most_voxels
 
     cells = sum(math.prod(shape) for shape, _, _ in grids)
-    size = int(mib * 2**20) - (24 * settings.environment_size**2 if environment else 0)  # float32
-    return most_voxels(size, settings.layout, m.fine.degree, (cells, 1, 1), settings.brick_size)
+    rows = settings.environment_size if environment else 0
+    return most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, (cells, 1, 1), settings.brick_size, environment=rows)
 
 
 def grids_of(bounds: np.ndarray, resolution: int, brick: int, count: int, lattice: np.ndarray | None) -> list[Grid]:
@@ -190,6 +196,8 @@ def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], ind
         # Dilated voxels are about in proportion to the visible ones; a little less, so that this ends soon.
         weights = weights[-max(1, int(0.95 * len(weights) * most / count)) :]
         indices = chosen_of(seen, grids, settings, float(weights[0]))
+    if not any(map(len, indices)) and len(weights):  # of equals all, where none is heavier
+        indices = chosen_of(seen, grids, settings, just_below(weights[0]))
     return indices
 
 

@@ -27,15 +27,21 @@ def load_lpips(network: str, folder: str | None, *, bundled: Sequence[Path] | No
     """
     from efficientnerf.evaluation.lpips import Lpips
 
+    backbone, heads = find_weights(network, folder, bundled=bundled)
+    try:
+        return Lpips(network, _state(backbone), _state(heads))
+    except ValueError as error:
+        raise BadInput(f"LPIPS, {backbone.name} with {heads}: {error}. Get the files again.") from None
+
+
+def find_weights(network: str, folder: str | None, *, bundled: Sequence[Path] | None = None) -> tuple[Path, Path]:
+    """The files of the network and of the heads; as `load_lpips`, without opening them."""
     places = [Path(folder)] if folder else []
     hub = Path(os.environ.get("TORCH_HOME", Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")).expanduser() / "hub" / "checkpoints"
     backbone = _found(BACKBONES[network], [*places, hub], f"Download {SITE}{BACKBONES[network]} into one of them, or name its folder: evaluate.lpips_weights.")
     folders = [*places, *(in_torchmetrics() if bundled is None else bundled)]
     heads = _found(f"{network}.pth", folders, "Install the extra that brings it: pip install 'efficientnerf[lpips]'.")
-    try:
-        return Lpips(network, _state(backbone), _state(heads))
-    except ValueError as error:
-        raise BadInput(f"LPIPS, {backbone.name} with {heads}: {error}. Get the files again.") from None
+    return backbone, heads
 
 
 def in_torchmetrics() -> list[Path]:

@@ -7,7 +7,7 @@ part of the sphere that these cover, at their distance.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -198,6 +198,7 @@ def turntable_cameras(
     sway: float | None = None,
     path: str = "auto",
     surroundings: bool = False,
+    unused: Callable[[str, str], object] = lambda name, path: None,
 ) -> list[Camera]:
     """The cameras of a turntable, pinholes in the training frame.
 
@@ -207,16 +208,21 @@ def turntable_cameras(
     sway       degrees, see turntable_poses; None: as far as the captured cameras go, or SWAY where the asset keeps none
     path       see PATHS; auto: a sway for a capture that does not go round, else an orbit; for a forward-facing asset a spiral among the capture's cameras,
                unless an elevation or a radius is given
+    unused     takes each of elevation, radius and sway that is given and that the path has no use for, and what the path is
     surroundings  whether they are shown: then the camera does not move back, where something may be in the way, and sees wider instead
 
     Raises BadInput for `captured` where the asset keeps no cameras, and for metadata that make no path.
     """
     if path == "captured":
+        _leave_out(unused, "past the captured cameras", elevation=elevation, radius=radius, sway=sway)
         return captured_cameras(tree, frames, width, height, fov)
     if tree.ndc is not None and path == "auto" and elevation is None and radius is None:
+        _leave_out(unused, "a spiral among the captured cameras", sway=sway)
         return _spiral_cameras(tree, tree.ndc, frames, width, height, fov)
     points = occupied_points(tree)
-    orbit, sway, rise = _framed_orbit(tree, points, path, sway)
+    orbit, amplitude, rise = _framed_orbit(tree, points, path, sway)
+    if not orbit.forward_facing:
+        _leave_out(unused, "a circle", sway=sway)
     distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
     orbit = replace(orbit, radius=distance, elevation=orbit.elevation if elevation is None else elevation)
     widest = math.tan(math.radians((MAX_SURROUNDING_FOV if surroundings else MAX_FITTED_FOV if tree.region is None else MAX_REGION_FOV) / 2))
@@ -224,19 +230,26 @@ def turntable_cameras(
     def needed(poses: list[np.ndarray]) -> float:
         return FIT_MARGIN * fitted_field_of_view(poses, points, width / height)[0]
 
-    poses = turntable_poses(orbit, frames, sway=sway, rise=rise)
+    poses = turntable_poses(orbit, frames, sway=amplitude, rise=rise)
     # Captures from one side have nothing beyond the borders of their images: without a region the camera keeps its distance, and the asset may be cropped.
     if radius is None and fov is None and not surroundings and (tree.region is not None or not orbit.forward_facing):
         for _ in range(60):
             if needed(poses) <= widest:
                 break
             orbit = replace(orbit, radius=1.1 * orbit.radius)
-            poses = turntable_poses(orbit, frames, sway=sway, rise=rise)
+            poses = turntable_poses(orbit, frames, sway=amplitude, rise=rise)
     half, drop = fitted_field_of_view(poses, points, width / height)
     half, drop = (min(widest, FIT_MARGIN * half), drop) if fov is None else (math.tan(math.radians(fov / 2)), 0.0)
     focal = 0.5 * height / half
     lens = (focal, width / 2, height / 2 - focal * drop)
     return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
+
+
+def _leave_out(unused: Callable[[str, str], object], path: str, **settings: float | None) -> None:
+    """Tell which of these settings are given."""
+    for name, value in settings.items():
+        if value is not None:
+            unused(name, path)
 
 
 def _framed_orbit(tree: NerfTree, points: np.ndarray, path: str, sway: float | None) -> tuple[Orbit, float, float | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from efficientnerf.model import Model
     from efficientnerf.rendering.field_renderer import FieldRenderer
     from efficientnerf.training.schedule import Schedule
-    from stages.io.scene import Scene
+    from stages.io.scene import Scene, View
 
 FORMAT = 1
 
@@ -129,6 +130,8 @@ def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, n
 def load_gains(folder: Path) -> dict[str, np.ndarray]:
     """What `save_model` was given: the factors (3,) of each training view; none where exposure was not learned."""
     path = TrainOutputs(folder).field
+    if not _names_gains(path):
+        return {}
     tensors, about = read_tensors(path)
     names = about.get("exposed", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -139,6 +142,24 @@ def load_gains(folder: Path) -> dict[str, np.ndarray]:
         found = tuple(tensors[GAINS].shape) if GAINS in tensors else None
         raise CorruptArtifact(f"{path}: '{GAINS}' is {found}; expected {(len(names), 3)}. Train again.")
     return dict(zip(names, tensors[GAINS].numpy(), strict=True))
+
+
+def _names_gains(path: Path) -> bool:
+    """Whether a field file has gains, by its head alone: where exposure was not learned, nobody waits for the rest. One that cannot be read has none: it is
+    refused where the field is needed."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with opened(path), safe_open(path, framework="pt", device="cpu") as file:
+            return GAINS in file.keys() or '"exposed"' in (file.metadata() or {}).get("field", "")  # noqa: SIM118 (not a dict)
+    except (SafetensorError, ValueError, OSError, TypeError):
+        return False
+
+
+def gains_of_views(folder: Path, views: Sequence[View]) -> np.ndarray | None:
+    """(C, 3) the gains of views from the scene's colours to the photograph's, as the train stage in `folder` learned them, 1 for others; None: none were."""
+    known = load_gains(folder)
+    return np.stack([known.get(view.image, np.ones(3, np.float32)) for view in views]) if known else None
 
 
 def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:

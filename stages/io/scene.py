@@ -12,6 +12,7 @@ Training frame: right-handed, z up, origin at the centre of the box, the largest
 from __future__ import annotations
 
 import contextlib
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -251,19 +252,31 @@ def save_points(points: SparsePoints, folder: Path) -> None:
     """Write folder/points.safetensors; `points` in the training frame, tracks as indices into the scene's views."""
     from safetensors.numpy import save
 
-    counts = np.array([len(track) for track in points.tracks], np.int64)
+    counts = np.fromiter(map(len, points.tracks), np.int64, len(points.tracks))
     tensors = {
         "xyz": np.ascontiguousarray(points.xyz, np.float64),
         "rgb": np.ascontiguousarray(points.rgb, np.uint8),
         "error": np.ascontiguousarray(points.error, np.float64),
         "observer_counts": counts,
-        "observers": np.array([view for track in points.tracks for view in track], np.int64),
+        "observers": np.fromiter(itertools.chain.from_iterable(points.tracks), np.int64, int(counts.sum())),
     }
     PosesOutputs(folder).points.write_bytes(save(tensors))  # save_file() would leave it to its owner alone, whatever the umask
 
 
 def read_points(folder: Path) -> SparsePoints:
     """The sparse points in the training frame; tracks are indices into the scene's views. Raises CorruptArtifact."""
+    xyz, rgb, error, counts, observers = _point_arrays(folder)
+    tracks = np.split(observers, np.cumsum(counts)[:-1]) if len(counts) else []
+    return SparsePoints(xyz, rgb, error, tuple(tuple(track.tolist()) for track in tracks))
+
+
+def read_observations(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the sparse points their places (P, 3), how many views observe each (P,), and these views (O,) point by point. Raises CorruptArtifact."""
+    xyz, _, _, counts, observers = _point_arrays(folder)
+    return xyz, counts, observers
+
+
+def _point_arrays(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
@@ -280,8 +293,7 @@ def read_points(folder: Path) -> SparsePoints:
         raise CorruptArtifact(f"{printable(path)}: sparse points whose shapes, types or counts do not agree. {AGAIN}")
     if not np.isfinite(xyz).all():
         raise CorruptArtifact(f"{printable(path)}: sparse points that are not finite. {AGAIN}")
-    ends = np.cumsum(counts)
-    return SparsePoints(xyz, rgb, error, tuple(tuple(track.tolist()) for track in np.split(observers, ends[:-1])) if count else ())
+    return xyz, rgb, error, counts, observers
 
 
 def describe(folder: Path) -> dict[str, Any]:
@@ -314,7 +326,7 @@ def describe(folder: Path) -> dict[str, Any]:
         "background": scene.background,
         "space": scene.space,
         "masks": sum(view.mask is not None for view in scene.views),
-        "points": len(read_points(folder).xyz) if scene.points else 0,
+        "points": len(read_observations(folder)[0]) if scene.points else 0,
         "metric": scene.metric,
         "world_from_capture": {
             "scale": scene.world_from_capture.scale,

@@ -10,8 +10,9 @@ from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
+from stages.artifacts import PosesOutputs
 from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
-from stages.training.data import channels_of, count_pixels
+from stages.training.data import MOST_OBSERVATIONS, channels_of, count_pixels
 
 if TYPE_CHECKING:
     from efficientnerf.geometry.spaces import Space
@@ -19,9 +20,11 @@ if TYPE_CHECKING:
     from stages.io.scene import View
 
 PIXELS = "training pixels"
-# Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes.
+# Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes;
+# sparse points, over those of their file, and an observation of one that is used: its rays and what they are made of.
 DIRECTION, DENSITY_VOXEL = 220, 26
 TABLES, SAVED = 4, 6  # of float32 for each parameter: itself, its gradient, Adam's moments; and while a checkpoint is written, three of these twice
+POINTS, OBSERVATION = 4, 250
 DECODED = 3  # images at a time while they are read: as decoded, and as they are put in rows
 
 
@@ -30,14 +33,15 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
 
     stored  whether the pixels are in a file
     """
-    from efficientnerf.training.pixels import EXACT, STRIDE
+    from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE
 
     cameras = [view.camera for view in views]
     total = count_pixels(tuple(views))
     lenses = {(camera.width, camera.height, camera.model, camera.params) for camera in cameras}
     every = 1 if sum(width * height for width, height, *_ in lenses) <= EXACT else STRIDE
     knots = [(width // every + 2) * (height // every + 2) for width, height, *_ in lenses]
-    masks = total // 8 if any(view.mask is not None for view in views) else 0
+    # Bits of all pixels, and the numbers of those that are listed.
+    masks = total // 8 + int(4 * LISTED_SHARE * total) if any(view.mask is not None for view in views) else 0
     largest = max(camera.width * camera.height for camera in cameras)
     return {
         PIXELS: (0 if stored else total * channels) + masks,
@@ -74,7 +78,9 @@ def sample_bytes(settings: TrainSettings) -> int:
     return 2 * settings.hidden_dim * settings.num_layers + 4 * (4 * 63 + 6 * outputs + 32)
 
 
-def needed(settings: TrainSettings, views: Sequence[View], channels: int, intervals: int, voxels: int, *, stored: bool, device: str = "cpu") -> Need:
+def needed(
+    settings: TrainSettings, views: Sequence[View], channels: int, intervals: int, voxels: int, *, stored: bool, device: str = "cpu", points: int = 0
+) -> Need:
     """What training takes.
 
     settings   with numbers for what is "auto" (`stages.training.hash_resolution`)
@@ -82,6 +88,7 @@ def needed(settings: TrainSettings, views: Sequence[View], channels: int, interv
     intervals  on a ray, at most
     voxels     D, density voxels along a side
     stored     whether the pixels are in a file
+    points     bytes of the file of sparse points
     """
     pixels = pixels_needed(views, channels, stored=stored)
     reading = pixels["reading images"] + pixels["directions of pixels"]
@@ -91,6 +98,7 @@ def needed(settings: TrainSettings, views: Sequence[View], channels: int, interv
         "a step's samples, or reading images": max(step, reading),
         "parameters and checkpoints": 4 * (TABLES + SAVED) * parameters(settings),
         "density voxels": DENSITY_VOXEL * voxels**3,
+        "sparse points": POINTS * points + OBSERVATION * min(MOST_OBSERVATIONS, points // 8),
         "libraries": libraries(device),
     })  # fmt: skip
 
@@ -133,4 +141,6 @@ def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettin
     coarse_samples = given(settings.num_coarse_samples) or space.num_coarse_samples
     intervals = space.max_intervals(space.sampled_length(None) / coarse_samples)
     voxels = given(settings.occupancy_resolution) or space.occupancy_resolution
-    return needed(settings, views, channels_of(folder, views), intervals, voxels, stored=stored, device=device)
+    file = PosesOutputs(folder).points
+    points = file.stat().st_size if file.is_file() else 0
+    return needed(settings, views, channels_of(folder, views), intervals, voxels, stored=stored, device=device, points=points)

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.surface.mesh import Mesh
     from efficientnerf.surface.texturing.photographs import Photograph
@@ -53,7 +51,7 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
     if not views:
         return None
     surveys, steps = [], 2 * len(views)
-    for number, photo in enumerate(photographs(inputs.poses.folder, views)):
+    for number, photo in enumerate(photographs(inputs, views)):
         progress(number, steps, "texture")
         surveys.append(survey(mesh.vertices, mesh.faces, mesh.normals, mesh.colours, photo, partial(progress, number, steps, "texture")))
     density = np.max([each.density for each in surveys], axis=0)
@@ -61,7 +59,7 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
     sharpness = float(np.median([each.sharpness for each in surveys]))
     progress(len(views), steps, "charts")
     texels = PhotographTexture(mesh.vertices, mesh.faces, mesh.normals, atlas, density, sharpness)
-    for number, photo in enumerate(photographs(inputs.poses.folder, views)):
+    for number, photo in enumerate(photographs(inputs, views)):
         progress(len(views) + number, steps, "texture")
         texels.look(photo, surveys[number], partial(progress, len(views) + number, steps, "texture"))
     colours, known = texels.finished(mesh, partial(progress, steps, steps, "texture"))
@@ -102,13 +100,17 @@ def largest_photograph(inputs: MeshInputs, choice: str) -> int:
     return max((view.camera.width * view.camera.height for view in views_of(load(inputs.poses.folder), "train")), default=0)
 
 
-def photographs(folder: Path, views: tuple[View, ...]) -> Iterator[Photograph]:
-    """The photographs of views, read when they are asked for."""
+def photographs(inputs: MeshInputs, views: tuple[View, ...]) -> Iterator[Photograph]:
+    """The photographs of views, read when they are asked for; where training learned their exposure, as if all had been exposed alike."""
     from efficientnerf.surface.texturing.photographs import photograph
+    from efficientnerf.training.exposure import averaged_image
+    from stages.io.field_file import gains_of_views
     from stages.io.scene import read_image, read_mask
 
-    for view in views:
-        yield photograph(view.camera, read_image(folder, view), read_mask(folder, view))
+    gains = gains_of_views(inputs.train.folder, views)
+    for number, view in enumerate(views):
+        image = read_image(inputs.poses.folder, view)
+        yield photograph(view.camera, image if gains is None else averaged_image(image, gains[number]), read_mask(inputs.poses.folder, view))
 
 
 def facts_of(report: dict[str, Any]) -> str:

@@ -19,17 +19,23 @@ LONGER_SIDE = 640  # pixels, of renders at most
 ORBIT = 36  # cameras round an asset that keeps none of its capture
 
 
-def photographs(folder: Path, scene: Scene) -> list[View]:
+def photographs(folder: Path, scene: Scene, trained: Path) -> list[View]:
     """The training photographs at working size, with the alpha that cuts an object out of a constant background; else alpha masks.
 
-    folder  of the scene
+    folder   of the scene
+    trained  of the stage train: where it learned the photographs' exposure, they are as if all had been exposed alike
     """
     from efficientnerf.splats.build import View
+    from efficientnerf.training.exposure import averaged_image
+    from stages.io.field_file import gains_of_views
     from stages.io.scene import read_image, read_mask, views_of
 
     found = []
-    for view in views_of(scene, "train"):
+    views = views_of(scene, "train")
+    gains = gains_of_views(trained, views)
+    for number, view in enumerate(views):
         pixels, mask = read_image(folder, view), read_mask(folder, view)
+        pixels = pixels if gains is None else averaged_image(pixels, gains[number])
         if pixels.shape[2] == 4 and scene.background is None:
             covered = pixels[..., 3] >= 128
             pixels, mask = np.ascontiguousarray(pixels[..., :3]), covered if mask is None else mask & covered

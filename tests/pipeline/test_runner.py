@@ -5,6 +5,7 @@ import errno
 import itertools
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -425,3 +426,29 @@ def test_a_file_too_many_is_a_warning(run: Run) -> None:
 
 def test_verify_of_what_is_not_there_yet(run: Run) -> None:
     assert verify(run, STAGES) == []
+
+
+def test_settings_that_cannot_work_are_refused_before_the_first_stage_runs(run: Run) -> None:
+    asked: list[dict[str, object]] = []
+
+    def refuse(settings: Mapping[str, object]) -> None:
+        asked.append(dict(settings))
+        raise UsageError("double cannot work with count")
+
+    stages = replaced("double", check=refuse)
+    for dry in (False, True):
+        with pytest.raises(UsageError, match="double cannot work"):
+            run_stages(run, stages, dry_run=dry)
+    assert not run.folder("list").exists()
+    assert set(asked[0]) == {stage.name for stage in stages}
+    assert type(asked[0]["count"]) is COUNT.settings
+    # Not where it is not to run, or is up to date; but where what it needs is to run again.
+    assert actions(run_stages(run, stages, until="count")) == {"list": "ran", "count": "ran"}
+    run_stages(run, STAGES)
+    assert set(actions(run_stages(run, stages)).values()) == {"skipped"}
+    set_one(run, "count", steps=9)
+    with pytest.raises(UsageError, match="double cannot work"):
+        run_stages(run, stages)
+    with pytest.raises(UsageError, match="double cannot work"):
+        run_stages(run, stages, only="double", force=True)
+    assert set(asked[-1]) == {"double"}

@@ -291,13 +291,34 @@ def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None
         run(job(tmp_path, QUICK, poses=inputs["poses"], train=tmp_path / "train"))
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"resolution": 1024, "max_mib": 2.0}, r"bake\.max_mib=2: has no room .* the coarse cells of 1024 .*Raise bake\.max_mib .*lower bake\.resolution\.$"),
+        ({"resolution": "auto", "max_mib": 0.02}, r"bake\.max_mib=0\.02: has no room .*of 32 voxels along .*\. Raise bake\.max_mib \(--target-mib\)\.$"),
+    ],
+)
+def test_a_size_without_room_for_a_voxel_is_refused_before_the_field_is_rendered(
+    changes: dict[str, Any], said: str, inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(baking, "visible_voxels", lambda *_: pytest.fail("the field was rendered"))
+    with pytest.raises(UsageError, match=said):
+        run(job(tmp_path, dataclasses.replace(QUICK, **changes), **inputs))
+
+
+def test_a_size_with_room_for_few_voxels_holds_some(inputs: dict[str, Path], tmp_path: Path) -> None:
+    made = job(tmp_path, dataclasses.replace(QUICK, resolution="auto", max_mib=0.028, layout="sparse", refine_steps=1), **inputs)
+    run(made)
+    assert len(format.load(made.out / BakeOutputs.asset).density_values) > 0
+
+
 def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is room the pixels decide, else the room, and the coarser asset is as if that resolution had been asked for."""
     fitted = dataclasses.replace(QUICK, resolution=0, samples_per_voxel=1, refine_steps=2, weight_threshold=0.0)
     monkeypatch.setattr(resolution, "VOXEL_PIXELS", 0.2)
     sizes = {}
     for room in (10**7, 20_000):
-        monkeypatch.setattr(serialisation, "most_voxels", lambda *asked, room=room: room)
+        monkeypatch.setattr(serialisation, "most_voxels", lambda *asked, room=room, **beside: room)
         told: list[dict[str, Any]] = []
         made = job(tmp_path / str(room), fitted, **inputs)
         made._report = told.append

@@ -14,6 +14,7 @@ import pytest
 
 from efficientnerf.asset import field_samples, format
 from efficientnerf.asset.cascades import cascade_sides, cascades_of, subset, voxel_cascades
+from efficientnerf.asset.file.serialisation import bytes_per_voxel
 from efficientnerf.asset.refinement import schedule
 from efficientnerf.asset.refinement.schedule import Phase
 from efficientnerf.asset.rendering import render
@@ -28,7 +29,7 @@ from stages.baking import holes, pruning, resolution, whole_scene
 from stages.baking.resolution import MAX_CELLS, MAX_MIB, budget_of, finest_of_cascades
 from stages.framing.view_coverage import close_to_path
 from stages.io import field_file
-from stages.io.png import write_png
+from stages.io.png import read_png, write_png
 from stages.io.scene import Scene, View, load, save
 from tests.efficientnerf.surroundings import GROUND, WALL, around, photographs, surroundings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job
@@ -100,6 +101,43 @@ def test_a_view_that_was_held_back_is_shown_whole_by_the_asset_alone(inputs: dic
     assert report["optimisation"]["psnr_after"] > report["optimisation"]["psnr_before"] > 10
     assert set(report["optimisation"]["holes"]) == {"pruned", "restored", "refined", "voxels_restored"}
     assert report["optimisation"]["holes"]["refined"] < 0.02
+
+
+def test_a_size_that_the_environment_map_fills_is_refused_before_the_field_is_rendered(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field_samples, "field_samples", lambda *_: pytest.fail("the field was rendered"))
+    for changes, lower in (({"resolution": "auto"}, "lower "), ({}, r"lower bake\.resolution or ")):
+        with pytest.raises(UsageError, match=rf"max_mib=5: has no room .*map of 1024 rows\. Raise bake\.max_mib.*{lower}bake\.environment_size \(1024\)\.$"):
+            baked(tmp_path, inputs, max_mib=5.0, environment_size=1024, **changes)
+
+
+def test_the_room_of_a_whole_scene_counts_the_bytes_that_the_file_holds(inputs: dict[str, Path], undisturbed: tuple[Path, int]) -> None:
+    """The file keeps the environment map in bytes."""
+    m, grid = surroundings(), ((8, 8, 8), 0.1, np.zeros(3))
+    with_map, without = (whole_scene.room_of(replace(QUICK, environment_size=256, layout="sparse"), m, [grid], 20.0, environment=on) for on in (True, False))
+    per_voxel = bytes_per_voxel("sparse", m.fine.degree) + 8 / 16
+    assert (without - with_map) * per_voxel == pytest.approx(6 * 256**2, abs=per_voxel)
+
+
+def test_what_training_learned_of_the_exposure_is_left_out_of_the_asset(
+    inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photographs half of which were exposed less: with their gains the asset is as good as of those that were not."""
+    shutil.copytree(inputs["poses"], tmp_path / "poses")
+    darker = {f"images/{camera.name}": 1.0 if n % 2 else 0.6 for n, camera in enumerate(around(9)[:8])}
+    for name, gain in darker.items():
+        path = tmp_path / "poses" / name
+        write_png(np.rint(read_png(path) * gain).astype(np.uint8), path)
+    psnr = {}
+    for known in (True, False):
+        gains = {name: np.full(3, gain, np.float32) for name, gain in darker.items()} if known else {}
+        monkeypatch.setattr(field_file, "load_gains", lambda folder, gains=gains: gains)
+        _, report = baked(tmp_path / str(known), {**inputs, "poses": tmp_path / "poses"})
+        psnr[known] = report["optimisation"]["psnr_after"]
+    usual = json.loads((undisturbed[0] / "out" / "report.json").read_text())["optimisation"]["psnr_after"]
+    assert psnr[True] == pytest.approx(usual, abs=0.3)
+    assert psnr[False] < usual - 2
 
 
 def test_the_same_twice_and_stopped_anywhere(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int]) -> None:

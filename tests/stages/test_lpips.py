@@ -10,6 +10,7 @@ import torch
 
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
+from stages.evaluate import STAGE, EvaluateSettings
 from stages.evaluation.comparison import AGAINST_NETWORK, GAP, lpips_metrics
 from stages.evaluation.lpips_weights import BACKBONES, load_lpips
 from stages.evaluation.mesh import FIGURES
@@ -121,3 +122,14 @@ def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
     assert found["network"]["lpips_alex"] == figures["lpips_alex"]
     assert found["asset"]["lpips_alex"] is None
     assert Lpips.__doc__
+
+
+def test_missing_weights_are_told_before_any_stage_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert STAGE.check is not None
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "none"))
+    folder = written(tmp_path / "weights", "alex")
+    STAGE.check({"evaluate": EvaluateSettings()})
+    STAGE.check({"evaluate": EvaluateSettings(lpips="alex", lpips_weights=str(folder))})
+    for lpips in ("vgg", "both"):
+        with pytest.raises(UsageError, match=r"vgg16.*were not found"):
+            STAGE.check({"evaluate": EvaluateSettings(lpips=lpips, lpips_weights=str(folder))})

@@ -18,6 +18,7 @@ from stages import splats
 from stages.artifacts import SplatsOutputs
 from stages.evaluation.splats import load_splats
 from stages.framing.captured import captured_metadata
+from stages.io import field_file
 from stages.io.exporters.splats.ply import read_splats
 from stages.io.exporters.writing import source_frame
 from stages.io.png import read_png
@@ -125,13 +126,25 @@ def test_the_same_pictures_give_the_same_bytes_and_others_do_not(made: SplatsOut
 
 def test_photographs_keep_the_alpha_of_an_object_and_are_masked_by_it_elsewhere(inputs: dict[str, Path]) -> None:
     scene = load_scene(inputs["poses"])
-    some = photographs(inputs["poses"], scene)
+    some = photographs(inputs["poses"], scene, inputs["train"])
     assert [view.camera.name for view in some] == [view.camera.name for view in scene.views if view.split == "train"]
     assert some[0].pixels.shape == (16, 16, 4)
     assert some[0].mask is None
-    around = photographs(inputs["poses"], replace(scene, background=None))
+    around = photographs(inputs["poses"], replace(scene, background=None), inputs["train"])
     assert around[0].pixels.shape == (16, 16, 3)
     np.testing.assert_array_equal(around[0].mask, some[0].pixels[..., 3] >= 128)
+
+
+def test_photographs_are_as_if_all_had_been_exposed_alike(inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(inputs["poses"])
+    plain = photographs(inputs["poses"], scene, inputs["train"])
+    names = [view.image for view in scene.views if view.split == "train"]
+    monkeypatch.setattr(field_file, "load_gains", lambda folder: {names[1]: np.array([2.0, 1.0, 0.5], np.float32)})
+    some = photographs(inputs["poses"], scene, inputs["train"])
+    np.testing.assert_array_equal(some[0].pixels, plain[0].pixels)
+    wanted = np.clip(np.rint(plain[1].pixels[..., :3] / np.array([2.0, 1.0, 0.5])), 0, 255)
+    assert np.abs(some[1].pixels[..., :3] - wanted).max() <= 1
+    np.testing.assert_array_equal(some[1].pixels[..., 3], plain[1].pixels[..., 3])
 
 
 def test_an_asset_alone_is_fitted_to_its_own_renders(inputs: dict[str, Path]) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import CorruptArtifact, Interrupted
+from pipeline.errors import CorruptArtifact, Interrupted, UsageError
 from pipeline.stage import Job
 from stages import train
 from stages.artifacts import TrainOutputs
@@ -20,7 +20,9 @@ from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
 from stages.io.field_file import load_gains, load_renderer
 from stages.io.refined_cameras import load_scene
-from stages.training.data import sparse_depth_of
+from stages.poses import PosesSettings
+from stages.training import data
+from stages.training.data import depth_range, pixels_of, sparse_depth_of
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -252,3 +254,69 @@ def test_exposures_are_saved(tmp_path: Path) -> None:
     assert all((scene / name).exists() for name in gains)
     assert np.log(np.stack(list(gains.values()))).mean(axis=0) == pytest.approx(0, abs=1e-6)
     assert any(np.abs(gain - 1).max() > 1e-6 for gain in gains.values())
+
+
+@pytest.mark.parametrize("planes", [{"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}])
+def test_planes_are_stated_both_and_in_order(planes: dict[str, float], scene: Path, tmp_path: Path) -> None:
+    chosen = settings(**QUICK, **planes)
+    for refused in (lambda: train.STAGE.check({"train": chosen}), lambda: train.run(job(tmp_path, chosen, poses=scene))):
+        with pytest.raises(UsageError, match=r"train\.near_plane=.*, train\.far_plane=.*: expected two numbers, the second one greater, or auto for both"):
+            refused()
+
+
+def test_planes_in_a_contracted_scene_are_refused_by_the_name_of_what_contracts_it(tmp_path: Path) -> None:
+    chosen = settings(**QUICK, near_plane=2.0, far_plane=6.0)
+    with pytest.raises(UsageError, match=r"poses\.space=contracted"):
+        train.run(job(tmp_path / "a", chosen, poses=poses(tmp_path / "poses", space="contracted")))
+    with pytest.raises(UsageError, match=r"poses\.space=contracted"):
+        train.STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
+    train.STAGE.check({"train": chosen, "poses": PosesSettings()})
+
+
+def test_planes_that_miss_the_scene_are_refused_and_those_that_cut_into_it_are_told(scene: Path) -> None:
+    """The views have 1 to 5 of the training frame before them, which is 2 to 10 in the capture's units."""
+    s = scenes.load(scene)
+    pixels = pixels_of(scene, scenes.views_of(s, "train"))
+
+    def told(near: float, far: float) -> list[str]:
+        found: list[str] = []
+        assert depth_range(s, pixels, settings(near_plane=near, far_plane=far), found.append) == (near / 2, far / 2)
+        assert (pixels.near == near / 2).all()
+        assert (pixels.far == far / 2).all()
+        return found
+
+    for near, far in ((10.0, 12.0), (0.1, 2.0)):
+        with pytest.raises(UsageError, match=rf"near_plane .* are {near:g} to {far:g} in .*, and the scene lies 2 to 10 before .* miss all of it"):
+            told(near, far)
+    assert told(2.0, 10.0) == told(0.0, 100.0) == told(2.5, 9.0) == []
+    for near, far in ((5.0, 10.0), (1.0, 6.0)):
+        assert [f"are {near:g} to {far:g} " in text and "miss a part of it" in text for text in told(near, far)] == [True]
+
+
+def test_two_training_views_are_enough_for_sparse_depth_and_none_is_told(tmp_path: Path) -> None:
+    folder = poses(tmp_path / "poses", count=3, points=True)
+    events: list[dict[str, Any]] = []
+    for tracks, some in ((((0, 1),), True), (((0,),), False)):
+        scenes.save_points(SparsePoints(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), tracks), folder)
+        assert (train.sparse_depth(job(tmp_path, None, events=events), folder, scenes.load(folder), settings()) is not None) == some
+    assert ["no sparse point lies before" in event["text"] for event in events] == [True]
+
+
+def test_of_many_observations_some_are_drawn_with_all_views_of_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = poses(tmp_path / "poses", points=True)
+    s, rng = scenes.load(folder), np.random.default_rng(0)
+    seen = tuple(tuple(sorted(rng.choice(7, rng.integers(3, 7), replace=False).tolist())) for _ in range(60))
+    scenes.save_points(SparsePoints(rng.uniform(-0.3, 0.3, (60, 3)), np.zeros((60, 3), np.uint8), np.zeros(60), seen), folder)
+    every = sparse_depth_of(folder, s)
+    assert len(every) == 2 * sum(map(len, seen))
+    monkeypatch.setattr(data, "POINTS_AT_ONCE", 40)  # the same of one point, or of a few at a time
+    again = sparse_depth_of(folder, s)
+    assert all(np.array_equal(getattr(again, name), getattr(every, name)) for name in ("origins", "directions", "distance"))
+    monkeypatch.setattr(data, "MOST_OBSERVATIONS", 100)
+    drawn = [sparse_depth_of(folder, s, seed) for seed in (0, 0, 1)]
+    assert all(2 * 90 < len(rays) <= 2 * 100 for rays in drawn)
+    assert np.array_equal(drawn[0].origins, drawn[1].origins)
+    assert not np.array_equal(drawn[0].distance[:50], drawn[2].distance[:50])
+    half = len(drawn[0]) // 2
+    known = {ray.tobytes() for ray in np.column_stack([every.origins, every.directions])[: len(every) // 2]}
+    assert {ray.tobytes() for ray in np.column_stack([drawn[0].origins, drawn[0].directions])[:half]} <= known

@@ -74,3 +74,18 @@ def test_the_share_follows_the_format_of_the_source(source: Path, tmp_path: Path
 def test_nothing_is_no_budget(source: Path, tmp_path: Path, options: dict[str, object], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny", **options))  # type: ignore[arg-type]
+
+
+def test_steps_that_a_budget_takes_the_place_of_are_told(source: Path, tmp_path: Path) -> None:
+    def told(*sets: str, budget: str | None = None, config: str = "") -> list[str]:
+        (tmp_path / "a.toml").write_text(config)
+        options = Options(source=source, preset="tiny", budget=budget, sets=sets, config=tmp_path / "a.toml")
+        return plan_run(tmp_path / "run", WORKFLOW, options).warnings
+
+    assert told(budget="10m") == told("train.iterations=5", "bake.refine_steps=9") == []  # the preset has steps of its own
+    both = told("train.iterations=5", budget="10m", config="[bake]\nrefine_steps = 0")
+    assert ["train.iterations has no effect: train.time_budget=" in both[0], "bake.refine_steps has no effect: bake.time_budget=" in both[1]] == [True, True]
+    assert all(text.endswith("Leave out --budget to use it.") for text in both)
+    (one,) = told("train.iterations=5", "train.time_budget=40")
+    assert one == "train.iterations has no effect: train.time_budget=40 s decides how many steps are taken. Give train.time_budget=off to use it."
+    assert told("train.iterations=5", "bake.time_budget=40") == []

@@ -124,6 +124,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
+    warnings += _without_effect(settings, config, options)
     memory, limit = _memory(options.memory, standing, warnings)
     run = Run(
         path,
@@ -135,6 +136,21 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         memory=memory, also=sources[1:], resume_text=resume_command,
     )  # fmt: skip
     return Plan(run, standing is None, run.device or "auto", limit, warnings, lambda: plan_run(path, workflow, options))
+
+
+STEPS = (("train", "iterations"), ("bake", "refine_steps"))  # settings that a time budget takes the place of
+
+
+def _without_effect(settings: Settings, config: Config, options: Options) -> list[str]:
+    """A warning for each number of steps that was named although a time budget decides it."""
+    set_here = {text.partition("=")[0].strip() for text in options.sets}
+    found = []
+    for stage, name in STEPS:
+        budget = settings.values[stage].get("time_budget", "off") if stage in settings.types else "off"
+        if budget != "off" and (f"{stage}.{name}" in set_here or any(name in table.get(stage, {}) for table in (config.table, options.table))):
+            remedy = "Leave out --budget" if options.budget is not None else f"Give {stage}.time_budget=off"
+            found.append(f"{stage}.{name} has no effect: {stage}.time_budget={budget:g} s decides how many steps are taken. {remedy} to use it.")
+    return found
 
 
 def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:

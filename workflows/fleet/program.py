@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.run import NAME, Run
+from pipeline.runner import refuse_what_cannot_work
 from pipeline.stage import Stage, settings_from
 from stages.artifacts import BakeOutputs
 from workflows.asset import Workflow
@@ -34,7 +35,8 @@ class WorkflowProgram:
         sources = [Path(source) for source in scene["sources"]]
         options = Options(source=sources[0] if sources else None, also=tuple(sources[1:]), preset=preset, seed=scene["seed"], table=scene["settings"])
         plan = plan_run(run, self.workflow, options)
-        with plan.written():
+        with plan.written() as written:
+            refuse_what_cannot_work(self.stages, written)
             return plan.warnings
 
     def describe(self, run: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from stages.framing.camera_paths import PATHS, orbit_of, pose_on_sphere, similar
 from stages.framing.captured import captured_metadata, captured_of, coverage
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
-from stages.turntable import TurntableSettings
+from stages.turntable import TurntableSettings, cameras_of
 from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree
@@ -424,3 +424,37 @@ def test_a_forward_facing_asset_takes_other_paths_too(path: str) -> None:
     assert np.isfinite([camera.world_from_camera for camera in cameras]).all()
     spiral = turntable_cameras(wall(voxels=12), frames=6, width=64, height=48)
     assert not np.allclose(cameras[1].world_from_camera, spiral[1].world_from_camera)
+
+
+@pytest.mark.parametrize(
+    ("tree", "given", "expected"),
+    [
+        (captured_tree(360.0), {"path": "captured", "elevation": 5.0, "radius": 9.0, "sway": 3.0, "fov": 40.0}, {"elevation", "radius", "sway"}),
+        (captured_tree(360.0), {"path": "captured"}, set()),
+        (captured_tree(360.0), {"elevation": 5.0, "radius": 9.0, "sway": 3.0}, {"sway"}),
+        (captured_tree(360.0), {"path": "sway", "elevation": 5.0, "radius": 9.0, "sway": 3.0}, set()),
+        (captured_tree(120.0), {"path": "orbit", "sway": 3.0}, {"sway"}),
+        (captured_tree(120.0), {"sway": 3.0}, set()),
+        (wall(voxels=24), {"sway": 3.0}, {"sway"}),
+        (wall(voxels=24), {"sway": 3.0, "elevation": 0.0, "path": "sway"}, set()),
+    ],
+    ids=["captured", "nothing", "circle", "swaying", "a circle of an arc", "arc", "spiral", "none"],
+)  # fmt: skip
+def test_what_the_path_has_no_use_for_is_told(tree: NerfTree, given: dict[str, Any], expected: set[str]) -> None:
+    """And it has none: the cameras are the same without."""
+    found: list[str] = []
+    size = {"frames": 6, "width": 64, "height": 48}
+    cameras = turntable_cameras(tree, **size, **given, unused=lambda name, path: found.append(name))
+    assert set(found) == expected
+    assert len(found) == len(expected)
+    for name in ("elevation", "radius", "sway"):
+        without = turntable_cameras(tree, **size, **{key: value for key, value in given.items() if key != name})
+        same = all(np.array_equal(a.world_from_camera, b.world_from_camera) and a.params == b.params for a, b in zip(cameras, without, strict=True))
+        assert same == (name in expected or name not in given)
+
+
+def test_the_stage_warns_of_each_setting_that_its_path_has_no_use_for() -> None:
+    told: list[str] = []
+    cameras_of(captured_tree(360.0), TurntableSettings(frames=3, path="captured", elevation=5.0, sway=3.0), told.append)
+    path = "has no effect: the camera's path is past the captured cameras (turntable.path=captured)"
+    assert told == [f"turntable.elevation=5 {path}", f"turntable.sway=3 {path}"]

@@ -12,6 +12,8 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
+from pipeline.run import Run
+from pipeline.runner import refuse_what_cannot_work
 from stages.renamed_settings import REMOVED, RENAMED
 from stages.settings import describe_settings
 from workflows.asset import STAGES
@@ -222,3 +224,32 @@ def test_recorded_settings_of_before_are_read_under_their_new_names() -> None:
     assert (train.hidden_dim, train.log2_hashmap_size, train.time_budget, train.sample_batch_size) == (64, "auto", "off", "off")
     assert (train.distortion_loss_weight, train.far_plane, train.precrop_steps) == ("auto", "auto", 0)
     assert (evaluate.field_views, evaluate.lpips, turntable.exr, turntable.fov) == ("all", "off", "off", "auto")
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("turntable.background=pink", "expected auto, white, black, transparent or a colour as #rrggbb"),
+        ("turntable.background=#12345", "expected auto, white, black, transparent or a colour as #rrggbb"),
+        ("mesh.density_threshold=0", "expected a number, more than 0, or auto"),
+        ("points.density_threshold=-3.5", "expected a number, more than 0, or auto"),
+    ],
+)
+def test_values_that_no_stage_can_work_with_are_refused_when_they_are_given(text: str, found: str) -> None:
+    settings = Settings({stage.name: stage.settings for stage in STAGES})
+    with pytest.raises(UsageError, match=re.escape(found)):
+        settings.put_option(text)
+    for stage, value in (("turntable", "#00ff7F"), ("turntable", "transparent")):
+        settings.put_option(f"{stage}.background={value}")
+
+
+def test_the_preset_whose_field_cannot_be_baked_is_refused_where_it_would_be(tmp_path: Path) -> None:
+    """And a mesh whose normal map has no texture to lie on, before hours of training."""
+    run = Run.create(tmp_path / "run", tmp_path, {"train": {"field": "nerf"}, "mesh": {"normal_map": True, "texture": "off"}})
+    with pytest.raises(UsageError, match=r"can't be baked"):
+        refuse_what_cannot_work(STAGES, run)
+    refuse_what_cannot_work(STAGES[:2], run)
+    run = Run.create(tmp_path / "other", tmp_path, {"mesh": {"normal_map": True, "texture": "off"}})
+    with pytest.raises(UsageError, match=r"mesh\.texture is off"):
+        refuse_what_cannot_work(STAGES, run)
+    refuse_what_cannot_work(STAGES[:3], run)
