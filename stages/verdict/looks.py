@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -181,8 +181,3 @@ def duplicates(looks: Mapping[str, Look]) -> dict[str, str]:
         if apart[first] < SAME:
             found[names[i]] = found.get(names[first], names[first])
     return found
-
-
-def in_order_of_sharpness(looks: Mapping[str, Look]) -> Sequence[str]:
-    """The names, the most blurred first."""
-    return sorted(looks, key=lambda name: (looks[name].sharpness, name))
