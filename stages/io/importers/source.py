@@ -137,11 +137,11 @@ class Source:
         return walk(self.root, self.runs, self.links, follow=self.allow_outside)
 
     def warnings(self) -> list[str]:
-        """Sentences about what look-ups came by and left aside."""
+        """Sentences about what look-ups came by and left aside, as they may be shown."""
         names = [self.name_of(path) for path in sorted(self.runs)]
         runs = [f"{abbreviated(names)}: {'runs' if len(names) > 1 else 'a run'} inside the source folder; what was made there is not read."] if names else []
         links = [f"{self.root}: holds {self.linked_folders()}."] if self.links else []
-        return [*runs, *links, *self.remarks]
+        return [printable(sentence) for sentence in (*runs, *links, *self.remarks)]
 
     def linked_folders(self) -> str:
         """What is said of the linked folders that were not followed."""

@@ -82,6 +82,15 @@ def test_photographs_in_other_folders_are_named(tmp_path: Path) -> None:
     assert read(write(tmp_path / "alone", "1.png", "2.png", "3.png", "masks/1.png"))[1] == ""
 
 
+def test_hostile_names_are_shown_escaped(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a\nb", "1.png", "2.png", "3.png", "x\x1b[2J/4.png")
+    (folder / "l\ni").symlink_to(tmp_path)
+    source = Source(folder)
+    photographs(source)
+    assert len(source.warnings()) == 2
+    assert not any(character in sentence for sentence in source.warnings() for character in "\n\x1b")
+
+
 # --- masks
 
 
