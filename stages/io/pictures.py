@@ -41,6 +41,8 @@ FEW_PIXELS = 32_000_000  # whatever the size of the file: memory stays within a 
 PIXELS_A_BYTE = 10_000  # of a larger picture at most: deflate makes 1,032 bytes of one, which are 8,256 pixels of 1 bit
 
 _ORIENTATION = 274
+_LOWEST = 3  # rows and columns of a quantisation table that its coarseness is told by; libjpeg's at quality 50 have this mean there
+_LOWEST_MEAN = 118 / 9
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 # The fault of the process or the machine, not of one file: to leave pictures out for these would change results in silence.
 NOT_THE_FILES_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
@@ -175,6 +177,17 @@ def orientation_of(image: Any) -> int:
     """EXIF's number, 1-8, of an opened image whose pixels are not decoded yet."""
     number = 1 if image.format == "HEIF" else exif_of(image).get(_ORIENTATION, 1)  # libheif turns the pixels itself
     return int(number) if number in range(1, 9) else 1
+
+
+def read_quality(path: Path) -> int | None:
+    """1 to 100, the quality by libjpeg's count that a JPEG's luminance table stands for, whoever wrote it; None of other files. Raises UnreadableImage."""
+    with opened(path) as image:
+        tables = getattr(image, "quantization", None)
+        if not tables:
+            return None
+        table = np.array(tables[min(tables)], np.float64).reshape(8, 8)  # in natural order, as Pillow has it
+    scale = 100 * float(table[:_LOWEST, :_LOWEST].mean()) / _LOWEST_MEAN
+    return int(np.clip(round(5000 / scale if scale > 100 else (200 - scale) / 2), 1, 100))
 
 
 def exif_of(image: Any) -> Any:

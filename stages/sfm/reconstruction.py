@@ -161,7 +161,7 @@ def reconstruct(
     models, place = found.models, found.work
     rejected = [*unreadable, *_unregistered(place, images, models)]
     if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
-        raise BadInput(_failure(folder, work, images, found, rejected, matching))
+        raise BadInput(_failure(folder, _paths(folder, names), work, images, found, rejected, matching))
     facts = _facts_of_matching(images, found, matching)
     model = models[0] if found.rung == ladder.CROPPED else mapping.bundle_adjusted(place, images, models[0], safe_point)
     capture = _capture(folder, place, images, model, masks, rejected, facts)
@@ -269,7 +269,13 @@ def _overlaps(work: Path, images: Sequence[WorkImage]) -> tuple[tuple[str, str, 
 
 
 def _failure(
-    folder: Path, work: Path, images: Sequence[WorkImage], found: ladder.Found, rejected: Sequence[tuple[str, str]], how: str
+    folder: Path,
+    paths: Mapping[str, Path],
+    work: Path,
+    images: Sequence[WorkImage],
+    found: ladder.Found,
+    rejected: Sequence[tuple[str, str]],
+    how: str,
 ) -> str:
     hints = ["more photographs with at least 60 % overlap between neighbours, sharp, of a subject with texture"]
     if how == "sequential":
@@ -279,7 +285,7 @@ def _failure(
     fewest = max(mapping.MIN_MODEL_SIZE, -(-len(images) // 2))
     registered = mapping.num_registered(found.models)
     what = f"cameras found for {registered} of {len(images)} photographs; at least {fewest} are needed."
-    looks = look_at_all({image.name: work / "images" / image.file for image in images})
+    looks = look_at_all({image.name: work / "images" / image.file for image in images}, paths)
     verdict = failed(what, "; ".join(hints), registered, rejected, looks, _facts_of_matching(images, found, how), _overlaps(found.work, images))
     write_json(work / VERDICT, {"source": str(folder), **verdict.document()})
     also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from stages.io.photo import apply_exif_orientation
-from stages.io.pictures import UnreadableImage, opened, orientation_of, rgb_and_alpha
+from stages.io.pictures import UnreadableImage, opened, orientation_of, read_quality, rgb_and_alpha
+from stages.verdict.compression import block_steps, is_strong
 
 SIDE = 640  # px, longest side that photographs are looked at with; docs/experiments/sfm.md
 NOISE = 0.8  # px, standard deviation of a blur that takes noise away
@@ -39,6 +40,7 @@ class Look:
     noise       levels, standard deviation: of a quarter of the blocks there is less
     longest     px of the longest side, as far as it was looked at
     small       (16, 24) float32 levels
+    compressed  whether it was compressed so strongly that its blocks show
     """
 
     sharpness: float
@@ -47,16 +49,21 @@ class Look:
     noise: float
     longest: int
     small: np.ndarray
+    compressed: bool = False
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, float | bool]:
         """As JSON has them."""
         rounded = {"sharpness": round(self.sharpness, 3), "brightness": round(self.brightness, 2), "clipped": round(self.clipped, 3)}
-        return {**rounded, "noise": round(self.noise, 1)}
+        return {**rounded, "noise": round(self.noise, 1), "compressed": self.compressed}
 
 
-def look_at(path: Path) -> Look:
-    """Raises UnreadableImage."""
-    return look(grey_of(path))
+def look_at(path: Path, source: Path | None = None) -> Look:
+    """
+    source  the file that the picture was taken from, where `path` is a copy, which may be reduced
+
+    Raises UnreadableImage.
+    """
+    return look(grey_of(path), read_quality(source or path))
 
 
 def grey_of(path: Path) -> np.ndarray:
@@ -74,9 +81,10 @@ def grey_of(path: Path) -> np.ndarray:
     return np.ascontiguousarray(apply_exif_orientation(grey, orientation))
 
 
-def look(grey: np.ndarray) -> Look:
+def look(grey: np.ndarray, quality: int | None = None) -> Look:
     """
-    grey  (H, W) uint8, sRGB
+    grey     (H, W) uint8, sRGB
+    quality  of the JPEG that it comes from
     """
     import cv2
 
@@ -91,6 +99,7 @@ def look(grey: np.ndarray) -> Look:
         noise=_noise(picture),
         longest=max(grey.shape),
         small=cv2.resize(picture, SMALL, interpolation=cv2.INTER_AREA),
+        compressed=is_strong(quality, *block_steps(grey)),
     )
 
 
@@ -126,12 +135,12 @@ def _noise(picture: np.ndarray) -> float:
     return float(np.percentile(np.median(blocks, axis=1), 25)) / (0.6745 * float(np.linalg.norm(LAPLACIANS)))
 
 
-def look_at_all(paths: Mapping[str, Path]) -> dict[str, Look]:
-    """Of each photograph that can be read, by its name."""
+def look_at_all(paths: Mapping[str, Path], sources: Mapping[str, Path] | None = None) -> dict[str, Look]:
+    """Of each photograph that can be read, by its name. sources: as `look_at` takes them."""
     found = {}
     for name, path in paths.items():
         try:
-            found[name] = look_at(path)
+            found[name] = look_at(path, (sources or {}).get(name))
         except UnreadableImage:
             continue
     return found
@@ -161,6 +170,11 @@ def dark(looks: Mapping[str, Look]) -> list[str]:
 def noisy(looks: Mapping[str, Look]) -> list[str]:
     """The names of those with so much noise that weak features are lost in it."""
     return sorted(name for name, each in looks.items() if each.noise > NOISY)
+
+
+def compressed(looks: Mapping[str, Look]) -> list[str]:
+    """The names of those that were compressed so strongly that their blocks show."""
+    return sorted(name for name, each in looks.items() if each.compressed)
 
 
 def clipped(looks: Mapping[str, Look]) -> list[str]:

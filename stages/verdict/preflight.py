@@ -22,7 +22,7 @@ from stages.io import importers
 from stages.io.importers.photographs import photographs
 from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.photo import focal_from_exif, read_photo, working_size
-from stages.io.pictures import UnreadableImage, exif_of, opened
+from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
 from stages.masking.turning import masks_of_turning_subject
 from stages.sfm import ladder, pairs
 from stages.verdict import looks
@@ -89,7 +89,7 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
     for name in chosen:
         try:
             grey = looks.grey_of(files[name])
-            seen[name], small[name] = looks.look(grey), _small(files[name], grey)
+            seen[name], small[name] = looks.look(grey, read_quality(files[name])), _small(files[name], grey)
         except UnreadableImage as error:
             unreadable.append((name, str(error)))
     if not small:

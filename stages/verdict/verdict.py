@@ -282,6 +282,12 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
         ("exposure", looks_of.of_other_exposure(looks), "brighter or darker than the others by more than 0.75 stops", "Lock exposure and white balance."),
         ("dark", looks_of.dark(looks), "so dark that little but noise is left", "Give more light, or expose longer with the camera on a stand."),
         ("noise", looks_of.noisy(looks), "so noisy that weak features are lost", "Give more light, or expose longer at a lower ISO, with a stand."),
+        (
+            "compression",
+            looks_of.compressed(looks),
+            "compressed so strongly that blocks of 8 pixels show",
+            "Give the originals, not what a messenger or a web page has made of them, or save them at quality 75 or more.",
+        ),
         ("clipped", looks_of.clipped(looks), "black or white in more than 40 % of their pixels", "Expose for the subject; black and white hold no detail."),
     ):
         if names:

@@ -28,11 +28,12 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
     """
     outputs = PosesOutputs(job.out)
     files = {view.name: job.out / view.image for view in scene.views} | {name: capture.rejected_files[name] for name in sorted(capture.rejected_files)}
+    sources = {photo.camera.name: photo.image for photo in capture.photos}
     seen: dict[str, looks.Look] = {}
     for done, (name, path) in enumerate(files.items()):
         job.safe_point()
         job.progress(done, len(files), "looking at images")
-        seen |= looks.look_at_all({name: path})
+        seen |= looks.look_at_all({name: path}, sources)
     found = verdict_on(capture, seen, in_folder=None if capture.kind == "photographs" or renders else _photographs_in_folder(job))
     write_json(outputs.verdict, found.document())
     job.safe_point()

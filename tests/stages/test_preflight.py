@@ -158,6 +158,15 @@ def test_noise_and_tiny_pictures_are_told(tmp_path: Path) -> None:
     assert "noise" not in found
 
 
+def test_strong_compression_is_told(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", along(0, 6))
+    for path in sorted(folder.glob("*.png")):
+        with Image.open(path) as image:
+            image.save(path.with_suffix(".jpg"), quality=7)
+        path.unlink()
+    assert problems(folder)["compression"] == "usable"
+
+
 def test_time_of_matching_follows_the_number_of_features(tmp_path: Path) -> None:
     """Against COLMAP's own detector, on one side of the size below which it looks at twice the size and on the other."""
     still_life = Path(__file__).resolve().parents[2] / "examples" / "still_life"

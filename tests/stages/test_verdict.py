@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from efficientnerf.geometry.cameras import Camera
 from stages.io.capture import Capture, Photo, SparsePoints
@@ -167,6 +167,7 @@ def test_each_problem_has_its_grade_words_and_remedy(changes: dict[str, object],
         ({"brightness": -3.0}, "exposure"),
         ({"clipped": 0.5}, "clipped"),
         ({"noise": 20.0}, "noise"),
+        ({"compressed": True}, "compression"),
     ],
 )
 def test_pictures_that_differ_are_named_and_count_where_they_are_many(change: dict[str, object], what: str) -> None:
@@ -183,6 +184,52 @@ def test_noise_is_measured_whatever_the_picture_shows(deviation: float) -> None:
         seen = look(np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8))
         assert seen.noise == pytest.approx(deviation, rel=0.12, abs=1.5)
         assert bool(looks.noisy({"a": seen})) == (deviation > looks.NOISY)
+
+
+STILL_LIFE = Path(__file__).resolve().parents[2] / "examples" / "still_life"
+
+
+def photograph(blur: float = 0.0) -> Image.Image:
+    """Of the still life, blurred by a Gaussian: then the blocks of a good JPEG are much of what differs from pixel to pixel."""
+    paths = sorted(STILL_LIFE.glob("*.jpg"))
+    if not paths:
+        pytest.skip("examples/still_life is not there")
+    with Image.open(paths[0]) as image:
+        return image.convert("RGB").filter(ImageFilter.GaussianBlur(blur))
+
+
+def saved(image: Image.Image, quality: int, folder: Path) -> Path:
+    image.save(folder / f"{quality}.jpg", quality=quality)
+    return folder / f"{quality}.jpg"
+
+
+@pytest.mark.parametrize("blur", [0.0, 2.0, 4.0])
+@pytest.mark.parametrize(("quality", "strong"), [(5, True), (8, True), (50, False), (75, False), (92, False)])
+def test_strong_compression_is_told_by_the_file_and_by_its_blocks_in_another(tmp_path: Path, blur: float, quality: int, strong: bool) -> None:
+    path = saved(photograph(blur), quality, tmp_path)
+    with Image.open(path) as image:
+        image.save(tmp_path / "again.png")
+        image.crop((3, 5, 403, 305)).save(tmp_path / "cropped.jpg", quality=95)
+        image.resize((311, 233)).save(tmp_path / "reduced.jpg", quality=92)
+    assert looks.look_at(path).compressed == strong
+    assert looks.look_at(tmp_path / "again.png").compressed == strong
+    assert looks.look_at(tmp_path / "cropped.jpg").compressed == strong
+    assert looks.look_at(tmp_path / "reduced.jpg", path).compressed == strong
+    assert not looks.look_at(tmp_path / "reduced.jpg").compressed  # smeared over all columns: nothing tells
+
+
+def test_the_blocks_of_a_large_photograph_are_told_by_its_tables(tmp_path: Path) -> None:
+    large = photograph().resize((1920, 1440), Image.Resampling.BICUBIC)  # the decoder reduces it
+    assert looks.compressed(looks.look_at_all({str(q): saved(large, q, tmp_path) for q in (6, 30, 80)})) == ["6"]
+
+
+@pytest.mark.parametrize("step", [4, 5, 8, 16])
+def test_enlarged_pictures_have_no_blocks(step: int) -> None:
+    coarse = np.random.default_rng(step).integers(0, 255, (480 // step, 640 // step), np.uint8)
+    for how in (cv2.INTER_LINEAR, cv2.INTER_CUBIC, cv2.INTER_LANCZOS4):
+        assert not look(cv2.resize(coarse, (640, 480), interpolation=how)).compressed
+    assert not look(np.full((480, 640), 90, np.uint8)).compressed
+    assert not look(coarse[:40]).compressed
 
 
 def test_a_picture_of_few_pixels_says_nothing_of_noise() -> None:

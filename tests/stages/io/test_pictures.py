@@ -377,3 +377,31 @@ def test_the_true_reason_is_said_and_want_of_memory_stays_one(tmp_path: Path, mo
         monkeypatch.setattr(Image, "open", fail)
         with pytest.raises(expected, match=text):
             pictures.read_header(tmp_path / "a.png")
+
+
+# --- how strongly a JPEG was compressed
+
+
+@pytest.mark.parametrize("quality", [2, 6, 19, 50, 75, 96])
+def test_the_quality_of_a_jpeg_is_read_from_its_tables(tmp_path: Path, quality: int) -> None:
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 40, 3), np.uint8))
+    for number, what in enumerate((picture, picture.convert("L"), picture.convert("CMYK"))):
+        what.save(tmp_path / f"{number}.jpg", quality=quality)
+        found = pictures.read_quality(tmp_path / f"{number}.jpg")
+        assert found is not None
+        assert abs(found - quality) <= 1
+
+
+def test_other_files_state_no_quality(tmp_path: Path) -> None:
+    Image.new("RGB", (24, 40)).save(tmp_path / "a.png")
+    Image.new("RGB", (24, 40)).save(tmp_path / "a.webp", quality=5)
+    assert pictures.read_quality(tmp_path / "a.png") is pictures.read_quality(tmp_path / "a.webp") is None
+    Image.new("L", (24, 40)).save(tmp_path / "zeros.jpg")
+    data = bytearray((tmp_path / "zeros.jpg").read_bytes())
+    table = data.index(b"\xff\xdb") + 5
+    data[table : table + 64] = bytes(64)
+    (tmp_path / "zeros.jpg").write_bytes(data)
+    assert pictures.read_quality(tmp_path / "zeros.jpg") == 100
+    (tmp_path / "text.jpg").write_bytes(b"no picture")
+    with pytest.raises(UnreadableImage):
+        pictures.read_quality(tmp_path / "text.jpg")
