@@ -119,6 +119,20 @@ class Similarity:
         return matrix
 
 
+def closest_similarity(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
+    """The similarity of least squared distances from (N, 3) source to target points, each weighted by (N,) weights; None: alike.
+
+    Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
+    """
+    weights = np.full(len(source), 1 / len(source)) if weights is None else weights / weights.sum()
+    a, b = source - weights @ source, target - weights @ target
+    u, singular, vt = np.linalg.svd((b * weights[:, None]).T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    scale = float((singular * sign).sum() / max((weights * (a**2).sum(1)).sum(), 1e-300))
+    return Similarity(scale, rotation, weights @ target - scale * rotation @ (weights @ source))
+
+
 def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The rays of pixels.
 

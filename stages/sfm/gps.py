@@ -1,7 +1,7 @@
 """Scale and up of cameras that were found, by the GPS positions in the EXIF data of their photographs.
 
-The cameras are aligned to the positions by a robust similarity (Umeyama 1991, "Least-squares estimation of transformation parameters between two point
-patterns", reweighted). How well the two agree decides what is used: a phone's positions are metres off, which says nothing of a capture two metres wide.
+The cameras are aligned to the positions by a robust similarity (of least squares, reweighted). How well the two agree decides what is used: a phone's
+positions are metres off, which says nothing of a capture two metres wide.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.geometry.cameras import Similarity, closest_similarity
 from stages.io.capture import Capture
 from stages.io.photo import read_gps_position
 from stages.io.pictures import UnreadableImage
@@ -41,19 +41,10 @@ def robust_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     weights = np.ones(len(source))
     found = Similarity.identity()
     for _ in range(ROUNDS):
-        found = _weighted_similarity(source, target, weights / weights.sum())
+        found = closest_similarity(source, target, weights)
         distance = np.linalg.norm(found.points(source) - target, axis=1)
         weights = 1 / (1 + (distance / max(2 * float(np.median(distance)), 1e-9)) ** 2)
     return found
-
-
-def _weighted_similarity(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> Similarity:
-    a, b = source - weights @ source, target - weights @ target
-    u, singular, vt = np.linalg.svd((b * weights[:, None]).T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    scale = float((singular * sign).sum() / max((weights * (a**2).sum(1)).sum(), 1e-300))
-    return Similarity(scale, rotation, weights @ target - scale * rotation @ (weights @ source))
 
 
 def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]:

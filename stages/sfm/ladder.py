@@ -1,14 +1,16 @@
 """From features to cameras, rung by rung: each is tried where those before it left photographs without a camera, and what it finds is kept where it is better.
 
     1  the matches of the pairs that are worth comparing, and COLMAP's mapper
-    2  the mapper goes on from there with fewer matches to a photograph
-    3  photographs without a camera are matched again, with more of the others, and along the geometry of the first matches
-    4  more features are detected in them, of less contrast
-    5  the mapper begins anew from another pair, with smaller angles
-    6  each photograph gets a focal length of its own, where matches disagree with the cameras, or where single photographs would have another
-    7  else each gets a principal point of its own, where single photographs would have another, as where they were cropped
+    2  the sub-models that it leaves are put together, where the points that they share fit; after 4 once more
+    3  the mapper goes on from there with fewer matches to a photograph; where it has not half of the photographs, as of a way straight ahead, it begins anew
+       from another pair, with smaller angles
+    4  photographs without a camera are matched again, with more of the others, and along the geometry of the first matches
+    5  more features are detected in them, of less contrast
+    6  the mapper begins anew as in 3, with the matches of 4 and 5
+    7  each photograph gets a focal length of its own, where matches disagree with the cameras, or where single photographs would have another
+    8  else each gets a principal point of its own, where single photographs would have another, as where they were cropped
 
-The rungs 3, 4, 6 and 7 work in scratch folders of their own that are made anew: what a killed call has left there would change the rungs before.
+The rungs 4, 5, 7 and 8 work in scratch folders of their own that are made anew: what a killed call has left there would change the rungs before.
 docs/experiments/sfm.md
 """
 
@@ -20,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.files import remove
-from stages.sfm import lenses, mapping, matches, pairs
+from stages.sfm import lenses, mapping, matches, merging, pairs
 from stages.sfm.database import FEATURES, PAIRS, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, pair_id_of
 from stages.sfm.images import Progress, SafePoint, WorkImage
 from stages.verdict.verdict import DOUBTFUL
@@ -34,7 +36,8 @@ ENOUGH = 0.9  # of the photographs with a camera, from which the costlier rungs 
 AGREEING = 0.8  # of the verified matches, that agree with the cameras
 BETTER = 1.005  # times the score, from which a later rung is better than an earlier one
 MORE_FEATURES, LESS_CONTRAST = 2, 0.35
-EACH, CROPPED = "a focal length each", "a principal point each"
+EACH, CROPPED, MERGED = "a focal length each", "a principal point each", "merged sub-models"
+KEPT = 0.02  # of the matches, that fewer may agree when sub-models are merged: a false place contradicts the matches between them
 SPREAD = 1.08  # between the focal lengths of single photographs, from which they may have been zoomed
 APART = 0.009  # of the longest side, between the principal points of single photographs, from which they may have been cropped
 CLOSER, SAME = 0.85, 0.995  # times the reprojection error, to which principal points of their own must lower it; and the score, which is hardly lower then
@@ -97,8 +100,12 @@ def find_models(
     match(work, images, how, seed=seed, workers=threads, **quiet)
     climb = _Climb(work, images)
     climb.tried(how, work, mapping.sub_models(work, images, seed, mapping.DEFAULTS, **quiet))
+    others = _try_merged(climb, work, climb.found.models[1:], seed, safe_point)
     if climb.missing() and climb.found.models:
         climb.tried("fewer matches", work, mapping.continued(work, images, climb.found.models[0], seed, mapping.RELAXED, **quiet))
+    begun = len(climb.missing()) > len(images) / 2
+    if begun:
+        _begin_anew(climb, work, seed, **quiet)
     place = work / "rungs"
     remove(place)
     if climb.missing():
@@ -116,13 +123,35 @@ def find_models(
             else:
                 models = mapping.sub_models(place, images, seed, mapping.RELAXED, **quiet)
             climb.tried(rung, place, models)
-    last = place if place.is_dir() else work  # where all have a camera, and matches disagree, nothing was matched again
-    for rung, options in (("another beginning", mapping.RELAXED), ("small angles", mapping.FORWARD)):
-        if not climb.is_enough():
-            climb.tried(rung, last, mapping.sub_models(last, images, seed, options, **quiet))
+            if not more:  # else features of the other sub-models' photographs were detected anew
+                others = _try_merged(climb, place, others, seed, safe_point)
+    if place.is_dir() or not begun:  # where all have a camera, and matches disagree, nothing was matched again
+        _begin_anew(climb, place if place.is_dir() else work, seed, **quiet)
     if climb.found.models:
         _try_own_cameras(climb, work / "own_cameras", seed, **quiet)
     return climb.found
+
+
+def _begin_anew(climb: _Climb, work: Path, seed: int, **quiet: Any) -> None:
+    """The rungs on which the mapper begins from another pair."""
+    for rung, options in (("another beginning", mapping.RELAXED), ("small angles", mapping.FORWARD)):
+        if not climb.is_enough():
+            climb.tried(rung, work, mapping.sub_models(work, climb.images, seed, options, **quiet))
+
+
+def _try_merged(climb: _Climb, work: Path, others: Sequence[Any], seed: int, safe_point: SafePoint) -> list[Any]:
+    """The rung on which other sub-models are put together with the best one, as far as they have photographs that it lacks; returns those that remain.
+
+    work  the scratch folder whose matches are used; the features are the same in all
+    """
+    lacking = {climb.images[position].file for position in climb.missing()}
+    others = [model for model in others if any(image.name in lacking for image in model.images.values() if image.has_pose)]
+    if others and climb.found.models:
+        models = merging.merged(work, climb.images, [climb.found.models[0], *others], seed, safe_point)
+        climb.tried(MERGED, work, models, least=climb.agreement - KEPT)
+        if models and climb.found.models[0] is models[0]:
+            return models[1:]
+    return others
 
 
 def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> None:

@@ -20,6 +20,7 @@ from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
 MANY_OBSERVATIONS = 150_000  # of points in images; of more, an even choice holds the cameras as well
+NEARLY = 0.95  # of the photographs: later rungs may bring back the others
 ALL_OF = 300  # points: a photograph with no more keeps all of them
 # Adjustments of all that is found so far: each time there are so many times more photographs or points than at the last, with those points that hold the
 # cameras, and not to the last digit, for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
@@ -50,7 +51,7 @@ def sub_models(work: Path, images: Sequence[WorkImage], seed: int, options: Opti
 
 def continued(work: Path, images: Sequence[WorkImage], model: Any, seed: int, options: Options, progress: Progress, safe_point: SafePoint) -> list[Any]:
     """A model with more photographs registered, as far as the matches of `work` let them, and other sub-models; largest first."""
-    fixed = any(camera.mean_focal_length() == prior for camera, prior in _cameras_with_exif_focal(images, model))
+    fixed = bool(cameras_with_fixed_focal(images, model))
     return _incremental_mapping(work, len(images), seed, options, progress, safe_point, refine_camera=not fixed, start=model)
 
 
@@ -64,11 +65,12 @@ def _with_exif_focal(
     safe_point: SafePoint,
 ) -> list[Any]:
     """`models`; or, where a focal length contradicts its EXIF data (forward motion does not determine it), those found with intrinsics fixed at
-    the EXIF data, if they register as many photographs with about the same reprojection error."""
+    the EXIF data, if they register nearly as many photographs with about the same reprojection error."""
     if not models or not any(contradicts_exif(camera.mean_focal_length(), prior) for camera, prior in _cameras_with_exif_focal(images, models[0])):
         return models
     fixed = _incremental_mapping(work, len(images), seed, options_of_attempt, progress, safe_point, refine_camera=False)
-    if num_registered(fixed) >= num_registered(models) and fixed[0].compute_mean_reprojection_error() < 1.15 * models[0].compute_mean_reprojection_error():
+    enough = fixed and num_registered(fixed) >= NEARLY * num_registered(models)
+    if enough and fixed[0].compute_mean_reprojection_error() < 1.15 * models[0].compute_mean_reprojection_error():
         return fixed
     return models
 
@@ -78,6 +80,11 @@ def _cameras_with_exif_focal(images: Sequence[WorkImage], model: Any) -> list[tu
     prior = {image.file: image.focal and image.focal * image.work_width / image.width for image in images}
     found = {image.camera_id: prior[image.name] for image in model.images.values() if image.has_pose}
     return [(model.cameras[camera_id], focal) for camera_id, focal in sorted(found.items())]
+
+
+def cameras_with_fixed_focal(images: Sequence[WorkImage], model: Any) -> set[int]:
+    """COLMAP's ids of the cameras whose intrinsics were fixed at their EXIF data."""
+    return {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.mean_focal_length() == prior}
 
 
 def contradicts_exif(focal: float, prior: float | None) -> bool:
@@ -100,14 +107,7 @@ def _incremental_mapping(
     start  a model to go on from
     """
     with quiet_pycolmap() as pycolmap:
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = 1
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-        options.min_model_size = MIN_MODEL_SIZE
-        options.mergedict(dict(ADJUSTMENTS))
-        options.mapper.ba_global_ignore_redundant_points3D = True
-        for part, values in options_of_attempt.items():
-            getattr(options, part).mergedict(dict(values))
+        options = pipeline_options(pycolmap, seed, options_of_attempt)
         options.ba_refine_focal_length = options.ba_refine_extra_params = refine_camera
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_camera
         registered = 0
@@ -141,6 +141,18 @@ def _incremental_mapping(
             remove(folder)
     safe_point()
     return [model for _, model in sorted(models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))]
+
+
+def pipeline_options(pycolmap: Any, seed: int, options_of_attempt: Options) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.min_model_size = MIN_MODEL_SIZE
+    options.mergedict(dict(ADJUSTMENTS))
+    options.mapper.ba_global_ignore_redundant_points3D = True
+    for part, values in options_of_attempt.items():
+        getattr(options, part).mergedict(dict(values))
+    return options
 
 
 def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_point: SafePoint) -> Any:
@@ -183,7 +195,7 @@ def _thinned(model: Any) -> Any:
 def _with_adjusted_cameras(work: Path, images: Sequence[WorkImage], model: Any, safe_point: SafePoint) -> Any:
     """`bundle_adjusted` of all points of a model."""
     with quiet_pycolmap() as pycolmap:
-        fixed = {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.mean_focal_length() == prior}
+        fixed = cameras_with_fixed_focal(images, model)
         safe_point()
         bundle_adjust(pycolmap, model, fixed)
         counts = _images_of_cameras(model)

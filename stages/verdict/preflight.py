@@ -50,7 +50,7 @@ FEATURES_A_MEGAPIXEL, AN_IMAGE = 0.4, 0.2
 A_PAIR, COMPARING, MANY = 0.006, 0.030, 4096  # of verifying a pair, and of comparing so many features of each with each
 CONTRAST = 0.02  # from which SIFT detects about as many features as COLMAP's does
 PAIRS_AN_IMAGE = 20  # of retrieval
-MAPPED_AGAIN, LEAST_WEAK = 4, 0.1  # of the later rungs: times that all is mapped again, and share of the photographs that are matched again, at least
+MAPPED_AGAIN, LEAST_WEAK = 6, 0.1  # of the later rungs: times that all is mapped again, and share of the photographs that are matched again, at least
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from stages.sfm.reconstruction import find_cameras
 ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
 QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
+ANEW = ["another beginning", "small angles"]
 IMAGES = [WorkImage(f"{k}.jpg", f"{k:05d}.png", 64, 48, 64, 48, None, "a") for k in range(20)]
 
 
@@ -94,8 +95,8 @@ def test_one_lost_photograph_is_worth_the_cheap_rungs_alone(monkeypatch: pytest.
 def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", ladder.EACH]
-    assert [rung["registered"] for rung in found.rungs] == [8, 9, 11, 19, 0]
+    assert rig.tried == ["exhaustive", "fewer matches", *ANEW, "wider matching", "more features", ladder.EACH]
+    assert [rung["registered"] for rung in found.rungs] == [8, 9, 0, 0, 11, 19, 0]
     assert rig.weak == [list(range(9, 20)), list(range(11, 20)), list(range(11, 20))]
     assert (found.models[0].rung, found.work) == ("more features", tmp_path / "rungs")
 
@@ -123,6 +124,17 @@ def test_focal_lengths_of_their_own_are_kept_where_they_explain_what_disagreed(
     assert rig.tried == ["exhaustive", ladder.EACH]
     assert found.rungs[-1] == {"rung": ladder.EACH, "registered": each[0], "agreeing": each[1]}
     assert (found.rung, found.work) == ((ladder.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
+
+
+def test_a_way_straight_ahead_begins_with_small_angles_before_anything_is_matched_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"small angles": (20, 0.95)})
+    found = climbed(rig, tmp_path)
+    assert rig.tried == ["exhaustive", *ANEW]
+    assert rig.weak == []
+    assert (found.rung, found.work) == ("small angles", tmp_path)
+    again = Rig(monkeypatch, {"exhaustive": (9, 0.5), "wider matching": (20, 0.7)})
+    found = climbed(again, tmp_path)
+    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", "fewer matches", *ANEW, "wider matching", *ANEW, ladder.EACH]
 
 
 def test_focal_lengths_that_differ_are_looked_at_though_the_matches_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -201,6 +213,6 @@ def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:
 
     said = read_json(tmp_path / "work/verdict.json")
     assert said["grade"] == "failed"
-    assert [rung["rung"] for rung in said["rungs"]] == ["exhaustive", "wider matching", "more features", "another beginning", "small angles"]
+    assert [rung["rung"] for rung in said["rungs"]] == ["exhaustive", *ANEW, "wider matching", "more features", *ANEW]
     assert set(said["images"]) == {"0.png", "1.png", "2.png"}
     assert not said["images"]["0.png"]["registered"]

@@ -4,88 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from benchmarks.poses import aligned_errors
-from efficientnerf.geometry.cameras import Camera, project
 from stages.sfm import ladder, lenses, mapping
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, copy_with_own_cameras, database_path, open_database
+from stages.sfm.database import FEATURES, PAIRS, copy_with_own_cameras, database_path
 from stages.sfm.images import WorkImage
 from stages.verdict.verdict import DOUBTFUL
+from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, cameras, matched, off, registered
 
-SIZE = 480, 360
-COUNT, POINTS = 9, 250
-QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
 ZOOMED = tuple(400.0 / (1.0, 0.8, 0.65)[k % 3] for k in range(COUNT))
-
-
-def cameras(focal: tuple[float, ...] = (400.0,) * COUNT, cut: Sequence[tuple[int, int]] = ((0, 0),) * COUNT) -> list[Camera]:
-    """Along a third of a circle, at different heights, looking at its middle.
-
-    cut  pixels that are cut off at the left and at the top
-    """
-    made = []
-    for k in range(COUNT):
-        angle = 2.0 * k / COUNT
-        centre = np.array([2 * np.cos(angle), 2 * np.sin(angle), 0.5 + 0.5 * np.sin(1.7 * k)])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], -1)
-        made.append(Camera(f"{k}.png", *SIZE, "SIMPLE_RADIAL", (focal[k], SIZE[0] / 2 - cut[k][0], SIZE[1] / 2 - cut[k][1], -0.04), pose))
-    return made
-
-
-def matched(work: Path, taken: list[Camera]) -> list[WorkImage]:
-    """Grey pictures, and a database of features where points of a cloud are seen, 0.4 px off, and of verified matches, of which 5 % were wrong before."""
-    rng = np.random.default_rng(0)
-    cloud = rng.normal(0, 0.35, (POINTS, 3))
-    (work / "images").mkdir(parents=True)
-    images = [WorkImage(camera.name, f"{k:05d}.png", *SIZE, *SIZE, None, "one") for k, camera in enumerate(taken)]
-    for image in images:
-        Image.new("RGB", SIZE, (90, 90, 90)).save(work / "images" / image.file)
-    open_database(work, images, print)
-    seen = [project(camera, cloud)[0] + rng.normal(0, 0.4, (POINTS, 2)) for camera in taken]
-    inside = [((xy > 0) & (xy < SIZE)).all(1) for xy in seen]
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
-        camera = database.read_all_cameras()[0]
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = 0
-        for k, xy in enumerate(seen):
-            database.write_keypoints(k + 1, np.clip(xy, 0, None).astype(np.float32))
-            database.write_descriptors(k + 1, pycolmap.FeatureDescriptors(data=np.zeros((POINTS, 128), np.uint8), type=pycolmap.FeatureExtractorType.SIFT))
-        for i in range(COUNT):
-            for j in range(i + 1, COUNT):
-                both = np.flatnonzero(inside[i] & inside[j] & (rng.random(POINTS) < 0.9 ** (j - i)))
-                pairs = np.stack([both, both], 1).astype(np.uint32)
-                wrong = rng.random(len(both)) < 0.05
-                pairs[wrong, 1] = rng.permutation(pairs[wrong, 1])
-                database.write_matches(i + 1, j + 1, pairs)
-                geometry = pycolmap.estimate_two_view_geometry(camera, seen[i], camera, seen[j], pairs, options)
-                database.write_two_view_geometry(i + 1, j + 1, geometry)
-    return images
 
 
 def found_for(work: Path, images: list[WorkImage]) -> ladder.Found:
     return ladder.find_models(work, images, "exhaustive", features=POINTS, seed=0, threads=1, **QUIET)
-
-
-def registered(model: Any) -> list[Any]:
-    return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
-
-
-def off(model: Any, taken: list[Camera]) -> float:
-    """Root mean square of the distances of the centres from the true ones."""
-    centres = np.array([image.projection_center() for image in registered(model)])
-    return float(np.sqrt((aligned_errors(centres, np.array([camera.centre for camera in taken])) ** 2).mean()))
 
 
 def numbers(found: ladder.Found) -> list[bytes]:
