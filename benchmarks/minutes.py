@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from stages.figures.plots import with_palette
 from workflows.paper.document import hardware
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -105,6 +106,7 @@ def plot(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)
     figure.savefig(path, metadata={"Software": None})
+    with_palette(path)
 
 
 def put_between_marks(text: str, table: str) -> str:

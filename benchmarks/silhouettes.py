@@ -1,6 +1,6 @@
 """Data sets with masks of the two kinds, from the still life and its true mesh: silhouettes of its objects, and masks over a moving thing.
 
-    python benchmarks/silhouettes.py FOLDER
+    python -m benchmarks.silhouettes FOLDER
 
     FOLDER/photographs_masks   photographs, masks/ beside them: the objects without table and cloth (cameras by structure from motion)
     FOLDER/photographs_rgba    the same as PNG with alpha, whose colours are left below what is transparent
@@ -29,6 +29,7 @@ from PIL import Image
 
 from efficientnerf.geometry.cameras import Camera, pose_from_opengl, project
 from stages.io.pictures import opened
+from tests.still_life import true_mesh
 
 ROOT = Path(__file__).resolve().parents[1]
 PHOTOGRAPHS = ROOT / "examples" / "still_life"
@@ -49,7 +50,7 @@ def cameras() -> dict[str, Camera]:
 
 def objects() -> trimesh.Trimesh:
     """The true mesh without the table and the cloth, its two widest parts."""
-    parts = trimesh.load(ROOT / "tests/data/still_life_mesh.ply", process=False).split(only_watertight=False)
+    parts = true_mesh().split(only_watertight=False)
     return trimesh.util.concatenate([part for part in parts if part.extents[:2].max() < 2 * SUPPORTS])
 
 

@@ -18,6 +18,7 @@ from typing import Any
 from stage_runs import linked_copy, made, read_json
 
 from stages.artifacts import BakeOutputs, EvaluateOutputs
+from stages.figures.plots import with_palette
 from workflows.paper.document import hardware, versions
 
 
@@ -73,6 +74,7 @@ def plot(path: Path, rows: list[dict[str, Any]], network: float | None, name: st
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, metadata={"Software": None})
+    with_palette(path)
 
 
 def main() -> None:

@@ -28,9 +28,9 @@ from scipy.spatial import cKDTree
 from efficientnerf.geometry.cameras import Camera, Similarity, pose_from_opengl, project
 from efficientnerf.surface.mesh import face_vectors, sample
 from efficientnerf.surface.rasteriser import mesh_image
+from tests.still_life import true_mesh
 
 ROOT = Path(__file__).resolve().parents[1]
-TRUTH = ROOT / "tests" / "data" / "still_life_mesh.ply"
 CAMERAS = ROOT / "tests" / "data" / "still_life_cameras.json"
 SAMPLES = 200_000  # of each surface
 DISTANCES = (0.005, 0.01, 0.02)
@@ -211,7 +211,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--mesh", type=Path, help="default: RUN/mesh/mesh.ply")
     parser.add_argument("--scene", help="kind of a made scene")
-    parser.add_argument("--truth", type=Path, default=TRUTH)
+    parser.add_argument("--truth", type=Path, help="default: that of the still life")
     parser.add_argument("--cameras", type=Path, default=CAMERAS)
     parser.add_argument("--no-truth", action="store_true", help="of scenes whose surface is not known")
     parser.add_argument("--out", type=Path)
@@ -245,7 +245,7 @@ def footprint(cameras: Sequence[Camera], middle: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(camera.centre - middle) / camera.intrinsics["fx"] for camera in cameras]))
 
 
-def measured(run: Path, mesh: Path, kind: str | None = None, truth: Path = TRUTH, cameras: Path = CAMERAS) -> dict[str, Any]:
+def measured(run: Path, mesh: Path, kind: str | None = None, truth: Path | None = None, cameras: Path = CAMERAS) -> dict[str, Any]:
     """All figures of a run's mesh."""
     if kind is not None:
         from benchmarks.scenes.catalogue import recipes
@@ -253,7 +253,7 @@ def measured(run: Path, mesh: Path, kind: str | None = None, truth: Path = TRUTH
 
         true = mesh_of(recipes()[kind].shapes)
     else:
-        true = trimesh.load(truth, process=False)
+        true = true_mesh() if truth is None else trimesh.load(truth, process=False)
     similarity, trained = truth_from_capture(run, true_cameras(cameras))
     loaded = trimesh.load(mesh, process=False)
     found = Surface(similarity.points(np.asarray(loaded.vertices)), np.asarray(loaded.faces))

@@ -26,6 +26,8 @@ from typing import Any
 
 from machine import processor
 
+from stages.figures.plots import with_palette
+
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple")
 
 
@@ -137,6 +139,7 @@ def plot(report: dict[str, Any], path: Path) -> None:
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     canvas.print_png(path, metadata={"Software": None})
+    with_palette(path)
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from benchmarks.surface import Surface, aligned, distances, footprint, image_sco
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
+from tests.still_life import true_mesh, write_mesh
 
 GREY = Material(((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))
 CAMERAS = [look_at(f"{n}", 2.5 * np.array([np.cos(n), np.sin(n), 0.3 * (-1) ** n]), np.zeros(3), 64, 1.2) for n in range(8)]
@@ -126,3 +127,22 @@ def test_a_made_scene_s_mesh_keeps_its_floor() -> None:
     assert found.f[voxel / 2] > 0.85
     assert found.normals < 9
     assert images["iou"] > 0.85
+
+
+def test_the_true_mesh_of_the_still_life_is_whole() -> None:
+    mesh = true_mesh()
+    assert (len(mesh.vertices), len(mesh.faces), mesh.faces.max()) == (14_316, 28_680, 14_315)
+    np.testing.assert_allclose(mesh.bounds, [[-0.95, -0.95, -0.06], [0.95, 0.95, 0.566822]], atol=2e-5)
+    assert len(mesh.split(only_watertight=False)) == 84
+    table = np.isclose(mesh.vertices[:, 2], 0, atol=2e-5)
+    assert table.any()
+    assert np.unique(mesh.vertices[table, 2]).size == 1  # what is flat stays flat
+
+
+def test_a_true_mesh_is_read_as_it_is_written(tmp_path: Path) -> None:
+    mesh, rng = trimesh.creation.icosphere(subdivisions=3), np.random.default_rng(0)
+    faces = np.asarray(mesh.faces)[rng.permutation(len(mesh.faces))]
+    write_mesh(np.asarray(mesh.vertices), faces, tmp_path / "a.npz")
+    again = true_mesh(tmp_path / "a.npz")
+    assert np.array_equal(again.faces, faces)
+    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=2 / 65535 * 0.51)

@@ -60,10 +60,11 @@ def make(number: str, request: Request, tables: Mapping[str, Table] = TABLES) ->
     _write(written["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
     _write(written["markdown"], in_markdown(document))
     if result.curves:
-        from stages.figures.plots import curve
+        from stages.figures.plots import curve, with_palette
 
         written["plot"] = request.out / f"table_{number}.png"
         curve(written["plot"], result.curves, x_label="seconds of training", y_label="PSNR of test views / dB", title=f"Table {number}")
+        with_palette(written["plot"])
     return written
 
 

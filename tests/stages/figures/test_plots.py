@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, error_map, grid_sheet, to_uint8
+from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, error_map, grid_sheet, to_uint8, with_palette
+from stages.io.png import read_png
 
 
 def test_sheet_holds_each_image_at_its_place(tmp_path: Path) -> None:
@@ -55,3 +56,17 @@ def test_error_picture_is_black_where_equal_and_bright_where_not() -> None:
     picture = error_map(image, truth)
     assert picture[1, 1].max() < 10
     assert picture[0, 0].min() > 150
+
+
+def test_a_palette_halves_a_plot_and_shows_the_same(tmp_path: Path) -> None:
+    path, x = tmp_path / "a.png", np.linspace(0, 6, 50)
+    curve(path, {str(n): (x, np.sin(x + n)) for n in range(8)}, x_label="time", y_label="height")
+    before, (plain, size) = read_png(path)[..., :3].astype(int), (read_png(path).ndim, path.stat().st_size)
+    with_palette(path)
+    with Image.open(path) as image:
+        assert (plain, image.mode) == (3, "P")
+        after = np.asarray(image.convert("RGB")).astype(int)
+    assert path.stat().st_size < 0.5 * size
+    assert np.abs(after - before).max() < 32
+    assert np.abs(after - before).mean() < 1
+    assert [each.name for each in tmp_path.iterdir()] == ["a.png"]

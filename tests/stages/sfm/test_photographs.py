@@ -27,6 +27,7 @@ from stages.sfm.images import WorkImage, prepare_images
 from stages.sfm.pairs import all_pairs
 from stages.sfm.reconstruction import find_cameras, reconstruct
 from tests.stages.spoilers import SPOILERS
+from tests.still_life import true_mesh
 
 ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE = ROOT / "examples" / "still_life"
@@ -83,8 +84,6 @@ def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path
 
 def test_still_life_lies_in_the_box(ten: tuple[list[str], Path, Capture]) -> None:
     """The things on the table, by the true mesh brought into the frame of the cameras found."""
-    import trimesh
-
     from stages.framing.training_frame import find_training_frame
 
     names, _, capture = ten
@@ -95,8 +94,7 @@ def test_still_life_lies_in_the_box(ten: tuple[list[str], Path, Capture]) -> Non
     u, s, vt = np.linalg.svd((found - found.mean(0)).T @ (true - true.mean(0)))
     sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
     rotation, scale = u * sign @ vt, (s * sign).sum() / ((true - true.mean(0)) ** 2).sum()
-    mesh = trimesh.load(TRUTH.with_name("still_life_mesh.ply"), process=False)
-    vertices = np.asarray(mesh.vertices)
+    vertices = np.asarray(true_mesh().vertices)
     things = vertices[vertices[:, 2] > 0.02]
     placed = scale * (things - true.mean(0)) @ rotation.T + found.mean(0)
     assert (np.abs(placed) <= training_frame.bounds[1]).all(1).mean() > 0.99
