@@ -5,6 +5,18 @@ import { projected } from "./camera.js";
 const element = (id) => document.getElementById(id);
 const MODES = ["colour", "depth", "normals", "colour without view dependence"];
 
+// Of what and how the asset was made, as far as it says so.
+function madeBy(provenance) {
+  const { tool, training_views: views, iterations, settings } = Object(provenance), said = (x) => String(x).slice(0, 200);
+  const parts = [];
+  if (typeof tool === "string") parts.push(`Made by ${said(tool)}`);
+  if (typeof views === "number") parts.push(`of ${said(views)} photographs`);
+  if (typeof iterations === "number") parts.push(`in ${said(iterations)} steps`);
+  const set = Object.entries(Object(settings)).slice(0, 20).filter(([, x]) => typeof x === "string" || typeof x === "number");
+  if (set.length) parts.push(`with ${set.map(([name, x]) => `${said(name)} ${said(x)}`).join(", ")}`);
+  return parts.length ? `${parts.join(" ")}.` : "";
+}
+
 export class Controls {
   constructor(viewer, page) {
     this.viewer = viewer;
@@ -109,6 +121,7 @@ export class Controls {
     this.background(element("scenes").hidden ? "black" : "scene");
     const { tree } = viewer, megabytes = (page.bytes / 1e6).toFixed(page.bytes < 1e7 ? 1 : 0);
     element("facts-line").textContent = `${tree.count.toLocaleString("en")} voxels, ${megabytes} MB`;
+    element("made").textContent = `${element("facts-line").textContent}, harmonics of degree ${tree.degree}. ${madeBy(tree.meta.provenance)}`;
     new MutationObserver(() => this.photograph()).observe(this.canvas, { attributes: true, attributeFilter: ["width", "height"] });
   }
 

@@ -183,6 +183,7 @@ async function start() {
   return { viewer, controls, tree, times, seconds: (performance.now() - began) / 1000, graphics };
 }
 
+document.body.classList.add("begun");
 globalThis.enerf = {
   ready: start().catch((error) => {
     const known = error instanceof FormatError || error instanceof Unsupported;

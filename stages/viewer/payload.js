@@ -50,7 +50,7 @@ export async function inflated(size, progress) {
     }
     await writer.close();
   })();
-  feeding.catch(() => {});
+  feeding.catch((error) => writer.abort(error).catch(() => {})); // else the reader waits for more
   try {
     for (;;) {
       const { done, value } = await reader.read();

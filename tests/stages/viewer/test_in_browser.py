@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from efficientnerf.asset.format import serialize
+from efficientnerf.asset.format import FormatError, load, serialize
 from efficientnerf.asset.region import foreground
 from efficientnerf.asset.rendering import render
-from stages.viewer.page import viewer_page
+from stages.viewer.page import PART, viewer_page
 from tests.efficientnerf.hostile import HOSTILE
 from tests.efficientnerf.trees import random_tree
 from tests.stages.viewer import browser
@@ -118,10 +119,13 @@ def test_a_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> No
         page.ready()
         assert page.page.evaluate("x => enerf.check(x)", base64.b64encode(good).decode()) is None
         files = {name: make() for name, (make, _) in HOSTILE.items()}
-        texts = {name: base64.b64encode(file).decode() for name, file in files.items() if len(file) < 10**6}
+        texts = {name: base64.b64encode(file).decode() for name, file in files.items()}
         check = "async all => { const out = {}; for (const [n, x] of Object.entries(all)) out[n] = await enerf.check(x); return out; }"
-        said = page.page.evaluate(check, texts)
-        assert len(said) > 250
+        large = {name: text for name, text in texts.items() if len(text) > 10**6}
+        assert len(large) >= 5
+        said = page.page.evaluate(check, {name: text for name, text in texts.items() if name not in large})
+        said |= {name: page.page.evaluate("x => enerf.check(x)", text) for name, text in large.items()}
+        assert len(said) == len(HOSTILE) > 250
         assert [name for name, text in said.items() if text is None] == []
         other = [name for name, text in said.items() if "'enerf convert' makes it" in text]  # tensors of layouts that it does not read
         assert [name for name in other if b'compact"' in files[name]] == []
@@ -147,6 +151,57 @@ def test_an_altered_page_says_so(chromium: Any, tmp_path: Path) -> None:
     (tmp_path / "viewer.html").write_text(text)
     with browser.opened(chromium, tmp_path / "viewer.html") as page:
         assert "longer than it states" in page.refusal()
+
+
+def test_a_large_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> None:
+    """Of several parts of data, cut short or altered anywhere: the asset in it, or the page itself."""
+    good = serialize(random_tree(1, shape=(20, 20, 20), brick=4, degree=2, share=0.6), "compact")
+    assert 2_000_000 < len(good) < 4_000_000
+    start, rng = 8 + int.from_bytes(good[:8], "little"), np.random.default_rng(0)
+    wrong = {f"of {n} bytes": good[:n] for n in (start - 1, start, len(good) // 3, PART, len(good) - 1)} | {"longer": good + b"\0"}
+    for at in [start, *rng.integers(start, len(good), 4).tolist(), len(good) - 1]:
+        wrong[f"altered at {at}"] = good[:at] + bytes([good[at] ^ 1 << int(rng.integers(8))]) + good[at + 1 :]
+    one, two, three = (start + 4096 * n for n in (1, 2, 3))
+    wrong["with two blocks changed round"] = good[:one] + good[two:three] + good[one:two] + good[three:]
+    for name, asset in wrong.items():
+        (tmp_path / "a.nerftree").write_bytes(asset)
+        with pytest.raises(FormatError):
+            load(tmp_path / "a.nerftree")
+        with browser.opened(chromium, written(tmp_path, asset)) as page:
+            assert "The asset in this page is refused" in page.refusal(), name
+            assert page.console == [], name
+    with browser.opened(chromium, written(tmp_path, good)) as page:
+        page.ready()
+        assert page.console == []
+
+
+def test_a_large_page_that_was_damaged_says_so(chromium: Any, tmp_path: Path) -> None:
+    text = viewer_page(serialize(random_tree(1, shape=(20, 20, 20), brick=4, degree=2, share=0.6), "compact")).decode()
+    parts = re.findall(r'<script type="text/plain" data-part>.*?</script>\n', text)
+    assert len(parts) >= 3
+    at = text.index(parts[1]) + len(parts[1]) // 2
+    damaged = {
+        "without a part": text.replace(parts[1], ""),
+        "without the last part": text.replace(parts[-1], ""),
+        "with a part twice": text.replace(parts[0], parts[0] * 2),
+        "with parts changed round": text.replace(parts[0] + parts[1], parts[1] + parts[0]),
+        "with another digit": text[:at] + ("A" if text[at] != "A" else "B") + text[at + 1 :],
+        "with what is no digit": text[:at] + "!" + text[at + 1 :],
+        "with a digit fewer": text[:at] + text[at + 1 :],
+        "with a part cut short": text.replace(parts[1], parts[1][: len(parts[1]) // 2] + "</script>\n"),
+    }
+    for name, page_text in damaged.items():
+        assert page_text != text
+        (tmp_path / "viewer.html").write_text(page_text)
+        with browser.opened(chromium, tmp_path / "viewer.html") as page:
+            assert "The asset in this page is refused" in page.refusal(), name
+            assert page.console == [], name
+    (tmp_path / "viewer.html").write_text(text[:at])  # so its script is not there
+    with browser.opened(chromium, tmp_path / "viewer.html") as page:
+        assert not page.page.is_visible("#late")
+        page.page.wait_for_selector("#late", state="visible")
+        assert "cut short" in page.page.inner_text("#late")
+        assert page.page.evaluate("typeof enerf") == "undefined"
 
 
 def test_a_browser_without_webgl2_is_told(chromium: Any, tmp_path: Path) -> None:
