@@ -7,6 +7,7 @@
 # make fuzz      100,000 damaged inputs to each reader; FUZZ_OPTIONS go to benchmarks/fuzz; `pip install -e '.[fuzz]'` guides it by coverage
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
 # make gpu-packages   the packages that `make gpu` needs beside torch, Triton and numba, into build/gpu-packages: for a machine without a package index
+# make viewer-page   write docs/still_life_viewer.html, which the README links: ten minutes on two cores
 # make docs      rewrite the pages under docs/ that are made from the code
 # make lint      ruff and mypy
 
@@ -17,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 # In the order of tests/conftest.py: by itself xdist begins with the files that have most tests, and a worker ends alone with a long one.
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-all torture faults gpu gpu-packages docs lint install clean
+.PHONY: demo test test-slow test-all torture faults gpu gpu-packages viewer-page docs lint install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
@@ -60,6 +61,10 @@ gpu-packages:
 	rm -rf $(GPU_PACKAGES)
 	$(PYTHON) -m pip install --quiet --target $(GPU_PACKAGES) --no-deps --only-binary=:all: --python-version $(GPU_PYTHON) --implementation cp \
 		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt msgspec platformdirs trimesh OpenEXR av fast_simplification
+
+viewer-page: $(INSTALLED)
+	$(BIN)/enerf run examples/still_life --out runs/page --set bake.resolution=112 --until bake
+	$(BIN)/python docs/make_viewer_page.py runs/page
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/make_pages.py

@@ -1,0 +1,86 @@
+"""docs/still_life_viewer.html, which the README links: whole, small, of the example, and drawn as `enerf render` draws its asset."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from efficientnerf.asset.format import describe, load
+from efficientnerf.asset.rendering import render
+from stages.framing.camera_paths import turntable_cameras
+from tests.stages.viewer import browser
+from tests.stages.viewer.pages import carried, check_no_other_place, check_policy, facts
+from tests.stages.viewer.scenes import decibels
+
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "still_life_viewer.html"
+VOID = {"meta", "link", "input", "img", "br"}
+
+
+class Elements(HTMLParser):
+    """Which elements stand open, and the numbers of those that were met."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.met: dict[str, int] = {}
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.met[tag] = self.met.get(tag, 0) + 1
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def text() -> str:
+    return PAGE.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def asset(text: str, tmp_path: Path) -> Path:
+    (tmp_path / "asset.nerftree").write_bytes(carried(text))
+    return tmp_path / "asset.nerftree"
+
+
+def test_its_elements_close(text: str) -> None:
+    elements = Elements()
+    elements.feed(text)
+    elements.close()
+    assert elements.open == []
+    assert (elements.met["html"], elements.met["canvas"]) == (1, 2)
+    assert PAGE.stat().st_size < 400_000
+
+
+def test_it_may_run_its_own_script_alone_and_asks_for_nothing(text: str) -> None:
+    check_policy(text)
+    check_no_other_place(text)
+
+
+def test_its_asset_verifies_and_says_how_it_was_made(text: str, asset: Path) -> None:
+    about = describe(asset)
+    assert facts(text)["bytes"] == asset.stat().st_size
+    assert len(load(asset).density_values) == about["voxels"] > 10_000  # digests and rules are checked
+    provenance = about["provenance"]
+    assert provenance["tool"].startswith("efficientnerf ")
+    assert provenance["training_views"] == 31
+    assert provenance["settings"]["region"] == "foreground"
+
+
+@pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
+def test_it_opens_in_a_browser(chromium: Any, asset: Path) -> None:
+    tree = load(asset)
+    with browser.opened(chromium, PAGE) as page:
+        page.ready()
+        camera = turntable_cameras(tree, frames=3, width=120, height=90)[1]
+        expected = render(tree, camera, background=tree.background).colour
+        assert expected.std() > 0.1
+        assert decibels(page.rendered(camera, background=(1, 1, 1)), expected) > 45
+        page.page.click("#about")
+        assert "31 photographs" in page.page.inner_text("#made")
+        assert page.console == []
+        assert [each for each in page.requests if not each.startswith(("file:", "data:", "blob:"))] == []
