@@ -339,6 +339,8 @@ def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_aske
     assert [refinement.refinement_steps(chosen, voxels, whole=True) for voxels in (1, 10**6)] == [320, 6000]
     asked = dataclasses.replace(chosen, refine_steps=7)
     assert {refinement.refinement_steps(asked, 10**7, whole=cut_out) for cut_out in (True, False)} == {7}
+    for steps in (0, 7):  # a time budget takes the place of any number, of none too: what is thick is learned then as ever
+        assert refinement.refinement_steps(dataclasses.replace(asked, refine_steps=steps, time_budget=40.0), 10**6, whole=False) == 15000
     made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=None, refine_rays_per_batch=256), **inputs)
     run(made)
     report = json.loads((made.out / "report.json").read_text())["optimisation"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -76,6 +77,9 @@ def test_a_size_that_nothing_has_is_warned_of(tree: NerfTree) -> None:
     _, _, warned = packed(tree, 1000)
     assert len(warned) == 1
     assert "bake.max_mib" in warned[0]
+    assert warned[0].endswith("give it a lower bake.resolution")
+    scene = replace(tree, background=None, environment=np.zeros((4, 8, 3), np.float32))
+    assert packed(scene, 1000)[2][0].endswith("give it a lower bake.resolution or bake.environment_size")
 
 
 def test_what_packing_takes_grows_with_what_there_is_to_do() -> None:
