@@ -4,7 +4,7 @@ Cameras of phones write Display P3, others Adobe RGB or ProPhoto; CMYK and grey 
 
 The intent is relative colorimetric with black point compensation: a colour that sRGB has stays that colour whatever profile it came in, so that photographs of
 one thing agree, and others are clipped to the nearest edge. The perceptual intent would move all colours as each profile's maker liked it. Matrix profiles,
-which photographs nearly all have, give the same with either.
+which photographs nearly all have, give the same with either. docs/experiments/colour-profiles.md
 
 A profile is known as sRGB by what it does to colours, not by its name: there are dozens of them under many names, and pictures with one keep their pixels.
 """
@@ -77,7 +77,7 @@ def _conversion(profile: bytes, mode: str) -> Conversion:
         return Conversion(fault=f"for {space or 'other'} pictures, and this one is {mode}")
     flags = ImageCms.Flags.BLACKPOINTCOMPENSATION | ImageCms.Flags.NOCACHE  # without a cache one transform serves all threads
     if space == "L":
-        flags |= ImageCms.Flags.NOOPTIMIZE  # else it is off by up to three levels; slow, but of 256 levels
+        flags |= ImageCms.Flags.NOOPTIMIZE  # else it is off by up to three levels; slow, but for 256 of them
     try:
         transform = ImageCms.buildTransform(
             ImageCms.ImageCmsProfile(io.BytesIO(profile)),
