@@ -1,10 +1,10 @@
 """Frames chosen of a video against every n-th: a hand-held clip is rendered from a run's asset, with motion blur where the hand shakes.
 
-    python -m benchmarks.video_frames RUN OUT [--seconds 10] [--fps 12] [--chosen 40] [--longest 400] [--no-cameras] [--assets 3m]
+    python -m benchmarks.video_frames RUN OUT [--seconds 10] [--fps 12] [--chosen 40] [--longest 400] [--no-cameras] [--assets 1500]
 
 OUT gets clip.mp4, truth.json (pose and true blur of each frame) and result.json: blur and sharpness of both choices, the share of frames whose cameras were
-found, and how far the centres are from the true ones. With --assets, an asset is made of each choice in that time, with the true cameras; its PSNR is that of
-the same sharp pictures from places between the frames.
+found, and how far the centres are from the true ones. With --assets, an asset is made of each choice in so many steps of training and a fifth of them of
+refinement, with the true cameras; its PSNR is that of the same sharp pictures from places between the frames.
 """
 
 from __future__ import annotations
@@ -124,10 +124,11 @@ def write_data_set(run: Path, frames: dict[int, Path], count: int, seconds: floa
     return out
 
 
-def psnr_of_asset(source: Path, out: Path, budget: str) -> dict[str, Any]:
+def psnr_of_asset(source: Path, out: Path, steps: int) -> dict[str, Any]:
     """PSNR and SSIM of the test views of a data set's asset."""
     shutil.rmtree(out, ignore_errors=True)
-    command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(out), "--budget", budget, "--quiet", "--until", "evaluate"]
+    command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(out), "--quiet", "--until", "evaluate"]
+    command += ["--set", f"train.iterations={steps}", "--set", f"bake.refine_steps={steps // 5}"]
     cost = cost_of([*command, "--set", "evaluate.captured_path_frames=off", "--set", "splats.make=off"])
     asset = read_json(out / "evaluate" / "metrics.json")["asset"]
     return {"psnr": asset["psnr"], "ssim": asset["ssim"], "views": asset["views"], **cost}
@@ -176,7 +177,7 @@ def main() -> None:
     parser.add_argument("--chosen", type=int, default=40)
     parser.add_argument("--longest", type=int, default=400)
     parser.add_argument("--no-cameras", action="store_true")
-    parser.add_argument("--assets", metavar="BUDGET", help="make an asset of each choice in this time")
+    parser.add_argument("--assets", type=int, metavar="STEPS", help="make an asset of each choice in so many steps")
     arguments = parser.parse_args()
     clip, frames = arguments.out / "clip.mp4", round(arguments.seconds * arguments.fps)
     if not clip.exists():
