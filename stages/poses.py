@@ -176,7 +176,7 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
     return [*importers.files(source, settings), *network]
 
 
-STAGE = Stage(name="poses", version=8, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
+STAGE = Stage(name="poses", version=9, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:

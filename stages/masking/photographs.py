@@ -19,7 +19,6 @@ def cameras_of_photographs(job: Job, warn: Any) -> Capture:
     """The capture of the job's photographs and videos. Raises BadInput."""
     from stages.io.material import photographs_of
     from stages.masking.polarity import kept_white
-    from stages.sfm.gps import with_gps
 
     found = photographs_of(job, warn)
     paths, settings = found.paths, job.settings
@@ -34,10 +33,31 @@ def cameras_of_photographs(job: Job, warn: Any) -> Capture:
         capture = _by_masks(job, find, paths, masks, given.inverted)
     if seen:
         capture = replace(capture, facts={**capture.facts, BACKGROUND: SEEN})
-    capture, sentence = with_gps(capture, paths)
-    if sentence:
+    capture, sentences = _in_known_frame(job, capture, paths)
+    for sentence in sentences:
         job.say(sentence)
     return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected})
+
+
+def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tuple[Capture, list[str]]:
+    """The capture in the frame of cameras that the source states, where it is read as photographs in spite of them; else by GPS; and what is to be said."""
+    from stages.io.importers import IMPORTERS, posed_format
+    from stages.sfm.gps import STATED, with_gps, with_stated_cameras
+
+    said, source = [], job.source
+    assert source is not None
+    name = posed_format(source, job.settings) if len(job.sources) == 1 else None
+    if name is not None:
+        try:
+            capture, sentence = with_stated_cameras(capture, IMPORTERS[name].read(source, job.settings))
+            said.append(sentence)
+        except BadInput as error:
+            said.append(f"the cameras that the source states cannot be read, and are not used: {error}")
+        facts = capture.facts.get(STATED)
+        if isinstance(facts, dict) and facts["used"] != "nothing":
+            return capture, said
+    capture, sentence = with_gps(capture, paths)
+    return capture, [*said, sentence] if sentence else said
 
 
 def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], inverted: Mapping[str, Path]) -> Capture:

@@ -1,4 +1,5 @@
-"""Scale and up of cameras that were found, by the GPS positions in the EXIF data of their photographs.
+"""Scale and up of cameras that were found: by the GPS positions in the EXIF data of their photographs, or by cameras that the source states, as of an app that
+tracked the phone.
 
 The cameras are aligned to the positions by a robust similarity (of least squares, reweighted). How well the two agree decides what is used: a phone's
 positions are metres off, which says nothing of a capture two metres wide.
@@ -6,7 +7,7 @@ positions are metres off, which says nothing of a capture two metres wide.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,8 @@ from stages.io.pictures import UnreadableImage
 
 FEWEST = 6  # photographs with a position
 ROUNDS = 20
-SCALE, UP = 0.1, 0.03  # median distance to the positions over their extent, up to which the scale and the upward axis are taken from them
+SCALE, UP = 0.1, 0.03  # median distance to the positions over their extent, up to which the scale (or a stated frame) and the upward axis are taken from them
+STATED = "stated_cameras"  # fact of a capture
 FLAT = 0.1  # extent across the longest line through the cameras, over that along it: below, they turn about it freely
 _A, _F = 6378137.0, 1 / 298.257223563  # WGS 84: semi-major axis in metres, flattening
 
@@ -65,21 +67,46 @@ def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]
     words = f"{len(positions)} of {len(capture.photos)} photographs have a GPS position"
     if len(positions) < max(FEWEST, len(capture.photos) / 2):
         return _with_facts(capture, {"photographs": len(positions), "used": "nothing"}), f"{words}: too few to be used."
-    centres = np.array([photo.camera.centre for photo in capture.photos if photo.camera.name in positions])
     places = enu_from_gps(np.array([positions[photo.camera.name] for photo in capture.photos if photo.camera.name in positions]))
-    aligned = robust_similarity(centres, places)
-    distance = float(np.median(np.linalg.norm(aligned.points(centres) - places, axis=1)))
-    spread = np.linalg.svd(aligned.scale * (centres - centres.mean(0)), compute_uv=False) / np.sqrt(len(centres))  # m, along three axes
-    extent = float(np.linalg.norm(spread))
+    aligned, distance, extent, straight = _aligned(capture, [*positions], places)
     facts: dict[str, object] = {"photographs": len(positions), "extent": round(extent, 3), "distance": round(distance, 3)}
     words += f", {distance:.2g} m from the cameras found in the median"
-    if not np.isfinite(distance) or aligned.scale <= 0 or distance > SCALE * extent:
+    if not distance <= SCALE * extent or aligned.scale <= 0:
         return _with_facts(capture, facts | {"used": "nothing"}), f"{words}: too far for an extent of {extent:.2g} m, and not used."
-    if distance > UP * extent or spread[1] < FLAT * spread[0]:
+    if distance > UP * extent or straight:
         scaled = Similarity(aligned.scale, np.eye(3), np.zeros(3))
         return _moved(_with_facts(capture, facts | {"used": "scale"}), scaled), f"{words}: the scale is taken from them."
     moved = replace(_moved(capture, aligned), up=np.array([0.0, 0.0, 1.0]))
     return _with_facts(moved, facts | {"used": "scale and up"}), f"{words}: scale and upward axis are taken from them."
+
+
+def with_stated_cameras(capture: Capture, stated: Capture) -> tuple[Capture, str]:
+    """Cameras that were found, in the frame of those that their source states, with its scale and upward axis, as far as the two agree; and a sentence."""
+    places = {photo.camera.name: photo.camera.centre for photo in stated.photos}
+    names = [photo.camera.name for photo in capture.photos if photo.camera.name in places]
+    words = f"the source states cameras of {len(names)} of the {len(capture.photos)} photographs ({stated.kind})"
+    if len(names) < max(FEWEST, len(capture.photos) / 2):
+        return _with_facts(capture, {"photographs": len(names), "used": "nothing"}, STATED), f"{words}: too few to be used."
+    aligned, distance, extent, straight = _aligned(capture, names, np.array([places[name] for name in names]))
+    facts: dict[str, object] = {"photographs": len(names), "extent": round(extent, 6), "distance": round(distance, 6), "used": "nothing"}
+    if not distance <= SCALE * extent or aligned.scale <= 0:
+        share = f"{distance / extent:.0%} of their extent" if extent > 0 else "they lie in one place"
+        return _with_facts(capture, facts, STATED), f"{words}, but not where they were found ({share} apart in the median): they are not used."
+    if straight:
+        return _with_facts(capture, facts, STATED), f"{words}, along a line, which they may turn about: they are not used."
+    moved = replace(_moved(capture, aligned), up=stated.up, metric=stated.metric)
+    return _with_facts(moved, facts | {"used": "frame"}, STATED), f"{words}: their frame and scale are kept, {distance / extent:.2%} of their extent apart."
+
+
+def _aligned(capture: Capture, names: Sequence[str], places: np.ndarray) -> tuple[Similarity, float, float, bool]:
+    """The similarity that takes the photographs of these names, in the order of the capture, to places (N, 3); the median distance that is left, the extent of
+    the photographs there, and whether they lie along a line."""
+    wanted = set(names)
+    centres = np.array([photo.camera.centre for photo in capture.photos if photo.camera.name in wanted])
+    aligned = robust_similarity(centres, places)
+    distance = float(np.median(np.linalg.norm(aligned.points(centres) - places, axis=1)))
+    spread = np.linalg.svd(aligned.scale * (centres - centres.mean(0)), compute_uv=False) / np.sqrt(len(centres))  # along three axes
+    return aligned, distance, float(np.linalg.norm(spread)), bool(spread[1] < FLAT * spread[0])
 
 
 def _moved(capture: Capture, similarity: Similarity) -> Capture:
@@ -88,5 +115,5 @@ def _moved(capture: Capture, similarity: Similarity) -> Capture:
     return replace(capture, photos=photos, points=points, metric=True)
 
 
-def _with_facts(capture: Capture, facts: Mapping[str, object]) -> Capture:
-    return replace(capture, facts={**capture.facts, "gps": dict(facts)})
+def _with_facts(capture: Capture, facts: Mapping[str, object], name: str = "gps") -> Capture:
+    return replace(capture, facts={**capture.facts, name: dict(facts)})

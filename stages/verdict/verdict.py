@@ -22,7 +22,7 @@ from stages.verdict.looks import Look
 
 LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose photographs have focal lengths, or principal points, of their own
 # Facts of a capture that stand among the figures.
-FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, "gps", BACKGROUND)
+FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, "gps", "stated_cameras", BACKGROUND)
 GRADES = ("good", "usable", "poor", "failed")
 NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
 FEW = 12  # views all round a subject

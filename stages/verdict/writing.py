@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
+from stages.framing.captured import coverage
 from stages.io.capture import Capture
 from stages.io.importers.photographs import photographs
 from stages.io.importers.source import Source
@@ -35,6 +37,7 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
         job.progress(done, len(files), "looking at images")
         seen |= looks.look_at_all({name: path}, sources)
     found = verdict_on(capture, seen, in_folder=None if capture.kind == "photographs" or renders else _photographs_in_folder(job))
+    found = replace(found, figures={**found.figures, "coverage": _coverage(scene)})
     write_json(outputs.verdict, found.document())
     job.safe_point()
     _draw(outputs, capture, scene, found)
@@ -46,6 +49,12 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
         if problem.grade != "good" and problem.what not in NOT_SAID:
             warn(f"{problem.sentence} {problem.remedy}")
     return found
+
+
+def _coverage(scene: Scene) -> dict[str, float]:
+    """Degrees of the sphere round the subject that the cameras stand on: round the upward axis, and of elevation in the middle and to either side of it."""
+    found = coverage(np.array([view.camera.centre for view in scene.views]), np.asarray(scene.orbit.centre))
+    return {"arc": round(found.arc, 1), "elevation": round(found.elevation, 1), "heights": round(found.heights, 1)}
 
 
 def _photographs_in_folder(job: Job) -> int | None:

@@ -345,4 +345,9 @@ def test_a_model_of_few_of_the_photographs_is_not_taken_without_a_word(tmp_path:
     made, warnings = run(source, tmp_path / "part")
     assert len(made.views) == 6
     assert [text for text in warnings if "6 of the 20 photographs in the folder" in text and "--as photographs" in text]
-    assert json.loads((tmp_path / "part/poses/verdict.json").read_text())["grade"] == "poor"
+    said = json.loads((tmp_path / "part/poses/verdict.json").read_text())
+    assert said["grade"] == "poor"
+    around = np.array([view.camera.centre for view in made.views]) - made.orbit.centre
+    elevation = np.degrees(np.arcsin(around[:, 2] / np.linalg.norm(around, axis=1)))
+    assert said["coverage"]["elevation"] == pytest.approx(np.median(elevation), abs=0.1)
+    assert 0 < said["coverage"]["arc"] <= 360

@@ -6,7 +6,7 @@ Nothing heavy is imported until something is read.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -130,7 +130,22 @@ def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str
     return found
 
 
+def posed_format(folder: Path, settings: Any) -> str | None:
+    """The format of the cameras that a folder states which is to be read as photographs in spite of them; None where it states none."""
+    if settings.format != "photographs" or not folder.is_dir():
+        return None
+    try:
+        name = candidates(folder, settings.allow_outside, settings.llff_factor)[0]
+    except BadInput:
+        return None
+    return name if IMPORTERS[name].posed else None
+
+
 def files(folder: Path, settings: Any) -> list[Path]:
-    """What the poses stage depends on: the files of the format in question that it reads."""
+    """What the poses stage depends on: the files of the format in question that it reads, and of photographs those that state cameras of them."""
     name = detect(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else settings.format
-    return sorted(set(IMPORTERS[name].files(folder, settings)))
+    found, stated = set(IMPORTERS[name].files(folder, settings)), posed_format(folder, settings)
+    if stated is not None:
+        with suppress(BadInput):  # said where it is read
+            found |= set(IMPORTERS[stated].files(folder, settings))
+    return sorted(found)

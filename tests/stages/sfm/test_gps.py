@@ -13,7 +13,7 @@ from efficientnerf.geometry.cameras import Camera, Similarity
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.photo import read_gps_position
 from stages.sfm.colmap import import_pycolmap
-from stages.sfm.gps import enu_from_gps, robust_similarity, with_gps
+from stages.sfm.gps import enu_from_gps, robust_similarity, with_gps, with_stated_cameras
 
 HOME = np.array([55.7047, 13.1910, 62.0])
 
@@ -160,6 +160,43 @@ def test_positions_that_say_nothing_change_nothing(tmp_path: Path, extent: float
     assert (found.metric, found.up) == (False, None)
     assert found.facts["gps"]["used"] == "nothing"  # type: ignore[index]
     assert "used" in sentence
+    np.testing.assert_array_equal(lengths(found), lengths(given))
+
+
+def stated_for(found: Capture, centres: np.ndarray, **changes: Any) -> Capture:
+    """What an app says of the cameras of these photographs: metres, y up."""
+    photos = []
+    for photo, centre in zip(found.photos, centres, strict=True):
+        pose = np.eye(4)
+        pose[:3, 3] = centre
+        photos.append(Photo(Camera(photo.camera.name, 8, 6, "SIMPLE_PINHOLE", (8.0, 4.0, 3.0), pose), photo.image))
+    return Capture("polycam", tuple(photos), None, up=np.array([0.0, 1.0, 0.0]), metric=True, **changes)
+
+
+def test_cameras_that_were_found_come_into_the_frame_of_those_that_the_source_states(tmp_path: Path) -> None:
+    given, _, _ = capture(tmp_path, CIRCLE, 0.0, np.random.default_rng(2), 0)
+    drifted = 0.1 * CIRCLE + np.random.default_rng(3).normal(0, 0.05, CIRCLE.shape)  # the phone's tracking
+    drifted[5] += 3.0  # which was lost once
+    found, sentence = with_stated_cameras(given, stated_for(given, drifted))
+    assert (found.metric, found.facts["stated_cameras"]["used"]) == (True, "frame")  # type: ignore[index]
+    np.testing.assert_array_equal(found.up, [0, 1, 0])
+    centres = np.array([photo.camera.centre for photo in found.photos])
+    np.testing.assert_allclose(centres, 0.1 * CIRCLE, atol=0.06)
+    assert found.points is not None
+    np.testing.assert_allclose(found.points.xyz, centres, atol=1e-9)
+    assert "24 of the 24 photographs (polycam)" in sentence
+
+
+@pytest.mark.parametrize(("places", "known", "why"), [("other", 24, "not where they were found"), ("line", 24, "along a line"), ("same", 5, "too few")])
+def test_stated_cameras_that_do_not_agree_change_nothing(tmp_path: Path, places: str, known: int, why: str) -> None:
+    line = np.array([[3.0 * n, 1.0 * n, 2.0] for n in range(24)])
+    true = line if places == "line" else CIRCLE
+    given, _, _ = capture(tmp_path, true, 0.0, np.random.default_rng(2), 0)
+    other = np.random.default_rng(3).normal(0, 30, true.shape) if places == "other" else true
+    stated = stated_for(given, other)
+    found, sentence = with_stated_cameras(given, Capture("polycam", stated.photos[:known], None, up=stated.up, metric=True))
+    assert (found.metric, found.up, found.facts["stated_cameras"]["used"]) == (False, None, "nothing")  # type: ignore[index]
+    assert why in sentence
     np.testing.assert_array_equal(lengths(found), lengths(given))
 
 
