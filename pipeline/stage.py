@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import time
 import types
@@ -146,6 +147,16 @@ class Job:
             self._report({**facts, "event": event, "stage": self.stage, "time": time.time()})
 
 
+def hints_of(cls: type) -> dict[str, Any]:
+    """The types of a class's fields by name, with their limits: evaluated once, for that takes milliseconds."""
+    return _hints(cls)
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls, include_extras=True)
+
+
 def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") -> T:
     """An instance of the settings dataclass from plain values, as JSON or TOML give them; what is not named keeps its default.
 
@@ -158,7 +169,7 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
     prefix = f"{where}." if where else ""
     if not isinstance(mapping, Mapping):
         raise UsageError(f"{where or cls.__name__}: expected a table of settings, found {_shown(mapping)}.")
-    hints = typing.get_type_hints(cls, include_extras=True)
+    hints = hints_of(cls)
     names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
     values = {}
     for name, value in mapping.items():

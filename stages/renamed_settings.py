@@ -5,11 +5,12 @@ An old name on the command line or in a file is answered with `moved`; recorded 
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Mapping
 from typing import Any
 
 import msgspec
+
+from pipeline.stage import hints_of
 
 RENAMED: dict[str, dict[str, str]] = {
     "poses": {
@@ -74,7 +75,7 @@ def updated(stage: str, settings_type: type, recorded: Mapping[str, Any]) -> dic
     Values that meant "choose" or "off" become `auto`, `off` or `all` where the setting admits the word and not the value; settings that were removed
     are left out; everything else stays as it is.
     """
-    hints = typing.get_type_hints(settings_type, include_extras=True)
+    hints = hints_of(settings_type)
     out: dict[str, Any] = {}
     for old, value in recorded.items():
         name = old if old in hints else RENAMED.get(stage, {}).get(old, old)

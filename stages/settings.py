@@ -12,7 +12,7 @@ import typing
 from typing import Any
 
 from efficientnerf.settings import setting
-from pipeline.stage import limits_of, type_in_words
+from pipeline.stage import hints_of, limits_of, type_in_words
 
 __all__ = ["SettingInfo", "describe_settings", "setting"]
 
@@ -59,7 +59,7 @@ class SettingInfo:
 
 def describe_settings(settings_type: type) -> list[SettingInfo]:
     """The fields of a settings dataclass in the order in which they are written."""
-    hints = typing.get_type_hints(settings_type, include_extras=True)
+    hints = hints_of(settings_type)
     return [
         SettingInfo(
             name=entry.name,

@@ -39,6 +39,14 @@ CONNECT_SECONDS = 60.0
 SUBMIT_SECONDS = 120.0  # without a worker before jobs are asked of a queue again: those before have ended, by their time limit
 LOOK_SECONDS = 1.0  # between a worker's looks whether its task is still wanted
 PROGRESS_SECONDS = 2.0  # between two reports of a task's progress: they pass through Dask's scheduler
+# Defaults for clusters that are started here, under what the user has configured: workers wait for children, of which what Dask looks at a hundred times a
+# second says nothing. A worker took 3.5 % of a core by it, and the process with the scheduler as much (docs/experiments/fleet.md).
+CALM = {
+    "distributed": {
+        "worker": {"profile": {"enabled": False}, "memory": {"monitor-interval": "1s"}},
+        "admin": {"system-monitor": {"interval": "5s"}, "tick": {"interval": "200ms"}},
+    }
+}
 
 
 class DaskWorkers:
@@ -154,6 +162,9 @@ def _started(kind: str, options: dict[str, Any], jobs: int) -> Any:
     """A cluster of this kind, with its workers asked for."""
     module, name = CLUSTERS[kind]
     cluster_type = getattr(_imported(module), name)
+    config = _imported("dask").config
+    if CALM not in config.defaults:
+        config.update_defaults(CALM)
     if kind == "ssh":
         _imported("asyncssh")  # Dask says so late
     if kind == "local":

@@ -7,6 +7,7 @@ An executor is a function (Stage, Job) -> Usage. It returns when job.out is comp
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import sys
 import time
@@ -40,6 +41,16 @@ def execute(stage: Stage, job: Job) -> Usage:
     stage.run(job)
     grown = peak_memory_of_children()  # of all children so far: known to be of this stage's only where it has grown
     return Usage(time.monotonic() - started, max(peak_memory(), grown if grown > child else 0), cpu_seconds() - busy, cores())
+
+
+def execute_alone(stage: Stage, job: Job) -> Usage:
+    """`execute` in a process that is there for stages alone: what they leave (libraries, compiled kernels) is looked at once by the collector of garbage.
+
+    Else that takes up to a second as each stage begins, and again and again within. Garbage goes before; what is left stays to the end of the process.
+    """
+    give_back_freed()
+    gc.freeze()
+    return execute(stage, job)
 
 
 def cpu_seconds() -> float:

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from pipeline.decide import survey
 from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, PipelineError, RunLocked, TooLittleMemory, UsageError
 from pipeline.executors.child import Event, end_with
+from pipeline.executors.local import execute_alone
 from pipeline.executors.memory import Limit, resident
 from pipeline.failures import history
 from pipeline.run import Run
@@ -116,7 +117,7 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     if request.get("donor") and take_over(Run.open(path), stage, Path(request["donor"])):
         channel.send({"event": "message", "stage": name, "text": f"{name}: taken over from {Path(request['donor']).name}", "time": time.time()})
     memory = None if request["memory"] is None else Limit(request["memory"], "its share of the worker's memory")
-    outcome = run_stages(Run.open(path), program.stages, only=name, device=request["device"], memory=memory, report=channel.send)[0]
+    outcome = run_stages(Run.open(path), program.stages, only=name, device=request["device"], memory=memory, report=channel.send, execute=execute_alone)[0]
     surveyed = _survey(program, path)
     made = next(each for each in surveyed if each["name"] == name)
     return {**made, "action": outcome.action, **_estimates(program, path, surveyed, request, channel), **program.describe(path)}

@@ -7,6 +7,7 @@ modules beside this one.
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import json
 import re
@@ -16,6 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import jinja2
+
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.cameras import Camera
 
@@ -58,7 +61,6 @@ def viewer_page(
     asset: bytes, *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene"
 ) -> bytes:
     """The page of the bytes of an asset in the layout `compact`, which the page checks."""
-    import jinja2
     from markupsafe import Markup
 
     from pipeline.text import printable
@@ -67,14 +69,20 @@ def viewer_page(
     entries = [_camera(camera, (photographs or {}).get(camera.name)) for camera in cameras] or _captured_path(asset)
     facts = {"title": title, "bytes": len(asset), "cameras": entries, "home": None}
     script, style = script_text(), (FOLDER / "viewer.css").read_text(encoding="utf-8")
-    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined)
-    head = environment.get_template("viewer.html.j2").render(
+    head = _template().render(
         title=title, script_hash=policy_hash(script), style_hash=policy_hash(style), style=Markup(style), facts=Markup(json_for_html(facts))
     )
     parts = [head.encode("utf-8"), b"\n"]
     for part in _parts(asset):
         parts += [b'<script type="text/plain" data-part>', part, b"</script>\n"]
     return b"".join([*parts, b"<script>", script.encode("utf-8"), b"</script>\n</body>\n</html>\n"])
+
+
+@functools.cache
+def _template() -> jinja2.Template:
+    import jinja2
+
+    return jinja2.Environment(loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined).get_template("viewer.html.j2")
 
 
 def script_text() -> str:

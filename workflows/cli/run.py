@@ -89,6 +89,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
     """Run a plan, display its progress, and print the summary."""
     import time
 
+    from pipeline.executors.local import execute_alone
     from pipeline.runner import run_stages
     from workflows.cli.device import resolve_device
     from workflows.cli.output import closing, write_json
@@ -105,7 +106,8 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
             for text in plan.warnings:
                 show({"event": "warning", "stage": "", "text": text, "time": time.time()})
             with nullcontext(run) if dry_run else plan.written() as run:
-                outcomes = run_stages(run, workflow().stages, device=device, memory=plan.memory, report=show, dry_run=dry_run, **selection)
+                how: dict[str, Any] = {"device": device, "memory": plan.memory, "report": show, "dry_run": dry_run, "execute": execute_alone}
+                outcomes = run_stages(run, workflow().stages, **how, **selection)
                 if not dry_run and (any(outcome.action == "ran" for outcome in outcomes) or not has_pages(run, workflow().stages)):
                     write_pages(run, workflow().stages)
     except (Exception, KeyboardInterrupt) as error:

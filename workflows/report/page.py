@@ -6,6 +6,7 @@ nothing from the network. The template is report.html.j2.
 
 from __future__ import annotations
 
+import functools
 import os
 import stat
 from collections.abc import Sequence
@@ -90,9 +91,9 @@ def _published(run: Run, stages: Sequence[Stage]) -> list[tuple[int, int] | None
     return found
 
 
-def page(run: Run, decisions: Sequence[Decision]) -> str:
-    """The page as text; whatever names hold, it encodes in UTF-8."""
-    folder = run.path
+@functools.cache
+def _template() -> jinja2.Template:
+    """Compiled once: a fleet's process writes many reports."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -102,11 +103,18 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         finalize=_shown,
     )
     environment.filters["link"] = lambda name: quote(os.fsencode(name.as_posix()))
-    environment.tests["there"] = lambda name: _size(folder / name) is not None
+    environment.tests["there"] = jinja2.pass_context(lambda context, name: _size(context["folder"] / name) is not None)
+    return environment.get_template(TEMPLATE)
+
+
+def page(run: Run, decisions: Sequence[Decision]) -> str:
+    """The page as text; whatever names hold, it encodes in UTF-8."""
+    folder = run.path
     damaged: list[str] = []
     found = _read(folder / EVALUATE.metrics, Metrics, damaged)
     made = [each.manifest for each in decisions if each.manifest is not None]
-    return environment.get_template(TEMPLATE).render(
+    return _template().render(
+        folder=folder,
         name=folder.name,
         source=", ".join(map(str, run.sources.values())) or None,
         preset=run.preset,

@@ -6,10 +6,11 @@ turntable of the scene that is pointed at or has the focus. Names and messages a
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Container, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from pipeline.fleet.state import FleetState, SceneState
@@ -17,6 +18,9 @@ from pipeline.text import printable
 from stages.artifacts import TurntableOutputs
 from stages.viewer.page import json_for_html, policy_hash
 from workflows.report.page import NAME as REPORT
+
+if TYPE_CHECKING:
+    import jinja2
 
 NAME = "index.html"
 FOLDER = Path(__file__).parent
@@ -56,17 +60,21 @@ def index_page(
 
 def filled(template: str, script: str | None = None, *, title: str, facts: Any = None, **more: Any) -> str:
     """A page of a template with the style of all of them and, where it has any, a script and the facts that it shows."""
-    import jinja2
     from markupsafe import Markup
 
     style = (FOLDER / "page.css").read_text(encoding="utf-8")
     if script is not None:
         code = (FOLDER / script).read_text(encoding="utf-8")
         more |= {"script": Markup(code), "script_hash": policy_hash(code), "data": Markup(json_for_html(facts))}
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.get_template(template).render(title=printable(title, 200), style=Markup(style), style_hash=policy_hash(style), **more)
+    return _environment().get_template(template).render(title=printable(title, 200), style=Markup(style), style_hash=policy_hash(style), **more)
+
+
+@functools.cache
+def _environment() -> jinja2.Environment:
+    """One: it keeps compiled templates, and pages are written again and again."""
+    import jinja2
+
+    return jinja2.Environment(loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 
 def _scene(scene: SceneState, picture: int | None, *, reported: bool) -> dict[str, Any]:
