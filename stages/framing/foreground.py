@@ -11,61 +11,26 @@ P points, M cells, C cameras.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from efficientnerf.asset.region import Region, inside_distance
-from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.cameras import Camera
+from stages.framing.cells import CENTRAL, CONNECTED, Cells, connected_parts, observed_cells
+from stages.framing.supports import find_supports, rays_that_end, with_feet
 
 MIN_POINTS = 200
 MIN_OPACITY = 0.5
 MAX_CAMERAS = 64  # evenly spaced over the capture
-MAX_CELLS = 40_000
 CELLS_TO_FOCUS = 40  # along the distance from the cameras to what they look at
-NEIGHBOURS = 4  # samples of a view that a cell is compared with
-CENTRAL = 0.4  # of half the image: rays in its middle
 NEAR_QUANTILE = 0.35  # of a view's central distances: its subject, behind which there is always something
 OBSERVED, REACHED = 0.6, 0.05  # views of a cell over those of the cells with most: what is well observed; what the subject may still reach into
 FARTHEST, PATH_FARTHEST = 1.6, 3.0  # distance of a cell from its views over the usual distance
 # docs/experiments/foreground.md
 MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
-SUPPORT_TRIES, MAX_SUPPORTS = 400, 3
-MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane holds; of the central rays that end before it, that end behind it: supports hide
 MARGIN, WIDE_MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.1, 0.25, 0.02  # of the longest side
-FEET = 0.3  # of the subject's size, that a part of it stands above a support at most
+MIN_INNER, MIN_ENDING = 3, 0.7  # views that show a cell off their border, where a part ends in view; of the cells at its ends
 MIN_MIDDLING, MAX_BESIDE = 0.1, 1.8  # about a third of the way from the middle to the corner, in the mean
-
-
-@dataclass(frozen=True, eq=False)
-class Cells:
-    """Cells of the grid in which rays end.
-
-    side      of a cell
-    centres   (M, 3) mean of the points in each
-    agree     (M,) views whose rays end there
-    against   (M,) views that see through it
-    in_view   (M,) views that have it in view, hidden or not
-    distance  (M,) mean distance of the views that agree
-    nearest   (M,) least distance from a camera
-    central   (M,) weight of the central rays that end there
-    middling  (M,) how near the middle of the pictures it is, from 0 to 1: the mean over the views that agree
-    """
-
-    side: float
-    centres: np.ndarray
-    agree: np.ndarray
-    against: np.ndarray
-    in_view: np.ndarray
-    distance: np.ndarray
-    nearest: np.ndarray
-    central: np.ndarray
-    middling: np.ndarray
-
-    @property
-    def trusted(self) -> np.ndarray:
-        """(M,) bool."""
-        return (self.agree >= np.minimum(3, np.maximum(1, self.in_view))) & (self.agree >= self.against)
 
 
 def find_foreground(
@@ -110,12 +75,13 @@ def find_foreground(
     observed = close & (share >= OBSERVED)
     if not observed.any():
         return _region_of(cells.centres[trusted], cells.side)
-    planes, support, hidden = find_support(cells, observed, close, centres, reach)
+    planes, support, hidden = find_supports(cells, observed, close, rays_that_end(points, views, pixels, cameras), centres, reach)
     level = any(normal[2] > 0.8 for normal, _ in planes)
     candidates = close & ~support & ~hidden & (share >= REACHED)
     subject = _subject(cells, candidates, observed)
     if not planes:  # nothing tells the subject from what is beside it but where the pictures are centred; if that leaves little out, it is the subject's own
         central = _subject(cells, candidates & (cells.middling >= MIN_MIDDLING), observed)
+        central |= _ending_in_view(cells, subject & ~central, central, cells.trusted & ~candidates)
         subject = central if _volume(cells.centres[subject]) > MAX_BESIDE * _volume(cells.centres[central]) else subject
     if cells.central[subject].sum() < MIN_SHARE * cells.central[close].sum():
         return _region_of(cells.centres[observed], cells.side, level=level)
@@ -174,147 +140,45 @@ def _all_round(centres: np.ndarray, focus: np.ndarray) -> bool:
     return bool(np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi)).max() < np.pi)
 
 
-def observed_cells(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], side: float) -> Cells:
-    """The cells, of about this side or larger, in which rays end."""
-    from scipy.spatial import cKDTree
-
-    ends = np.flatnonzero(np.isfinite(points).all(axis=1))
-    while True:
-        index = np.floor(points[ends] / side)
-        index = index[(np.abs(index) < 2**20).all(axis=1)]
-        kept = ends[(np.abs(np.floor(points[ends] / side)) < 2**20).all(axis=1)]
-        _, cell, count = np.unique(index, axis=0, return_inverse=True, return_counts=True)
-        if len(count) <= MAX_CELLS:
-            break
-        side *= 1.4
-    cell = cell.reshape(-1)
-    centres = np.stack([np.bincount(cell, points[kept, axis], len(count)) for axis in range(3)], axis=1) / np.maximum(count, 1)[:, None]
-    central = np.bincount(cell, _weight_in_middle(pixels[kept]), len(count))
-    agree, against, in_view = (np.zeros(len(count), np.int64) for _ in range(3))
-    total, middling, nearest = np.zeros(len(count)), np.zeros(len(count)), np.full(len(count), np.inf)
-    for number, camera in enumerate(cameras):
-        mine = np.flatnonzero(views == number)
-        place, depth = project(camera, centres)
-        place = 2 * place / (camera.width, camera.height) - 1
-        with np.errstate(invalid="ignore"):
-            seen = np.flatnonzero((depth > 0) & (np.abs(place) <= 1).all(axis=1))
-        distance = np.linalg.norm(centres - camera.centre, axis=1)
-        nearest = np.minimum(nearest, distance)
-        in_view[seen] += 1
-        if not len(mine) or not len(seen):
-            continue
-        found = cKDTree(pixels[mine]).query(place[seen], k=min(NEIGHBOURS, len(mine)))[1].reshape(len(seen), -1)
-        beyond = np.linalg.norm(points[mine] - camera.centre, axis=1)[found] - distance[seen, None]
-        tolerance = (1.5 * side + 0.02 * distance[seen])[:, None]
-        ends_there = (np.abs(beyond) <= tolerance).any(axis=1)
-        agree[seen] += ends_there
-        against[seen] += (beyond > tolerance).all(axis=1)
-        total[seen] += np.where(ends_there, distance[seen], 0)
-        middling[seen] += np.where(ends_there, _weight_in_middle(place[seen]), 0)
-    mean = np.maximum(agree, 1)
-    return Cells(side, centres, agree, against, in_view, np.where(agree > 0, total / mean, np.inf), nearest, central, middling / mean)
-
-
-def _weight_in_middle(pixels: np.ndarray) -> np.ndarray:
-    """(N,) from 1 in the middle of a picture to next to nothing at its edge, for pixels (N, 2) from -1 to 1."""
-    return np.asarray(np.exp(-((pixels / CENTRAL) ** 2).sum(axis=1)))
-
-
-Plane = tuple[np.ndarray, float]
-
-
-def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras: np.ndarray, reach: float) -> tuple[list[Plane], np.ndarray, np.ndarray]:
-    """The planes that support the subject, unit normals towards the cameras and offsets, the cells (M,) on them, and the cells behind one.
-
-    A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of what the photographs' middles show beside it.
-    """
-    tolerance = max(1.5 * cells.side, 0.03 * reach)
-    support, hidden = np.zeros(len(observed), bool), np.zeros(len(observed), bool)
-    planes: list[Plane] = []
-    left = observed.copy()
-    for _ in range(MAX_SUPPORTS):
-        found = _plane(cells.centres[left], tolerance)
-        if found is None:
-            break
-        normal, offset = found
-        if np.median(cameras @ normal - offset) < 0:
-            normal, offset = -normal, -offset
-        height = along(cells.centres, normal) - offset
-        on = left & (np.abs(height) <= tolerance)
-        if on.sum() < MIN_SUPPORT * observed.sum():
-            break
-        left &= ~on
-        before, behind = (float(cells.central[close & part].sum()) for part in (height > tolerance, height < -tolerance))
-        if (cameras @ normal > offset + tolerance).mean() < 0.8 or behind > MAX_BEHIND * before:
-            continue
-        support |= np.abs(height) <= tolerance
-        hidden |= height < -tolerance
-        planes.append((normal, offset))
-    return planes, support, hidden & ~support
-
-
-def along(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(N,) coordinates of points (N, 3) along a direction: in sums whose order no number of threads changes."""
-    return np.asarray(points[:, 0] * direction[0] + points[:, 1] * direction[1] + points[:, 2] * direction[2])
-
-
-def _plane(points: np.ndarray, tolerance: float) -> Plane | None:
-    """Normal and offset of the plane with most of the points (N, 3) within a tolerance."""
-    if len(points) < 3:
-        return None
-    generator = np.random.default_rng(0)
-    triple = points[generator.integers(0, len(points), (SUPPORT_TRIES, 3))]
-    normals = np.cross(triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    good = length > 1e-12
-    if not good.any():
-        return None
-    normals = normals[good] / length[good, None]
-    offsets = (normals * triple[good, 0]).sum(axis=1)
-    counts = [(np.abs(along(points, normal) - offset) <= tolerance).sum() for normal, offset in zip(normals, offsets, strict=True)]
-    best = int(np.argmax(counts))
-    normal, offset = normals[best], float(offsets[best])
-    for _ in range(3):
-        near = points[np.abs(along(points, normal) - offset) <= tolerance]
-        if len(near) < 3:
-            break
-        middle = near.mean(axis=0)
-        normal = np.linalg.eigh(np.einsum("ni,nj->ij", near - middle, near - middle))[1][:, 0]
-        offset = float(normal @ middle)
-    return normal, offset
-
-
 def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.ndarray:
     """(M,) bool: connected parts of the candidates that hold some of the central rays where they are well observed."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     at = np.flatnonzero(candidates)
     out = np.zeros(len(candidates), bool)
     if not len(at):
         return out
-    pairs = cKDTree(cells.centres[at]).query_pairs(2.2 * cells.side, output_type="ndarray")
-    count, part = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(at), len(at))), directed=False)
+    count, part = connected_parts(cells.centres[at], CONNECTED * cells.side)
     held = np.bincount(part, np.where(observed[at], cells.central[at], 0.0), count)
     out[at] = (held >= MIN_PART * held.sum())[part] & (held[part] > 0)
+    return out
+
+
+def _ending_in_view(cells: Cells, beside: np.ndarray, subject: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(M,) bool: connected parts of the cells beside a subject that end within the pictures, as horns do, and neither go on out of them nor in other cells."""
+    from scipy.spatial import cKDTree
+
+    at, out = np.flatnonzero(beside), np.zeros(len(beside), bool)
+    if not len(at) or not subject.any():
+        return out
+    _, part = connected_parts(cells.centres[at], CONNECTED * cells.side)
+    ends = cells.inner[at] >= MIN_INNER
+    if others.any():
+        ends &= cKDTree(cells.centres[others]).query(cells.centres[at])[0] > CONNECTED * cells.side
+    bounds = np.stack([cells.centres[subject].min(axis=0), -cells.centres[subject].max(axis=0)])
+    for number in range(part.max() + 1):
+        mine = at[part == number]
+        whole = True
+        for sign, limit in zip((1, -1), bounds, strict=True):
+            places = sign * cells.centres[mine]
+            for axis in np.flatnonzero(places.min(axis=0) < limit):
+                last = places[:, axis] <= places[:, axis].min() + CONNECTED * cells.side
+                whole &= bool(ends[part == number][last].mean() >= MIN_ENDING)
+        out[mine] = whole
     return out
 
 
 def _volume(points: np.ndarray) -> float:
     """Of the box of points (N, 3)."""
     return float(np.ptp(points, axis=0).prod()) if len(points) else 0.0
-
-
-def with_feet(subject: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
-    """Points (N, 3) of a subject and where those near a support would stand on it: what touches a plane counts as plane."""
-    size = float(np.ptp(subject, axis=0).max())
-    feet = [subject]
-    for normal, offset in planes:
-        height = along(subject, normal) - offset
-        near = height <= FEET * size
-        feet.append(subject[near] - height[near, None] * normal)
-    return np.concatenate(feet)
 
 
 def _region_of(found: np.ndarray, side: float, beside: np.ndarray | None = None, *, level: bool = False, margin: float = MARGIN) -> Region:

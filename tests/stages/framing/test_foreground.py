@@ -146,6 +146,62 @@ def test_a_head_is_whole_in_close_ups_and_before_a_wall_of_uncertain_depth(away:
     assert (found.bounds[1] - found.bounds[0]).max() < 4.5  # of a wall of 16
 
 
+HEAD, NOSE, BODY = ([0, -0.45, 0], 0.4), ([-0.06, -1.25, -0.1], [0.06, -0.75, 0.0]), ([-0.5, -0.3, -1.2], [0.5, 0.5, -0.2])
+Corners = tuple[list[float], list[float]]
+
+
+def both(*boxes: Corners) -> list[Corners]:
+    """Boxes and their mirror images, left and right."""
+    return [*boxes, *(([-high[0], *low[1:]], [-low[0], *high[1:]]) for low, high in boxes)]
+
+
+# What lies in one plane that faces the cameras, and what reaches out of the middle of the pictures.
+PARTS = {
+    "flat ears": both(([0.1, -0.45, 0.3], [0.25, -0.42, 1.2])),
+    "wide ears": both(([0.1, -0.45, 0.3], [0.5, -0.42, 1.2])),
+    "thick ears": both(([0.1, -0.5, 0.3], [0.25, -0.35, 1.2])),
+    "one ear": [([0.05, -0.45, 0.3], [0.3, -0.42, 1.2])],
+    "an elephant's ears": both(([0.2, -0.45, -0.5], [1.1, -0.4, 0.5])),
+    "a mane": [([-0.8, -0.4, -0.8], [0.8, -0.36, 0.8])],
+    "horns": both(([0.3, -0.5, 0.2], [0.4, -0.4, 1.0]), ([0.4, -0.5, 0.9], [0.9, -0.4, 1.0])),
+    "antlers": both(([0.2, -0.5, 0.3], [0.28, -0.42, 1.3]), ([0.28, -0.5, 0.8], [0.7, -0.42, 0.88]), ([0.28, -0.5, 1.2], [0.9, -0.42, 1.28])),
+}
+
+
+def in_front(distance: float, height: float) -> list[Camera]:
+    angles = np.radians(np.linspace(-60, 60, 20))
+    return [camera([distance * np.sin(a), -0.45 - distance * np.cos(a), height], [0, -0.45, 0.2], 55) for a in angles]
+
+
+@pytest.mark.parametrize("wall", [None, 0.5, 4.0])
+@pytest.mark.parametrize(("body", "height", "noise"), [(False, 0.2, 0.0), (False, 0.2, 0.01), (True, 0.2, 0.01), (True, 1.2, 0.01)])
+@pytest.mark.parametrize("kind", PARTS)
+def test_a_head_is_whole_whatever_it_wears(kind: str, body: bool, height: float, noise: float, wall: float | None) -> None:
+    """What of it is in one plane is no support: rays pass between and beside its parts, and go on to a wall or to nowhere."""
+    cameras, parts = in_front(2.6, height), [*PARTS[kind], NOSE]
+    shapes = [ball(*HEAD), *(box(*part) for part in parts)]
+    shapes += [box(*BODY)] if body else []
+    shapes += [box([-20, wall, -20], [20, wall + 1, 20])] if wall is not None else []
+    found = region(cameras, shapes, noise=noise)
+    points, views, _ = cast(cameras, [box(*part) for part in parts])
+    for low, high in parts:
+        place = np.concatenate([in_box(low, high), np.stack([low, high])])
+        assert (inside_distance(found, place) > 0).all()
+    assert len(np.unique(views[np.isfinite(points).all(axis=1)])) == len(cameras)  # it is in view of all
+    head = on_ball(*HEAD)
+    assert (inside_distance(found, head[head[:, 1] < HEAD[0][1]]) > 0).all()  # the back is seen by none
+    assert (found.bounds[1] - found.bounds[0]).max() < 5  # of a wall of 40
+
+
+def test_a_table_is_clipped_about_what_stands_on_it_and_a_panel_that_ends_in_view_is_not() -> None:
+    """The same plane with and without edges that all photographs show."""
+    cameras = in_front(2.5, 0.2)
+    wall, panel = ([-20.0, 0.0, -20.0], [20.0, 1.0, 20.0]), ([-0.9, 0.0, -0.9], [0.9, 0.1, 0.9])
+    clipped, whole = (region(cameras, [ball(*HEAD), box(*behind)]) for behind in (wall, panel))
+    assert (clipped.bounds[1] - clipped.bounds[0])[[0, 2]].max() < 1.6
+    assert (inside_distance(whole, in_box([-0.9, 0.0, -0.9], [0.9, 0.02, 0.9])) > 0).all()
+
+
 def test_floaters_before_the_cameras_and_scattered_ends_change_little() -> None:
     cameras = ring(30, 2.5, 1.2)
     shapes = [ball([0, 0, 0], 0.5), ROOM]
