@@ -25,6 +25,7 @@ from stages.video.reading import KNOWN, SUFFIXES
 
 # What conversions leave beside the photographs, in any case: reductions, depth maps, masks.
 NOT_PHOTOGRAPHS = {*FOLDERS, "depth", "depths", "sparse", "dense", "stereo", "thumbnails", "thumbs", "@eadir"}
+CORRECTED = "corrected_images"
 _REDUCED = re.compile(r"images_\d+")
 _PREFERRED = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif", ".webp", ".bmp")  # of one picture in several formats
 _EXIF, _TAKEN, _FRACTION = 34665, 36867, 37521  # directory; DateTimeOriginal, SubSecTimeOriginal
@@ -64,7 +65,7 @@ def _all(source: Source) -> list[Path]:
     else:
         everything = source.walk()
         usable = [path for path in everything if not _is_beside(path, folder)]
-        found = one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES))
+        found = _corrected_once(one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES)))
         videos = _videos_in(folder) or sorted(filter(is_video, usable))
         if not found and not videos:
             raise BadInput(_nothing(source, everything))
@@ -76,6 +77,12 @@ def _all(source: Source) -> list[Path]:
     if len(found) > MAX_FRAMES:
         raise BadInput(f"{folder}: {len(found)} images; at most {MAX_FRAMES} are read.")
     return [source.check_inside(path) for path in found]
+
+
+def _corrected_once(images: Sequence[Path]) -> list[Path]:
+    """Without those in a folder images/ that lie in corrected_images/ beside it, too, as Polycam writes them."""
+    corrected = {(path.parent.parent, path.name) for path in images if path.parent.name == CORRECTED}
+    return [path for path in images if path.parent.name != "images" or (path.parent.parent, path.name) not in corrected]
 
 
 def _count(paths: Sequence[Path], what: str, source: Source) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,9 +13,11 @@ import numpy as np
 from efficientnerf.geometry.cameras import Similarity
 from stages.io import importers
 from stages.io.capture import Capture
+from stages.io.importers.photographs import photographs
+from stages.io.importers.source import Source
 from stages.masking.photographs import _in_known_frame
 from stages.poses import PosesSettings
-from tests.stages import captures
+from tests.stages import captures, exports
 
 AWAY = Similarity(0.2, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([4.0, 1, -3]))
 ANEW = PosesSettings(format="photographs")
@@ -50,6 +53,17 @@ def test_a_model_that_cannot_be_read_is_said_and_changes_nothing(tmp_path: Path)
     for photo, before in zip(capture.photos, found_for(stated).photos, strict=True):
         assert photo.camera.world_from_camera.tobytes() == before.camera.world_from_camera.tobytes()
     assert "cannot be read" in said[0]
+
+
+def test_photographs_that_an_app_writes_twice_are_taken_once(tmp_path: Path) -> None:
+    source, _ = exports.polycam(tmp_path / "source")
+    stated = importers.IMPORTERS["polycam"].read(source, PosesSettings())
+    place = source / "keyframes"
+    shutil.copytree(place / "corrected_images", place / "images", dirs_exist_ok=True)
+    found = photographs(Source(source, False))
+    assert [path.relative_to(source).as_posix() for path in found] == sorted(photo.camera.name for photo in stated.photos)
+    shutil.rmtree(place / "corrected_images")
+    assert {path.parent for path in photographs(Source(source, False))} == {place / "images"}
 
 
 def test_what_states_cameras_is_among_the_files_that_a_run_depends_on(tmp_path: Path) -> None:
