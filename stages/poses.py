@@ -135,6 +135,8 @@ def run(job: Job) -> None:
     framed = training_frame.find_training_frame(
         capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
     )
+    if cut := framed.facts.get("silhouettes_cut"):
+        warn(f"the silhouettes of {len(cut)} photographs reach out of the box: {abbreviated(cut)}. Something is cut off; state the box with poses.crop_box.")
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = tuple(
@@ -176,7 +178,7 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
     return [*importers.files(source, settings), *network]
 
 
-STAGE = Stage(name="poses", version=9, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
+STAGE = Stage(name="poses", version=10, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:

@@ -214,7 +214,7 @@ def hull_overlaps(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray]]
     cameras, masks = [photo.camera for photo, _ in pictures], [picture for _, picture in pictures]
     focus, converging = focus_point(capture)
     ranges = [(photo.near, photo.far) for photo, _ in pictures]
-    hull = scene_bounds.visual_hull(masks, cameras, *scene_bounds.bounds_of_frusta(cameras, ranges, focus, converging, least=0.5))
+    hull = scene_bounds.whole_visual_hull(masks, cameras, ranges, focus, converging)
     return np.zeros(len(pictures)) if hull is None else overlaps(masks, cameras, *hull)
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, Similarity, project, resized
+from efficientnerf.geometry.cameras import Camera, Similarity, project, rays, resized
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.silhouettes import SmallPictures
 
@@ -15,12 +15,31 @@ MIN_POINTS = 50  # sparse points
 MIN_VIEW_RATIO = 0.65  # views of a point over those of the points with most: below, it is background
 MAX_CAMERAS = 48  # evenly spaced over the capture
 GRID_SIZE = 32  # voxels along a side of the region searched
+# docs/experiments/framing.md
+QUORUMS = (0.5, 0.375, 0.25, 0.125, 0.0)  # of the photographs, that have a voxel of the visual hull in view: the first is taken that cuts nothing
+MIN_VIEWS = 3  # that show a part of the subject at least
+MAX_OUTSIDE = 0.005  # of a silhouette, that may be outside of the box
+MAX_GROWTH = 4.0  # of the box's volume, by lower quorums
+
+Ranges = Sequence[tuple[float | None, float | None]]
 
 
-def find_scene_bounds(
-    capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool, small: SmallPictures | None = None
-) -> tuple[np.ndarray, np.ndarray, str]:
-    """Corners of an axis-aligned box in the turned frame, and how it was found, in words.
+@dataclass(frozen=True, eq=False)
+class SceneBounds:
+    """Corners of an axis-aligned box.
+
+    how  it was found, in words
+    cut  names of the photographs whose silhouettes reach out of it
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    how: str
+    cut: tuple[str, ...] = ()
+
+
+def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool, small: SmallPictures | None = None) -> SceneBounds:
+    """The box of a capture, in the turned frame.
 
     turned      the rotation from the capture's frame to one with z up
     focus       what the cameras look at, in the turned frame
@@ -33,16 +52,18 @@ def find_scene_bounds(
     bounded = capture.background is not None  # silhouettes are more exact than points, in bounded scenes
     for way in ("silhouettes", "sparse points") if bounded else ("sparse points", "silhouettes"):
         if way == "silhouettes":
-            # A wide region to start from: parts of the subject outside of close views are cut by the others.
             pictures = [(small or SmallPictures()).silhouette(photo, capture.silhouettes) for photo in photos]
-            found = bounds_of_visual_hull(pictures, cameras, *bounds_of_frusta(cameras, ranges, focus, converging, least=0.5))
+            hull = whole_visual_hull(pictures, cameras, ranges, focus, converging)
+            if hull is not None:
+                low, high = box_round(*hull)
+                shares = shares_outside(pictures, silhouettes_outside(pictures, cameras, low, high))
+                cut = tuple(photo.camera.name for photo, share in zip(photos, shares, strict=True) if share > MAX_OUTSIDE)
+                return SceneBounds(low, high, way, cut if len(cut) >= MIN_VIEWS else ())
         elif capture.points is not None and len(capture.points.xyz) >= MIN_POINTS:
             found = bounds_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, converging)
-        else:
-            found = None
-        if found is not None:
-            return *found, way
-    return *bounds_of_frusta(cameras, ranges, focus, converging), "camera frusta"
+            if found is not None:
+                return SceneBounds(*found, way)
+    return SceneBounds(*bounds_of_frusta(cameras, ranges, focus, converging), "camera frusta")
 
 
 def chosen_photos(photos: Sequence[Photo]) -> list[Photo]:
@@ -120,7 +141,7 @@ def in_view(xyz: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 def bounds_of_frusta(
     cameras: Sequence[Camera],
-    ranges: Sequence[tuple[float | None, float | None]],
+    ranges: Ranges,
     focus: np.ndarray,
     converging: bool,
     least: float = 0.9,
@@ -160,22 +181,71 @@ def _depth_limits(near: float | None, far: float | None) -> tuple[float, float]:
     return 0.0, np.inf
 
 
-def bounds_of_visual_hull(
-    pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray
+def whole_visual_hull(
+    pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], ranges: Ranges, focus: np.ndarray, converging: bool
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """A box round the visual hull; None unless half of the photos have a silhouette, or where the hull is empty."""
-    found = visual_hull(pictures, cameras, low, high)
-    return None if found is None else (found[0].min(0) - found[1] / 2, found[0].max(0) + found[1] / 2)
+    """`visual_hull` of a capture, of what as many photographs have in view as may be without that its box cuts silhouettes.
+
+    The more photographs it takes, the nearer the box is; but of a subject that is photographed from near too, the ends are in view in few.
+    """
+    best, fewest, least = None, len(pictures) + MIN_VIEWS, np.inf
+    for quorum in QUORUMS:
+        # A wide region to start from: parts of the subject outside of close views are cut by the others.
+        hull = visual_hull(pictures, cameras, *bounds_of_frusta(cameras, ranges, focus, converging, least=max(quorum, 0.05)), quorum)
+        if hull is None:
+            continue
+        low, high = box_round(*hull)
+        least = min(least, float((high - low).prod()))
+        if (high - low).prod() > MAX_GROWTH * least:  # into such a box anything fits, damaged silhouettes too
+            break
+        cut = int((shares_outside(pictures, silhouettes_outside(pictures, cameras, low, high)) > MAX_OUTSIDE).sum())
+        if cut <= fewest - MIN_VIEWS:
+            best, fewest = hull, cut
+        if fewest < MIN_VIEWS:
+            break
+    return best
 
 
-def visual_hull(pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def box_round(hull: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box of voxels with centres (N, 3) and sides (3,)."""
+    return hull.min(0) - step / 2, hull.max(0) + step / 2
+
+
+def silhouettes_outside(pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> list[np.ndarray | None]:
+    """Of each silhouette (h, w) bool the pixels whose rays miss a box; None without one."""
+    found: list[np.ndarray | None] = []
+    for picture, camera in zip(pictures, cameras, strict=True):
+        if picture is None:
+            found.append(None)
+            continue
+        missing = np.array(picture)
+        row, column = np.nonzero(picture)
+        origins, directions = rays(resized(camera, picture.shape[1], picture.shape[0]), np.stack([column, row], axis=-1) + 0.5)
+        directions = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
+        sides = np.stack([(low - origins) / directions, (high - origins) / directions])  # (2, N, 3)
+        enters, leaves = sides.min(0).max(axis=1), sides.max(0).min(axis=1)
+        missing[row, column] = (leaves < enters) | (leaves <= 0)
+        found.append(missing)
+    return found
+
+
+def shares_outside(pictures: Sequence[np.ndarray | None], outside: Sequence[np.ndarray | None]) -> np.ndarray:
+    """(C,) which share of each silhouette that is; 0 without one."""
+    pairs = zip(pictures, outside, strict=True)
+    return np.array([0.0 if picture is None or part is None else part.sum() / max(1, int(picture.sum())) for picture, part in pairs])
+
+
+def visual_hull(
+    pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray, quorum: float = QUORUMS[0]
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Centres (N, 3) of the voxels of the visual hull in a box, and the (3,) sides of a voxel; None unless half of the photos have a silhouette, or where
     the hull is empty.
 
     pictures  (h, w) bool of each photo: its silhouette, at any size; or None
+    quorum    share of the photographs
 
     A voxel is carved where its whole projection is transparent in more than one in fifty photographs (whose silhouette may be damaged), or where
-    less than half of the photographs have it in view.
+    less than the quorum of the photographs, or less than MIN_VIEWS, have it in view.
     """
     views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in zip(cameras, pictures, strict=True) if mask is not None]
     if len(views) < max(3, len(pictures) / 2):
@@ -188,10 +258,10 @@ def visual_hull(pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera]
             against, views_of = against + transparent, views_of + inside
             left = against <= len(views) // 50
             kept, against, views_of = kept[left], against[left], views_of[left]
-        kept = kept[views_of >= len(views) / 2]
+        kept = kept[views_of >= max(MIN_VIEWS, quorum * len(views))]
         if not len(kept):
             return None
-        low, high = kept.min(0) - step / 2, kept.max(0) + step / 2
+        low, high = box_round(kept, step)
     return kept, step
 
 
@@ -204,8 +274,8 @@ def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: floa
         reach = np.ceil(radius * camera.intrinsics["fx"] / depth) + 1  # px
         column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
         inside = (depth > radius) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    # One distance transform of the image serves all balls.
-    distance = cv2.distanceTransform(np.where(mask, np.uint8(0), np.uint8(1)), cv2.DIST_C, 3) if mask.any() else np.full(mask.shape, np.inf)
+    # One distance transform of the image serves all balls. What is beyond its border may be opaque.
+    distance = cv2.distanceTransform(np.pad(np.where(mask, np.uint8(0), np.uint8(1)), 1), cv2.DIST_C, 3)[1:-1, 1:-1]
     out = np.zeros(len(xyz), bool)
     out[inside] = distance[row[inside].astype(int), column[inside].astype(int)] > reach[inside]
     return inside, out

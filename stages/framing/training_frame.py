@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class TrainingFrame:
     near_far_planes: np.ndarray
     space: str
     forward: ForwardFacing | None
-    facts: dict[str, object]
+    facts: dict[str, Any]
 
 
 def find_training_frame(
@@ -64,6 +65,7 @@ def find_training_frame(
         raise BadInput("a capture without photographs cannot be framed.")
     upward, from_axes = up_vector(capture, up)
     turn = rotation_to_z(upward)
+    cut: tuple[str, ...] = ()
     stated = _corners(box) if box is not None else None if capture.bounds is None else _corners(np.asarray(capture.bounds).ravel())
     focus, converging = focus_point(capture)
     if not from_axes and stated is None:
@@ -73,7 +75,8 @@ def find_training_frame(
         low, high, how = corners.min(0), corners.max(0), "given" if box is not None else "stated by the source"
     else:
         turned = Similarity(1.0, turn, np.zeros(3))
-        low, high, how = scene_bounds.find_scene_bounds(capture, turned, turned.points(focus), converging, small)
+        found = scene_bounds.find_scene_bounds(capture, turned, turned.points(focus), converging, small)
+        low, high, how, cut = found.low, found.high, found.how, found.cut
         padding = margin * (high - low).max() if how == "sparse points" else 0.0
         low, high = low - padding, high + padding
     centre, half = (low + high) / 2, (high - low) / 2
@@ -83,13 +86,15 @@ def find_training_frame(
     bounds = np.stack([-half, half]) * scale
     placed = [world.camera(camera) for camera in cameras]
     orbit = orbit_of(placed, np.clip(world.points(focus), *bounds))
-    facts: dict[str, object] = {
+    facts: dict[str, Any] = {
         "up": [round(float(c), 6) for c in upward],
         "up_from": "given" if up != "auto" else "stated by the source" if capture.up is not None else "estimated from the cameras",
         "bounds_from": how,
         "converging": converging,
         "scale": float(scale),
     }
+    if cut:
+        facts["silhouettes_cut"] = list(cut)
     space, forward, facts["space_from"] = space_of(capture, placed, world, space)
     facts["space"] = space
     return TrainingFrame(world, bounds, orbit, near_far_planes(capture, placed, world, bounds), space, forward, facts)

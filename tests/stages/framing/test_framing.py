@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from efficientnerf.geometry.cameras import Camera, Similarity, project
+from efficientnerf.geometry.cameras import Camera, Similarity, project, rays
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
 from stages.framing.training_frame import TrainingFrame, estimated_up, find_training_frame, mean_azimuth, rotation_to_z
@@ -214,6 +214,88 @@ def test_box_without_points(tmp_path: Path, with_alpha: bool) -> None:
         assert near - 1e-9 <= corner_depth <= far + 1e-9
 
 
+# --------------------------------------------------------------------------------------------------------------- silhouettes
+
+
+def ellipsoids(kind: str) -> list[tuple[list[float], list[float]]]:
+    """Centres and radii of a head of radius 0.45, and of what it wears."""
+    ears = [([side * 0.25, 0.0, 0.6], [0.08, 0.05, 0.35]) for side in (-1, 1)]
+    horns = [([side * 0.75, 0.0, 0.3], [0.45, 0.06, 0.06]) for side in (-1, 1)]
+    nose = ([0.0, -0.6, -0.05], [0.08, 0.25, 0.08])
+    return [([0.0, 0.0, 0.0], [0.45, 0.45, 0.45]), nose, *{"ears": ears, "horns": horns}[kind]]
+
+
+def outlines(kind: str, camera: Camera) -> np.ndarray:
+    """(h, w) bool: which pixels show the ellipsoids."""
+    origins, directions = rays(camera)
+    out = np.zeros(len(origins), bool)
+    for centre, radii in ellipsoids(kind):
+        away, along = (origins - centre) / radii, directions / radii
+        half, square = (away * along).sum(1), (along**2).sum(1)
+        out |= (half**2 >= square * ((away**2).sum(1) - 1)) & (half < 0)
+    return out.reshape(camera.height, camera.width)
+
+
+def near_and_far(seed: int, far: float, close: float, arc: float) -> list[Camera]:
+    """48 cameras round the head, so many of them from far, and the others so close that they have little but the face in view."""
+    generator = np.random.default_rng(seed)
+    cameras = []
+    for number in range(48):
+        angle = np.radians(-90 + arc * ((number * 17 % 48 + 0.5) / 48 - 0.5))
+        distance = 4.0 if number < 48 * far else close
+        height = 0.3 * distance * generator.uniform(-0.5, 1)
+        centre = np.array([distance * np.cos(angle), distance * np.sin(angle), height])
+        cameras.append(looking(centre, 0.04 * distance * generator.normal(size=3), name=f"{number:03d}"))
+    return cameras
+
+
+def shares_outside(pictures: list[np.ndarray], cameras: list[Camera], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    return scene_bounds.shares_outside(pictures, scene_bounds.silhouettes_outside(pictures, cameras, low, high))
+
+
+@pytest.mark.parametrize(("far", "close", "arc"), [(0.3, 1.3, 360), (0.3, 1.6, 360), (1.0, 1.0, 360), (0.6, 1.3, 360), (0.6, 1.3, 150), (1.0, 1.0, 150)])
+@pytest.mark.parametrize("kind", ["ears", "horns"])
+def test_what_three_photographs_show_is_in_the_box_of_silhouettes(kind: str, far: float, close: float, arc: float) -> None:
+    cameras = near_and_far(4, far, close, arc)
+    pictures = [outlines(kind, camera) for camera in cameras]
+    hull = scene_bounds.whole_visual_hull(pictures, cameras, [(None, None)] * len(cameras), np.zeros(3), True)
+    assert hull is not None
+    low, high = scene_bounds.box_round(*hull)
+    assert (shares_outside(pictures, cameras, low, high) > scene_bounds.MAX_OUTSIDE).sum() < 3
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    surface = np.concatenate([np.asarray(centre) + directions * radii for centre, radii in ellipsoids(kind)])
+    shown = scene_bounds.in_view(surface, cameras).sum(0) >= 3
+    step = hull[1]
+    assert (surface[shown] >= low - 0.5 * step).all()
+    assert (surface[shown] <= high + 0.5 * step).all()
+    if arc == 360:  # from one side what is behind is not carved
+        assert (high - low).prod() <= 4 * np.ptp(surface[shown], axis=0).prod()
+
+
+def test_one_damaged_silhouette_widens_no_box() -> None:
+    cameras = near_and_far(4, 1.0, 1.0, 360)
+    pictures = [outlines("ears", camera) for camera in cameras]
+    clean = scene_bounds.whole_visual_hull(pictures, cameras, [(None, None)] * len(cameras), np.zeros(3), True)
+    pictures[5][:20, :20] = True
+    dirty = scene_bounds.whole_visual_hull(pictures, cameras, [(None, None)] * len(cameras), np.zeros(3), True)
+    assert clean is not None
+    assert dirty is not None
+    low, high = scene_bounds.box_round(*dirty)
+    np.testing.assert_array_equal(np.stack([low, high]), np.stack(scene_bounds.box_round(*clean)))
+    outside = shares_outside(pictures, cameras, low, high)
+    assert np.flatnonzero(outside > scene_bounds.MAX_OUTSIDE).tolist() == [5]
+
+
+def test_a_silhouette_that_the_border_cuts_carves_nothing_of_what_is_beyond_it() -> None:
+    """The ears begin just above some pictures."""
+    cameras = [looking(np.array([2 * np.cos(a), 2 * np.sin(a), 0.0]), np.array([0.0, 0.0, z]), focal=1.2) for a in np.arange(0, 6.2, 0.3) for z in (-0.4, 0.45)]
+    pictures = [outlines("ears", camera) for camera in cameras]
+    hull = scene_bounds.whole_visual_hull(pictures, cameras, [(None, None)] * len(cameras), np.zeros(3), True)
+    assert hull is not None
+    assert scene_bounds.box_round(*hull)[1][2] >= 0.95 - hull[1][2]
+
+
 def test_heading() -> None:
     angles = np.radians([170, 180, -170, -160])
     heading, one_side = mean_azimuth(np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1))
@@ -262,8 +344,6 @@ def entry(origins: np.ndarray, directions: np.ndarray, bounds: np.ndarray) -> np
 
 
 def test_chair_lies_in_its_box() -> None:
-    from efficientnerf.geometry.cameras import rays
-
     capture = replace(real("chair_200", "blender"), background=(1.0, 1.0, 1.0))
     framed = find_training_frame(capture)
     check_laws(capture, framed)
