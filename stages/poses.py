@@ -135,8 +135,7 @@ def run(job: Job) -> None:
     framed = training_frame.find_training_frame(
         capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
     )
-    if cut := framed.facts.get("silhouettes_cut"):
-        warn(f"the silhouettes of {len(cut)} photographs reach out of the box: {abbreviated(cut)}. Something is cut off; state the box with poses.crop_box.")
+    _say_what_is_cut(framed.facts.get("silhouettes_cut", ()), warn)
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = tuple(
@@ -170,6 +169,11 @@ def run(job: Job) -> None:
     _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
+
+
+def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
+    if names:
+        warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
 
 
 def files(source: Path, settings: PosesSettings) -> list[Path]:
