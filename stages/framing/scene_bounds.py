@@ -274,8 +274,8 @@ def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: floa
         reach = np.ceil(radius * camera.intrinsics["fx"] / depth) + 1  # px
         column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
         inside = (depth > radius) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    # One distance transform of the image serves all balls. What is beyond its border may be opaque.
-    distance = cv2.distanceTransform(np.pad(np.where(mask, np.uint8(0), np.uint8(1)), 1), cv2.DIST_C, 3)[1:-1, 1:-1]
+    # One distance transform of the image serves all balls.
+    distance = cv2.distanceTransform(np.where(mask, np.uint8(0), np.uint8(1)), cv2.DIST_C, 3) if mask.any() else np.full(mask.shape, np.inf)
     out = np.zeros(len(xyz), bool)
     out[inside] = distance[row[inside].astype(int), column[inside].astype(int)] > reach[inside]
     return inside, out

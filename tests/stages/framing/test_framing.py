@@ -287,15 +287,6 @@ def test_one_damaged_silhouette_widens_no_box() -> None:
     assert np.flatnonzero(outside > scene_bounds.MAX_OUTSIDE).tolist() == [5]
 
 
-def test_a_silhouette_that_the_border_cuts_carves_nothing_of_what_is_beyond_it() -> None:
-    """The ears begin just above some pictures."""
-    cameras = [looking(np.array([2 * np.cos(a), 2 * np.sin(a), 0.0]), np.array([0.0, 0.0, z]), focal=1.2) for a in np.arange(0, 6.2, 0.3) for z in (-0.4, 0.45)]
-    pictures = [outlines("ears", camera) for camera in cameras]
-    hull = scene_bounds.whole_visual_hull(pictures, cameras, [(None, None)] * len(cameras), np.zeros(3), True)
-    assert hull is not None
-    assert scene_bounds.box_round(*hull)[1][2] >= 0.95 - hull[1][2]
-
-
 def test_heading() -> None:
     angles = np.radians([170, 180, -170, -160])
     heading, one_side = mean_azimuth(np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1))
