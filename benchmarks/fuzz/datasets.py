@@ -170,6 +170,7 @@ for _suffix, _write, _changed in ((".bin", captures.colmap_bin, binary.changed_b
 EXPORTED = {
     "polycam": ("polycam", "keyframes/corrected_cameras/img_2.json", "a camera of Polycam"),
     "record3d": ("record3d", "EXR_RGBD/metadata.json", "metadata.json of Record3D"),
+    "scanner_app": ("3d scanner app", "frame_00002.json", "a frame of 3D Scanner App"),
     "metashape": ("metashape", "cameras.xml", "Metashape's XML of cameras"),
     "realitycapture_csv": ("realitycapture csv", "registration.csv", "RealityCapture's table of cameras"),
     "realitycapture_xmp": ("realitycapture xmp", "images/img_2.xmp", "RealityCapture's XMP files"),

@@ -33,6 +33,14 @@ def finite(value: Any, largest: float = LARGEST_NUMBER) -> float | None:
     return float(value)
 
 
+def numbers(value: Any, count: int, where: str, remedy: str) -> list[float]:
+    """A list of finite numbers of a JSON file; BadInput says where it is another, then the remedy."""
+    found = [finite(entry) for entry in value] if isinstance(value, list) and len(value) == count else [None]
+    if None in found:
+        raise BadInput(f"{where} is {shown(value)}; expected {count} finite numbers. {remedy}")
+    return [entry for entry in found if entry is not None]
+
+
 def shown(value: Any) -> str:
     """A value of a JSON file for a message: what it is, where it is large or nested."""
     if isinstance(value, list):

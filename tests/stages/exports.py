@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, opengl_from_pose
+from efficientnerf.geometry.cameras import Camera, opengl_from_pose, rays
 from tests.stages import captures
 from tests.stages.captures import FOCAL, HEIGHT, WIDTH
 
@@ -207,6 +207,22 @@ def record3d(folder: Path) -> tuple[Path, Pixels]:
     return folder, pixels
 
 
+def scanner_app(folder: Path) -> tuple[Path, Pixels]:
+    """As in life with more poses than pictures."""
+    pixels = {}
+    made = cameras()
+    for index, camera in enumerate([*made, *made[:2]]):
+        matrix, lens = opengl_from_pose(camera.world_from_camera), {"fx": 40.0 + index, "fy": 41.0 + index, "cx": 15.5, "cy": 12.5}
+        k = [lens["fx"], 0, lens["cx"], 0, lens["fy"], lens["cy"], 0, 0, 1]
+        document = {"cameraPoseARFrame": matrix.ravel().tolist(), "intrinsics": k, "projectionMatrix": [0.0] * 16, "time": 0.5 * index, "motionQuality": 1}
+        captures.write_json(folder / f"frame_{index:05d}.json", document | {"frame_index": index})
+        if index < len(made):
+            pixels[f"frame_{index:05d}.jpg"] = opengl_pinhole(matrix, **lens)
+    captures.write_pictures(folder, [*pixels, "textured_output.png"])
+    captures.write_json(folder / "info.json", {"title": "a scan"})
+    return folder, pixels
+
+
 # --- data sets
 
 
@@ -327,6 +343,23 @@ def tanks(folder: Path) -> tuple[Path, Pixels]:
     return folder, pixels
 
 
+# --- depth
+
+
+def plane_depth(camera: Camera, width: int, height: int) -> np.ndarray:
+    """(h, w) depth of the plane z = 0 along the view axis."""
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    pixels = np.stack([x.ravel() * camera.width / width, y.ravel() * camera.height / height], -1)
+    origins, directions = rays(camera, pixels)
+    distance = -origins[:, 2] / directions[:, 2]
+    along = np.where(distance > 0, distance * (directions @ camera.forward), 0)
+    return np.where(along < 20, along, 0).reshape(height, width)
+
+
+def write_depth(path: Path, values: np.ndarray, unit: float = 0.001) -> None:
+    captures.write_picture(path, np.clip(np.rint(values / unit), 0, 65535).astype(np.uint16))
+
+
 EXPORTS: dict[str, tuple[str, Callable[[Path], tuple[Path, Pixels]]]] = {
     "polycam": ("polycam", polycam),
     "metashape": ("metashape", metashape),
@@ -334,6 +367,7 @@ EXPORTS: dict[str, tuple[str, Callable[[Path], tuple[Path, Pixels]]]] = {
     "realitycapture xmp": ("realitycapture", realitycapture_xmp),
     "opensfm": ("opensfm", opensfm),
     "record3d": ("record3d", record3d),
+    "3d scanner app": ("3d-scanner-app", scanner_app),
     "kapture": ("kapture", kapture),
     "mvsnet": ("mvsnet", mvsnet),
     "blended mvs": ("mvsnet", lambda folder: mvsnet(folder, images="blended_images")),

@@ -83,6 +83,7 @@ IMPORTERS: dict[str, Importer] = {
     "scannetpp": Importer("datasets.scannetpp"),
     "polycam": Importer("apps.polycam"),
     "record3d": Importer("apps.record3d"),
+    "3d-scanner-app": Importer("apps.scanner_app"),
     "metashape": Importer("photogrammetry.metashape"),
     "realitycapture": Importer("photogrammetry.realitycapture"),
     "opensfm": Importer("photogrammetry.opensfm"),

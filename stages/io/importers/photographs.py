@@ -27,6 +27,7 @@ from stages.video.reading import KNOWN, SUFFIXES
 NOT_PHOTOGRAPHS = {*FOLDERS, "depth", "depths", "sparse", "dense", "stereo", "thumbnails", "thumbs", "@eadir"}
 CORRECTED = "corrected_images"
 _REDUCED = re.compile(r"images_\d+")
+_MAP = re.compile(r"(?:depth|conf)_(\d+)\.png")  # of a phone's sensor
 _PREFERRED = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif", ".webp", ".bmp")  # of one picture in several formats
 _EXIF, _TAKEN, _FRACTION = 34665, 36867, 37521  # directory; DateTimeOriginal, SubSecTimeOriginal
 _SMALL, _ALIKE, _ANYWHERE = 64, 4.0, 48  # px, longest side; levels of 255 that formats differ by, in the mean and anywhere
@@ -59,13 +60,13 @@ def photographs(source: Source) -> list[Path]:
 def _all(source: Source) -> list[Path]:
     """The same with pictures that are there twice."""
     folder = source.root
-    found = next((some for some in (images_in(folder), images_in(folder / "images")) if len(some) >= MIN_IMAGES), [])
+    found = next((some for some in map(_without_maps, (images_in(folder), images_in(folder / "images"))) if len(some) >= MIN_IMAGES), [])
     if found:
         _remark_on_others(source, found)
     else:
         everything = source.walk()
         usable = [path for path in everything if not _is_beside(path, folder)]
-        found = _corrected_once(one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES)))
+        found = _corrected_once(_without_maps(one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES))))
         videos = _videos_in(folder) or sorted(filter(is_video, usable))
         if not found and not videos:
             raise BadInput(_nothing(source, everything))
@@ -83,6 +84,12 @@ def _corrected_once(images: Sequence[Path]) -> list[Path]:
     """Without those in a folder images/ that lie in corrected_images/ beside it, too, as Polycam writes them."""
     corrected = {(path.parent.parent, path.name) for path in images if path.parent.name == CORRECTED}
     return [path for path in images if path.parent.name != "images" or (path.parent.parent, path.name) not in corrected]
+
+
+def _without_maps(images: Sequence[Path]) -> list[Path]:
+    """Without depth_00000.png and conf_00000.png where frame_00000.json lies beside them, as 3D Scanner App writes them."""
+    numbers = {path: found[1] for path in images if (found := _MAP.fullmatch(path.name))}
+    return [path for path in images if path not in numbers or not path.with_name(f"frame_{numbers[path]}.json").is_file()]
 
 
 def _count(paths: Sequence[Path], what: str, source: Source) -> str:

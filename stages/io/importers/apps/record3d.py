@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from stages.io.importers import frames
 from stages.io.importers.brown import brown_camera
 from stages.io.importers.depth import DepthFile, depth_file, with_depth
 from stages.io.importers.source import ImportSettings, Source, images_in
-from stages.io.json_file import finite, read_json, shown
+from stages.io.json_file import numbers, read_json, shown
 
 PLACES = (".", "EXR_RGBD")
 FARTHEST = 5.0  # metres, the range of the sensor
@@ -66,13 +65,6 @@ def _place(source: Source) -> Path | None:
     return None
 
 
-def _values(value: Any, count: int, where: str) -> list[float]:
-    found = [finite(entry) for entry in value] if isinstance(value, list) and len(value) == count else [None]
-    if None in found:
-        raise BadInput(f"{where} is {shown(value)}; expected {count} finite numbers. {_AGAIN}")
-    return [float(entry) for entry in found if entry is not None]
-
-
 def _read(source: Source) -> tuple[Path, list[frames.Frame], list[str]]:
     """The folder of the export, its frames, and the images without a pose."""
     place = _place(source)
@@ -83,12 +75,12 @@ def _read(source: Source) -> tuple[Path, list[frames.Frame], list[str]]:
     poses, coefficients = document["poses"], document.get("perFrameIntrinsicCoeffs") or []
     if not isinstance(poses, list) or not isinstance(coefficients, list) or (coefficients and len(coefficients) != len(poses)):
         raise BadInput(f"{where}: poses are {shown(poses)} and perFrameIntrinsicCoeffs {shown(coefficients)}; expected lists of one length. {_AGAIN}")
-    width, height = _values([document.get("w"), document.get("h")], 2, f"{where}: w, h")
+    width, height = numbers([document.get("w"), document.get("h")], 2, f"{where}: w, h", _AGAIN)
     if width != int(width) or height != int(height) or not 0 < min(width, height) <= max(width, height) <= 65535:
         raise BadInput(f"{where}: image size {width:g}x{height:g}; expected whole pixels. {_AGAIN}")
     common: list[float] = []
     if not coefficients:
-        k = _values(document.get("K"), 9, f"{where}: K")  # column by column
+        k = numbers(document.get("K"), 9, f"{where}: K", _AGAIN)  # column by column
         common = [k[0], k[4], k[6], k[7]]
     listed, unposed = [], []
     images = images_in(place / IMAGES)
@@ -99,9 +91,9 @@ def _read(source: Source) -> tuple[Path, list[frames.Frame], list[str]]:
             unposed.append(source.name_of(image))
             continue
         what = f"{where}: frame {index}"
-        fx, fy, cx, cy = common or _values(coefficients[index], 4, f"{what}: perFrameIntrinsicCoeffs")
+        fx, fy, cx, cy = common or numbers(coefficients[index], 4, f"{what}: perFrameIntrinsicCoeffs", _AGAIN)
         lens = brown_camera("", (int(width), int(height)), (fx, fy), (cx, cy), (), (0, 0), what)
-        camera = replace(lens, world_from_camera=_pose(_values(poses[index], 7, f"{what}: pose"), what))
+        camera = replace(lens, world_from_camera=_pose(numbers(poses[index], 7, f"{what}: pose", _AGAIN), what))
         listed.append(frames.Frame(image.name, image.parent, what, frames.stated(camera)))
     return place, listed, unposed
 
