@@ -13,11 +13,18 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose, rays
+from stages.io import importers
+from stages.io.capture import Capture
 from tests.stages import captures
-from tests.stages.captures import FOCAL, HEIGHT, WIDTH
+from tests.stages.captures import FOCAL, HEIGHT, WIDTH, Settings
 
 POINTS = np.random.default_rng(7).uniform(-0.6, 0.6, (9, 3))
 Pixels = dict[str, np.ndarray]  # name of an image -> (9, 2), the centre of the first pixel being at 0.5, 0.5
+
+
+def read(folder: Path, **settings: object) -> Capture:
+    """The capture of a folder, by the importer that takes it."""
+    return importers.IMPORTERS[importers.detect(folder)].read(folder, Settings(**settings))  # type: ignore[arg-type]
 
 
 def cameras(suffix: str = ".png") -> list[Camera]:
