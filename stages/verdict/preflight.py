@@ -25,7 +25,7 @@ from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
 from stages.masking.turning import masks_of_turning_subject
 from stages.sfm import ladder, pairs
-from stages.verdict import looks
+from stages.verdict import looks, run_forecast
 from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, worded, zooms
 
 SIDE = 560  # px, longest side of the pictures that overlap is told on
@@ -71,11 +71,12 @@ class Small:
     seconds: float
 
 
-def check(folder: Path, settings: Any, threads: int) -> Verdict:
+def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | None = None) -> Verdict:
     """The verdict on a source before anything is run.
 
     settings  of the poses stage
     threads   that a run may use
+    later     settings of all stages by their names, where the whole run is to be forecast
     Raises BadInput where there is nothing that could be read.
     """
     source = Source(folder, settings.allow_outside)
@@ -101,6 +102,9 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
         problems += of_sizes(seen)
         problems += _with_turning(_of_overlap(list(small), overlaps), {name: files[name] for name in small})
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
+    about = forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed, joined=_share_in_largest(len(small), overlaps))
+    if later is not None:
+        about |= _forecast_of_run(about, small, len(names), later, threads, whole=kind != "llff" and not _rendered(kind, files[next(iter(small))]))
     figures = {
         "source": str(folder),
         "format": kind,
@@ -110,7 +114,7 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
         "sizes": sorted({f"{a}x{b}" for a, b in (each.size for each in small.values())}),
         "overlapping": round(_share_in_largest(len(small), overlaps), 3),
         **_layout(list(small), overlaps),
-        "forecast": forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed, joined=_share_in_largest(len(small), overlaps)),
+        "forecast": about,
     }
     return Verdict(ordered[0].grade if ordered else "good", ordered, figures, {name: each.figures() for name, each in seen.items()})
 
@@ -277,7 +281,7 @@ def forecast(
         seconds = {"poses_seconds": round(reading, 1), "poses_seconds_at_most": round(reading, 1)}
         return {**seconds, "poses_bytes": int(decoding_needed(sizes).total), "pairs": 0}
     memory = features_needed(sizes * -(-count // len(sizes)), side, features, threads).total
-    slower = float(np.median([each.seconds for each in small.values()])) / REFERENCE
+    slower = _slower(small)
     reduced = [working_size(*size, side) for size in sizes]
     pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
     how = ladder.matching_for(count) if settings.matching == "auto" else settings.matching
@@ -295,6 +299,29 @@ def forecast(
         "poses_bytes": int(memory),
         "pairs": compared,
     }
+
+
+def _slower(small: Mapping[str, Small]) -> float:
+    """By how much than the machine of REFERENCE."""
+    return float(np.median([each.seconds for each in small.values()])) / REFERENCE
+
+
+def _rendered(kind: str, file: Path) -> bool:
+    """Whether the pictures are probably renders of an object, without surroundings."""
+    with opened(file) as image:
+        return importers.IMPORTERS[kind].renders and "A" in image.getbands()
+
+
+def _forecast_of_run(
+    about: Mapping[str, Any], small: Mapping[str, Small], count: int, later: Mapping[str, Any], threads: int, *, whole: bool
+) -> dict[str, Any]:
+    """Seconds of each stage, of all, and bytes at the peak; of the seconds None where the later stages were never measured."""
+    sizes = [working_size(*each.size, later["poses"].max_image_size) for each in small.values()]
+    megapixels = count * float(np.mean([width * height for width, height in sizes])) / 1e6
+    seconds = run_forecast.seconds_of(later, views=count, megapixels=megapixels, whole=whole, threads=threads, slower=_slower(small))
+    stages = {"poses": about["poses_seconds"], **seconds} if seconds else None
+    total = None if stages is None else round(sum(stages.values()), 1)
+    return {"stage_seconds": stages, "run_seconds": total, "run_bytes": max(about["poses_bytes"], run_forecast.bytes_of(later))}
 
 
 def count_features(rgb: np.ndarray) -> int:

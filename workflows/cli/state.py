@@ -19,7 +19,7 @@ from workflows.cli.options import common_options, folder_type, json_option, memo
 @common_options
 def check(source: Path, format_name: str | None, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool) -> int:
     """Look at the photographs of the folder SOURCE, or at the frames that are chosen of a video: sharpness, exposure, focal lengths, sizes, overlap on
-    small pictures; and say what is likely to go wrong, what to do, and what finding their cameras will take here.
+    small pictures; and say what is likely to go wrong, what to do, and what finding their cameras and a whole run will take here on the CPU.
 
     The grade is good, usable, poor or failed. Exit code 0, and 2 where no cameras can be found of them.
     """

@@ -32,11 +32,12 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
     settings.put_table(read_preset(CPU_PRESET, workflow.presets).table, f"preset {CPU_PRESET}")
     for text in sets:
         settings.put_option(text)
-    poses = settings.resolved()["poses"]
+    stages = settings.resolved()
+    poses = stages["poses"]
     with TemporaryDirectory() as work:
-        found = check(with_frames_for_videos(source, poses, Path(work)), poses, count_cores()).document() | {"source": str(source)}
+        found = check(with_frames_for_videos(source, poses, Path(work)), poses, count_cores(), stages).document() | {"source": str(source)}
     found["forecast"]["memory_limit"] = None if limit is None else limit.bytes
-    found["forecast"]["fits"] = limit is None or found["forecast"]["poses_bytes"] <= limit.bytes
+    found["forecast"]["fits"] = limit is None or found["forecast"]["run_bytes"] <= limit.bytes
     return found
 
 
@@ -81,8 +82,19 @@ def in_words(found: dict[str, Any]) -> list[str]:
     lines += [printable(f"  {sentence}", 600) for sentence in found["left_aside"]]
     compared = f", {about['pairs']} pairs compared" if about["pairs"] else ""
     longer = f", up to {duration(about['poses_seconds_at_most'])} where photographs match badly" if about["pairs"] else ""
-    room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are"
     seconds, memory = duration(about["poses_seconds"]), size(about["poses_bytes"])
-    lines.append(f"  Cameras: about {seconds} on this machine if nothing else runs{compared}{longer}, and {memory} of memory{room}.")
-    lines.append("  Then training, for as long as --budget says, or 'enerf presets' has it.")
+    lines.append(f"  Cameras: about {seconds} on this machine if nothing else runs{compared}{longer}, and {memory} of memory.")
+    lines.append(f"  {_of_the_run(about)}")
     return lines
+
+
+def _of_the_run(about: dict[str, Any]) -> str:
+    from workflows.cli.progress import duration, size
+
+    room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are"
+    memory = f"about {size(about['run_bytes'])} of memory{room}"
+    if about["run_seconds"] is None:
+        return f"Then training, for as long as --budget says, or 'enerf presets' has it; {memory}."
+    longest = sorted(about["stage_seconds"].items(), key=lambda stage: -stage[1])[:3]
+    stages = ", ".join(f"{name} {duration(took)}" for name, took in longest)
+    return f"All stages of the preset {CPU_PRESET}: about {duration(about['run_seconds'])} ({stages}), and {memory}."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from tests.stages import clips
@@ -26,12 +27,22 @@ def test_check_says_what_is_wrong_and_exits_with_2_where_nothing_can_come_of_it(
     assert "overlap with no other" in text.out + text.err
     assert "6 pairs compared, up to " in text.out + text.err
     assert " where photographs match badly" in text.out + text.err
+    assert "All stages of the preset preview: about " in text.out + text.err
     told = enerf("check", folder, "--json", "--memory", "1m").object
     assert (told["ok"], told["grade"], told["exit_code"]) == (False, "failed", 2)
     assert {"overlap", "few", "tiny", "noise"} <= {problem["what"] for problem in told["problems"]}
     assert told["forecast"]["fits"] is False
+    assert list(told["forecast"]["stage_seconds"]) == ["poses", "train", "bake", "mesh", "splats", "evaluate", "turntable", "points"]
+    assert told["forecast"]["run_seconds"] == pytest.approx(sum(told["forecast"]["stage_seconds"].values()), abs=0.1)
+    assert told["forecast"]["run_bytes"] > told["forecast"]["poses_bytes"]
     assert sorted(told["images"]) == ["0.png", "1.png", "2.png", "3.png"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]  # nothing is written
+
+
+def test_check_forecasts_no_stages_that_were_never_measured(enerf: Enerf, tmp_path: Path) -> None:
+    folder = noise(tmp_path / "photos", 4)
+    assert "Then training, for as long as --budget says" in enerf("check", folder, "--set", "train.field=nerf").out
+    assert enerf("check", folder, "--set", "train.field=nerf", "--json").object["forecast"]["run_seconds"] is None
 
 
 def test_check_says_what_is_left_aside(enerf: Enerf, tmp_path: Path) -> None:

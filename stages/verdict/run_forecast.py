@@ -1,0 +1,73 @@
+"""What the stages after poses will take on a CPU, roughly, before anything is run: seconds from what they took of known scenes, and bytes at the peak.
+
+Processor seconds of a stage are taken for proportional to its steps, pictures or pixels, and to how long SIFT takes here; of a stage a share is done by one
+core alone. docs/experiments/sfm.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from efficientnerf.settings import given
+from stages.baking.refinement import usual_steps
+from stages.baking.resolution import MAX_MIB
+from stages.memory.need import libraries
+
+SLOWER = 1.5  # by `preflight.REFERENCE`, of the machine that the processor seconds below were taken on
+ALONE = 0.28  # of a stage's processor seconds, on one core
+
+A_TRAIN_STEP = 0.062  # of 65,536 samples
+A_REFINE_STEP, RAYS_A_STEP = 0.33, 32768
+A_MESH, A_MESH_VIEW = 55.0, 0.45
+SPLATS = 32.0
+EVALUATION, AN_EVALUATED_MEGAPIXEL, TEST_SHARE = 40.0, 1.5, 0.125
+A_TURNTABLE, A_TURNTABLE_MEGAPIXEL = 10.0, 0.8
+POINTS = 31.0
+
+BYTES_A_VOXEL = 12.2  # of a file
+BAKED_BYTES_A_VOXEL = 560  # at the peak of baking
+
+
+def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, whole: bool, threads: int, slower: float) -> dict[str, float]:
+    """Stage -> seconds; empty where they are not known: only hash grids were measured.
+
+    settings    of each stage by its name, dataclasses
+    views       photographs that cameras are found of
+    megapixels  of all working images
+    whole       whether the scene has surroundings
+    slower      than the machine of `preflight.REFERENCE`
+    """
+    train, bake, turntable = settings["train"], settings["bake"], settings["turntable"]
+    if train.field != "hash" or train.sample_batch_size == "off":
+        return {}
+    steps = given(bake.refine_steps)
+    if steps is None:
+        steps = usual_steps(_voxels(bake), bake.refine_rays_per_batch, whole=whole)
+    frames = turntable.frames * turntable.width * turntable.height * turntable.supersample**2 / 1e6
+    processor = {
+        "train": train.iterations * A_TRAIN_STEP * train.sample_batch_size / 65536,
+        "bake": steps * A_REFINE_STEP * bake.refine_rays_per_batch / RAYS_A_STEP,
+        "mesh": A_MESH + A_MESH_VIEW * views,
+        "splats": 0.0 if settings["splats"].make == "off" else SPLATS,
+        "evaluate": EVALUATION + AN_EVALUATED_MEGAPIXEL * TEST_SHARE * megapixels,
+        "turntable": A_TURNTABLE + A_TURNTABLE_MEGAPIXEL * frames,
+        "points": POINTS,
+    }
+    scale = (ALONE + (1 - ALONE) / threads) * slower / SLOWER
+    found = {stage: scale * seconds for stage, seconds in processor.items()}
+    for stage in ("train", "bake"):
+        budget = given(settings[stage].time_budget)
+        found[stage] = found[stage] if budget is None else budget
+    return {stage: round(seconds, 1) for stage, seconds in found.items()}
+
+
+def bytes_of(settings: Mapping[str, Any]) -> int:
+    """At the peak of the stages after poses: baking, as a rule."""
+    return int(libraries() + BAKED_BYTES_A_VOXEL * _voxels(settings["bake"]))
+
+
+def _voxels(bake: Any) -> int:
+    """That the asset may hold."""
+    stated = given(bake.max_mib)
+    return int((MAX_MIB if stated is None else stated) * 2**20 / BYTES_A_VOXEL)

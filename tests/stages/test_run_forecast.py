@@ -1,0 +1,69 @@
+"""What a whole run will take, before it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from stages.verdict import run_forecast
+from workflows.asset import STAGES
+
+DEFAULTS: dict[str, Any] = {stage.name: stage.settings() for stage in STAGES}
+SHOT: dict[str, Any] = {"views": 36, "megapixels": 6.0, "whole": True, "threads": 2, "slower": 1.5}
+
+
+def seconds(**changes: Any) -> dict[str, float]:
+    """Of the stages; changes: settings by `stage__name`, and of the capture and the machine by their names."""
+    settings = dict(DEFAULTS)
+    for key, value in changes.items():
+        stage, _, name = key.partition("__")
+        if name:
+            settings[stage] = replace(settings[stage], **{name: value})
+    return run_forecast.seconds_of(settings, **SHOT | {key: value for key, value in changes.items() if "__" not in key})
+
+
+def test_each_stage_after_the_cameras_is_forecast() -> None:
+    assert set(seconds()) == {stage.name for stage in STAGES} - {"poses"}
+    assert all(took > 0 for took in seconds().values())
+
+
+@pytest.mark.parametrize(
+    ("stage", "more"),
+    [
+        ("train", {"train__iterations": 2 * DEFAULTS["train"].iterations}),
+        ("bake", {"whole": False}),
+        ("mesh", {"views": 300}),
+        ("evaluate", {"megapixels": 600.0}),
+        ("turntable", {"turntable__frames": 4 * DEFAULTS["turntable"].frames}),
+    ],
+)
+def test_more_of_it_takes_longer_and_nothing_else_does(stage: str, more: dict[str, Any]) -> None:
+    before, after = seconds(), seconds(**more)
+    assert [name for name in before if after[name] != before[name]] == [stage]
+    assert after[stage] > 1.2 * before[stage]
+
+
+def test_a_slower_machine_takes_longer_and_more_cores_less_by_what_they_share() -> None:
+    before = sum(seconds().values())
+    assert sum(seconds(slower=3.0).values()) == pytest.approx(2 * before, rel=1e-2)
+    assert 0.28 * sum(seconds(threads=1).values()) < sum(seconds(threads=64).values()) < 0.5 * before
+
+
+def test_a_time_budget_is_what_a_stage_takes_on_any_machine() -> None:
+    assert seconds(train__time_budget=50.0, slower=9.0)["train"] == 50.0
+    assert seconds(bake__time_budget=70.0)["bake"] == 70.0
+
+
+def test_what_is_not_made_takes_nothing() -> None:
+    assert seconds(splats__make="off")["splats"] == 0
+
+
+def test_networks_that_were_not_measured_are_not_forecast() -> None:
+    assert seconds(train__field="nerf") == {}
+
+
+def test_a_larger_asset_takes_more_memory() -> None:
+    small, large = (run_forecast.bytes_of(DEFAULTS | {"bake": replace(DEFAULTS["bake"], max_mib=mib)}) for mib in (4.0, 64.0))
+    assert 5e8 < small < run_forecast.bytes_of(DEFAULTS) < large
