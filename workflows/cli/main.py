@@ -6,6 +6,7 @@ at once.
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -19,6 +20,9 @@ from workflows.fleet.command import fleet
 
 if TYPE_CHECKING:
     from workflows.asset import Workflow
+
+
+INTERRUPTED = 128 + signal.SIGINT  # exit code
 
 
 @click.group(
@@ -69,6 +73,9 @@ def main(arguments: Sequence[str] | None = None, workflow: Workflow | None = Non
             code = result if isinstance(result, int) else 0
         except BaseException as error:
             code = report_failure(error, as_json=as_json, debug=debug)
+            if code == INTERRUPTED and arguments is None:
+                # The process ends now: another Ctrl-C shall not raise in what Python tidies up, and be printed with a traceback.
+                signal.signal(signal.SIGINT, signal.SIG_DFL)
         return exit_code(out, code, as_json=as_json)
 
 

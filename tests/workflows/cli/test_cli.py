@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -302,8 +303,6 @@ def test_what_has_nothing_to_do_imports_nothing_heavy(tmp_path: Path, arguments:
 
 def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path) -> None:
     """A process of its own, sent SIGTERM and SIGINT while the toy trains for long."""
-    import signal
-
     for number, code in ((signal.SIGTERM, 143), (signal.SIGINT, 130)):
         run = tmp_path / f"run {code}"
         program = (
@@ -324,3 +323,17 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path) -> None:
         assert f"enerf run --out '{run}'" in err
         assert json.loads(out.splitlines()[-1])["exit_code"] == code
         time.sleep(0.01)
+
+
+def test_another_ctrl_c_while_an_interrupted_process_ends_prints_no_traceback(tmp_path: Path) -> None:
+    program = (
+        "import atexit, os, signal, sys, time; from workflows.cli import main, state\n"
+        "def interrupted(*_, **__): raise KeyboardInterrupt\n"
+        "state.status.callback = interrupted\n"
+        "atexit.register(lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(5)))\n"
+        f"sys.argv[1:] = ['status', {str(tmp_path)!r}]; sys.exit(main.main())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == -signal.SIGINT  # the process ended at once
+    assert "Traceback" not in done.stderr
+    assert "interrupted" in done.stderr.lower()
