@@ -103,6 +103,20 @@ def labelled(picture: np.ndarray, n: int) -> np.ndarray:
     return out
 
 
+def moving(picture: np.ndarray, n: int) -> np.ndarray:
+    """Before it a balloon with a pattern, which is elsewhere and leans another way each time."""
+    rng, (h, w) = np.random.default_rng(5), picture.shape[:2]
+    octaves = [40 * 0.9**k * cv2.resize(rng.normal(0, 1, (2**k, 2**k, 3)), (256, 256), interpolation=cv2.INTER_CUBIC) for k in range(2, 7)]
+    y, x = np.mgrid[:256, :256]
+    balloon = np.dstack([np.clip(np.sum(octaves, axis=0) + np.array((200, 120, 90)), 0, 255), 255.0 * (np.hypot(x - 128, y - 128) < 126)]).astype(np.float32)
+    angle, scale = 0.12 * np.sin(1.3 * n), 1 + 0.1 * np.sin(2.1 * n)
+    lean = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag([0.12 * w, 0.18 * h]) / 256
+    place = (0.15 + 0.7 * (n * 0.381966 % 1)) * w, (0.35 + 0.3 * (n * 0.618034 % 1)) * h
+    there = cv2.warpAffine(balloon, np.column_stack([lean, place - lean @ (128, 128)]), (w, h), flags=cv2.INTER_AREA)
+    opacity = there[..., 3:] / 255
+    return np.clip(picture * (1 - opacity) + there[..., :3] * opacity + 0.5, 0, 255).astype(np.uint8)
+
+
 def mixed(good: Pictures) -> Pictures:
     """Half of the scene, and half of another that would do by itself: a room with patterned walls."""
     names = list(good)
@@ -171,6 +185,7 @@ CAPTURES = (
     Capture("turned by quarters", each(upright_or_not), ("orientation", "not registered", "sizes")),
     Capture("hard compression", dict, ("compress", "few points", "not registered", "reprojection error"), quality=6),
     Capture("a label burnt in", each(labelled), ("stands still", "static", "folded", "parallax")),
+    Capture("something moves", each(moving), ("moves between",)),
     Capture("torn files", dict, ("cannot be used",), placeable=lambda names: names[6:]),
 )
 

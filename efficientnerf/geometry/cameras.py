@@ -160,6 +160,17 @@ def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, 
     return np.broadcast_to(camera.centre, directions.shape).copy(), directions
 
 
+def epipolar_error(first: Camera, second: Camera, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """How far matched rays are from a common epipolar plane.
+
+    a, b     (N, 3) unit directions of matched pixels of the first and of the second camera, in the world
+    returns  (N,) the angle of a ray a to the plane through both centres and ray b, in pixels of the first camera's middle
+    """
+    plane = np.cross(second.centre - first.centre, b)
+    sine = np.abs((plane * a).sum(1)) / np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
+    return np.asarray(sine * first.intrinsics["fx"])
+
+
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Projections of points.
 

@@ -5,17 +5,18 @@ See docs/experiments/sfm.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
 from pipeline.files import remove
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts
 from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
+from stages.verdict.moving import moving_parts
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
@@ -255,8 +256,28 @@ def num_registered(models: Sequence[Any]) -> int:
 
 
 def match_agreement(work: Path, images: Sequence[WorkImage], model: Any) -> float:
+    return pair_agreement(work, cameras_of(model, images))
+
+
+def moving_shares(work: Path, images: Sequence[WorkImage], model: Any, safe_point: SafePoint) -> dict[str, float]:
+    """Name of a photograph -> share of it that moves, of those in which anything does (`stages.verdict.moving`)."""
+    cameras = cameras_of(model, images)
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
+
+        def matches() -> Iterator[tuple[tuple[int, int], np.ndarray]]:
+            for pair, count in inlier_counts(database_path(work)).items():
+                if count >= MIN_MATCHES and all(image in cameras for image in pair):
+                    safe_point()
+                    yield pair, np.asarray(database.read_matches(*pair))
+
+        keypoints = {image: np.asarray(database.read_keypoints(image), np.float64)[:, :2] for image in cameras}
+        return {cameras[image].name: round(share, 4) for image, share in moving_parts(cameras, keypoints, matches()).items()}
+
+
+def cameras_of(model: Any, images: Sequence[WorkImage]) -> dict[int, Camera]:
+    """By COLMAP's image id, of the photographs that have one, at working size."""
     by_file = {image.file: image for image in images}
-    return pair_agreement(work, {image.image_id: camera_of(model, image, by_file[image.name]) for image in model.images.values() if image.has_pose})
+    return {image.image_id: camera_of(model, image, by_file[image.name]) for image in model.images.values() if image.has_pose}
 
 
 def camera_of(model: Any, image: Any, source: WorkImage) -> Camera:
@@ -285,10 +306,6 @@ def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: floa
                 continue
             inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
             a, b = directions[first][inliers[:, 0]], directions[second][inliers[:, 1]]
-            baseline = cameras[second].centre - cameras[first].centre
-            plane = np.cross(baseline, b)  # the epipolar plane of the second ray
-            sine = np.abs((plane * a).sum(1)) / np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
-            focal = cameras[first].intrinsics["fx"]
-            agreeing += int((sine * focal < tolerance).sum())
+            agreeing += int((epipolar_error(cameras[first], cameras[second], a, b) < tolerance).sum())
             total += len(inliers)
     return agreeing / total if total else 1.0

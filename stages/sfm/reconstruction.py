@@ -29,7 +29,7 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
 from stages.sfm.images import Callables, Masks, WorkImage, prepare_images
 from stages.verdict.looks import look_at_all
-from stages.verdict.verdict import CROPPED, LENS, WITHOUT_TEXTURE, ZOOMED, failed, triangulation_angle
+from stages.verdict.verdict import CROPPED, LENS, MOVING, WITHOUT_TEXTURE, ZOOMED, failed, triangulation_angle
 
 WAIT = 0.05  # seconds between two looks at a lock
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
@@ -164,6 +164,8 @@ def reconstruct(
         raise BadInput(_failure(folder, _paths(folder, names), work, images, found, rejected, matching))
     facts = _facts_of_matching(images, found, matching)
     model = models[0] if found.rung == ladder.CROPPED else mapping.bundle_adjusted(place, images, models[0], safe_point)
+    if moving := mapping.moving_shares(place, images, model, safe_point):
+        facts[MOVING] = moving
     capture = _capture(folder, place, images, model, masks, rejected, facts)
     for sentence in capture.warnings:
         callables["warn"](sentence)

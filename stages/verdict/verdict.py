@@ -21,6 +21,7 @@ from stages.verdict import looks as looks_of
 from stages.verdict.looks import Look
 
 LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose photographs have focal lengths, or principal points, of their own
+MOVING = "moving_parts"  # fact: name of a photograph -> share of it that moves
 # Facts of a capture that stand among the figures.
 FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, "gps", "stated_cameras", BACKGROUND)
 GRADES = ("good", "usable", "poor", "failed")
@@ -32,6 +33,7 @@ LARGE_ERROR = 2.0  # px at LONGEST
 MOST_PLANAR = 0.8  # share of the pairs
 DOUBTFUL = 0.94  # of the matches, that agree with the cameras; docs/experiments/sfm.md
 TINY = 150  # px of the longest side, below which too few features are detected
+LARGE_PART = 0.05  # of the picture, from which what moves may have more matches than what stands still
 SMALL_ANGLE = 4.0  # degrees of parallax
 ZOOM = 1.05  # between focal lengths, from which they differ
 OFF_MIDDLE = 0.03  # of the longest side, from the middle to the principal point of a photograph that was cropped
@@ -125,6 +127,7 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
         *_of_registration(capture, len(names), total, in_folder),
         *_of_matches(capture, flat=angle is None or angle < SMALL_ANGLE),
         *_of_lens(capture),
+        *_of_moving_parts(capture),
         *_of_geometry(capture, angle, counts),
         *of_looks(looks),
         *(of_sizes(looks) if capture.kind == "photographs" else ()),
@@ -204,6 +207,26 @@ def _of_lens(capture: Capture) -> list[Problem]:
     else:
         return []
     return [found] if found.images else []
+
+
+def _of_moving_parts(capture: Capture) -> list[Problem]:
+    """Of photographs in which something moves while the rest stands still."""
+    shares = capture.facts.get(MOVING)
+    if not isinstance(shares, dict) or not shares or BACKGROUND in capture.facts:
+        return []
+    agreeing = capture.facts.get("pairs_agreeing")
+    large = float(np.median(list(shares.values()))) > LARGE_PART and isinstance(agreeing, float) and agreeing < DOUBTFUL
+    names, most = tuple(sorted(shares)), max(shares.values())
+    of = f"{len(names)} of {len(capture.photos)} photographs"
+    sentence = f"Something moves between photographs while the rest stands still, over {most:.0%} of a picture at most, in {of}: {abbreviated(list(names))}."
+    if large:
+        sentence += " So many matches are of it that the cameras may be wrong."
+    remedy = (
+        "Leave it out: masks beside the photographs (masks/, black over it), or --mask-model where the subject itself stands still."
+        " Or photograph again while nothing moves."
+    )
+    grade = "poor" if large else "usable" if len(names) > SHARE * len(capture.photos) else "good"
+    return [Problem("moving parts", grade, sentence, remedy, names)]
 
 
 def _off_middle(camera: Camera) -> float:
@@ -317,11 +340,13 @@ def of_sizes(looks: Mapping[str, Look]) -> list[Problem]:
 
 def _rows(capture: Capture, looks: Mapping[str, Look], counts: np.ndarray | None) -> dict[str, dict[str, Any]]:
     """Of each photograph what is known of it."""
-    same = looks_of.duplicates(looks)
+    same, moving = looks_of.duplicates(looks), capture.facts.get(MOVING)
     registered = {photo.camera.name for photo in capture.photos}
     rows: dict[str, dict[str, Any]] = {}
     for index, photo in enumerate(capture.photos):
         rows[photo.camera.name] = {"registered": True, "points": None if counts is None else int(counts[index])}
+        if isinstance(moving, dict) and photo.camera.name in moving:
+            rows[photo.camera.name]["moving"] = moving[photo.camera.name]
     for name, reason in capture.rejected:
         near = sorted(((n, b if a == name else a) for a, b, n in capture.overlaps if name in (a, b)), reverse=True)
         beside = [{"image": other, "matches": n} for n, other in near if other in registered or not registered][:NEAREST]

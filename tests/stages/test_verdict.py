@@ -267,6 +267,24 @@ def test_photographs_that_were_zoomed_or_cropped_are_named() -> None:
     assert with_lenses("zoomed", {}).problems == ()
 
 
+def test_photographs_in_which_something_moves_are_named_with_the_share_of_the_picture() -> None:
+    def moving(count: int, first: float = 0.02, **facts: object) -> Verdict:
+        shares = {name: first + 0.01 * k for k, name in enumerate(NAMES[:count])}
+        return verdict_on(capture(facts={"pairs_agreeing": 0.97, "moving_parts": shares} | facts), sharp(NAMES))
+
+    found = moving(3)
+    assert [(problem.what, problem.grade, problem.images) for problem in found.problems] == [("moving parts", "usable", tuple(NAMES[:3]))]
+    assert "over 4% of a picture at most, in 3 of 24 photographs: 00.jpg, 01.jpg, 02.jpg." in found.problems[0].sentence
+    assert "masks/" in found.problems[0].remedy
+    assert [row.get("moving") for row in found.document()["images"].values()] == [0.02, 0.03, 0.04] + [None] * 21
+    assert moving(2).grade == "good"
+    assert moving(3, pairs_agreeing=0.9).grade == moving(3, first=0.1).grade == "usable"
+    doubtful = moving(3, first=0.1, pairs_agreeing=0.9)
+    assert [(problem.what, problem.grade) for problem in doubtful.problems] == [("moving parts", "poor"), ("disagreement", "usable")]
+    assert "may be wrong" in doubtful.problems[0].sentence
+    assert "moving parts" not in [problem.what for problem in moving(24, background="in the picture").problems]  # the subject turned
+
+
 def test_a_model_of_few_of_the_photographs_says_how_to_start_afresh() -> None:
     found = verdict_on(capture(), sharp(NAMES), in_folder=292)
     assert found.grade == "poor"

@@ -1,0 +1,118 @@
+"""What moves between photographs is told by its matches, which one motion explains and the cameras do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.geometry.cameras import project
+from stages.sfm import ladder, mapping
+from stages.verdict.moving import OF_A_PART, motions, moving_parts, share_of_parts
+from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, SIZE, cameras, clouds, matched
+
+BALL = 60  # points that move
+TAKEN = dict(enumerate(cameras()))
+Matches = dict[tuple[int, int], np.ndarray]
+
+
+def seen(elsewhere: int) -> dict[int, np.ndarray]:
+    """(POINTS, 2) pixels of each camera, half a pixel off."""
+    rng = np.random.default_rng(2)
+    return {k: project(TAKEN[k], cloud)[0] + rng.normal(0, 0.4, (POINTS, 2)) for k, cloud in enumerate(clouds(elsewhere=elsewhere))}
+
+
+def all_matches(wrong: float = 0.2) -> Matches:
+    """Of all points in all pairs of pictures, a share of them wrong."""
+    rng, made = np.random.default_rng(3), {}
+    for i in range(COUNT):
+        for j in range(i + 1, COUNT):
+            rows = np.stack([np.arange(POINTS)] * 2, 1)
+            bad = np.flatnonzero(rng.random(POINTS) < wrong)
+            rows[bad, 1] = rng.permutation(rows[bad, 1])
+            made[i, j] = rows.astype(np.uint32)
+    return made
+
+
+def test_a_ball_that_is_elsewhere_in_each_photograph_is_found_in_all_of_them() -> None:
+    pixels = seen(BALL)
+    found = moving_parts(TAKEN, pixels, all_matches().items())
+    assert sorted(found) == list(range(COUNT))
+    for k, share in found.items():
+        whole = share_of_parts(pixels[k][-BALL:], TAKEN[k])
+        assert 0.5 * whole < share < 1.2 * whole
+    assert found == moving_parts(TAKEN, pixels, all_matches().items())
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 1.0])
+def test_wrong_matches_move_nothing(wrong: float) -> None:
+    assert moving_parts(TAKEN, seen(0), all_matches(wrong).items()) == {}
+
+
+def test_a_ball_that_is_matched_in_one_pair_alone_is_not_named() -> None:
+    def of_two(pair: tuple[int, int], rows: np.ndarray) -> np.ndarray:
+        return rows if pair == (2, 5) else rows[:-BALL]
+
+    matches = {pair: of_two(pair, rows) for pair, rows in all_matches(0.0).items()}
+    assert moving_parts(TAKEN, seen(BALL), matches.items()) == {}
+
+
+def test_a_patch_that_comes_twice_is_no_motion() -> None:
+    """In half of the pairs it is matched with its twin; by the others both stand still."""
+    pixels = {}
+    for k, cloud in enumerate(clouds()):
+        cloud[-BALL:] = cloud[-2 * BALL : -BALL] * 0.4 + np.array((0.3, -0.4, 0.2))
+        cloud[-2 * BALL : -BALL] = cloud[-BALL:] + np.array((0.1, 0.7, 0.0))
+        pixels[k] = project(TAKEN[k], cloud)[0]
+    matches = all_matches(0.0)
+    for (i, j), rows in matches.items():
+        if (i + j) % 2:
+            rows[-BALL:, 1] -= BALL
+            rows[-2 * BALL : -BALL, 1] += BALL
+    i, j = 0, 1
+    a, b = (pixels[k][matches[i, j][-BALL:, side]] / SIZE[0] for side, k in enumerate((i, j)))
+    assert len(motions(a, b)) > BALL / 2  # of this pair alone it looks like one
+    assert moving_parts(TAKEN, pixels, matches.items()) == {}
+
+
+def test_what_stays_in_the_picture_is_no_motion() -> None:
+    """As a date that was burnt in."""
+    pixels = seen(0)
+    for places in pixels.values():
+        places[-BALL:] = np.random.default_rng(4).uniform((20, 20), (120, 60), (BALL, 2))
+    assert moving_parts(TAKEN, pixels, all_matches(0.1).items()) == {}
+
+
+def test_a_motion_is_a_similarity_of_a_patch() -> None:
+    rng = np.random.default_rng(5)
+    a = rng.uniform(0.3, 0.5, (40, 2))
+    turned = 1.2 * (a - 0.4) @ np.array([[0.8, 0.6], [-0.6, 0.8]]) + (0.7, 0.3)
+    others = rng.uniform(0, 1, (30, 2)), rng.uniform(0, 1, (30, 2))
+    group = motions(np.concatenate([a, others[0]]), np.concatenate([turned, others[1]]))
+    assert set(range(40)) <= set(group.tolist())
+    assert len(group) < 45
+    assert not len(motions(a, 3 * turned))  # three times as large
+    assert not len(motions(a[:5], turned[:5]))
+    assert not len(motions(*others))
+
+
+def test_the_share_is_that_of_the_outlines_of_what_lies_together() -> None:
+    y, x = np.mgrid[0:5, 0:5]
+    patch = 10.0 * np.stack([x.ravel(), y.ravel()], 1)  # 40 by 40 px
+    one = share_of_parts(patch + 50, TAKEN[0])
+    assert one == pytest.approx(1600 / (SIZE[0] * SIZE[1]))
+    assert share_of_parts(np.concatenate([patch + 50, patch + 250]), TAKEN[0]) == pytest.approx(2 * one)
+    assert share_of_parts(np.concatenate([patch + 50, patch[:3] + 250, patch + 50.2]), TAKEN[0]) == pytest.approx(one)
+    assert share_of_parts(patch[: OF_A_PART - 1], TAKEN[0]) == 0.0
+    assert share_of_parts(patch[:0], TAKEN[0]) == 0.0
+
+
+@pytest.mark.parametrize("elsewhere", [0, BALL])
+def test_the_mapper_s_cameras_show_what_moved(tmp_path: Path, elsewhere: int) -> None:
+    images = matched(tmp_path, list(TAKEN.values()), elsewhere)
+    found = ladder.find_models(tmp_path, images, "exhaustive", features=POINTS, seed=0, threads=1, **QUIET)
+    model = mapping.bundle_adjusted(found.work, images, found.models[0], QUIET["safe_point"])
+    shares = mapping.moving_shares(found.work, images, model, QUIET["safe_point"])
+    assert sorted(shares) == ([image.name for image in images] if elsewhere else [])
+    assert all(0.001 < share < 0.1 for share in shares.values())
