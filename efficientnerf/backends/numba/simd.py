@@ -129,6 +129,16 @@ def popcount(typing_context: Any, bits: Any) -> Any:
 
 
 @intrinsic
+def fetch_add(typing_context: Any, address: Any, index: Any, amount: Any) -> Any:
+    """p[index] of a pointer to int64, to which `amount` is then added, whatever other threads do."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.atomic_rmw("add", builder.gep(args[0], [args[1]]), args[2], "monotonic")
+
+    return types.int64(address, types.int64, types.int64), codegen
+
+
+@intrinsic
 def load4(typing_context: Any, address: Any, index: Any) -> Any:
     """p[index : index + 4] of a pointer to float32."""
 

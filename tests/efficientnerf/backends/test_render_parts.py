@@ -14,7 +14,7 @@ from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcoun
 from efficientnerf.backends.numba.tree import march
 from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packed import packed_of
-from efficientnerf.backends.numba.tree.packets import halves, lanes
+from efficientnerf.backends.numba.tree.packets import groups, halves, lanes
 from efficientnerf.backends.numba.tree.packets.halves import mix_pairs, store_halves4
 from efficientnerf.backends.numba.tree.packets.layout import LANES
 from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, packed_pointers, sh_basis
@@ -241,12 +241,12 @@ def test_operators_on_lanes_are_numpys(count: int) -> None:
 @numba.njit(error_model="numpy")
 def in_groups(floats, ints, at, out):  # type: ignore[no-untyped-def]
     """What comes of groups of four and of two numbers of a packet."""
-    a, b, c, d = lanes.channels(pointer(floats), 0)
+    a, b, c, d = groups.channels(pointer(floats), 0)
     lanes.store_lanes(pointer(out), 0, a - b + c * d)
-    lanes.store_pairs(pointer(out), LANES, a, b)
-    lanes.store_channels(pointer(out), 3 * LANES, a, b, c, d)
-    e, f = lanes.gather_pairs(pointer(ints), pointer(at), 0)
-    g, h, i, j = lanes.gather_fours(pointer(ints), pointer(at), 0)
+    groups.store_pairs(pointer(out), LANES, a, b)
+    groups.store_channels(pointer(out), 3 * LANES, a, b, c, d)
+    e, f = groups.gather_pairs(pointer(ints), pointer(at), 0)
+    g, h, i, j = groups.gather_fours(pointer(ints), pointer(at), 0)
     for n, value in enumerate((e, f, g, h, i, j)):
         lanes.store_lanes(pointer(out), (7 + n) * LANES, lanes.to_floats(value))
 
@@ -261,6 +261,34 @@ def test_groups_of_numbers_go_into_lanes_and_back() -> None:
     assert np.array_equal(out[LANES : 3 * LANES].reshape(-1, 2), floats[:, :2])
     assert np.array_equal(out[3 * LANES : 7 * LANES], floats.reshape(-1))
     assert np.array_equal(out[7 * LANES :].reshape(6, -1), [ints[at + n] for n in (0, 1, 0, 1, 2, 3)])
+
+
+@numba.njit(error_model="numpy")
+def in_doubles(doubles, floats, ints, rows, out):  # type: ignore[no-untyped-def]
+    """What operators on lanes of float64 make of two rows of them; rows of eight of the first as float32 and of the three of `floats`; the sum of `ints`."""
+    x, y = lanes.load32(pointer(doubles), 0), lanes.load32(pointer(doubles), LANES)
+    chosen = lanes.select_lanes((x < y) & (y != 0.5), 1.0 / x - y, lanes.max_lanes(x * 3.0, lanes.floor_lanes(y)))
+    lanes.store_lanes(pointer(out), 0, chosen + lanes.sqrt_lanes(lanes.abs_lanes(x)) * lanes.sqrt_lanes(2.0))
+    lanes.store_lanes(pointer(out), LANES, lanes.to_doubles(lanes.to_floats(y)) + lanes.lane_numbers() + lanes.broadcast32(0.25))
+    a, b, c = (lanes.load32(pointer(floats), LANES * n) for n in (0, 1, 2))
+    groups.store_rows(pointer(rows), 1, 30, lanes.to_floats(x))
+    groups.store_rows_of_three(pointer(rows), 200, 40, a, b, c)
+    return lanes.sum_lanes(lanes.load32(pointer(ints), 0))
+
+
+def test_lanes_of_float64_and_rows_of_pixels() -> None:
+    rng = np.random.default_rng(2)
+    doubles, floats, out = rng.normal(0, 3, 2 * LANES), rng.normal(size=3 * LANES).astype(np.float32), np.zeros((2, LANES))
+    ints, rows = rng.integers(-9999, 9999, LANES).astype(np.int32), np.zeros(360, np.float32)
+    assert in_doubles(doubles, floats, ints, rows, out) == ints.sum()
+    x, y = doubles.reshape(2, LANES)
+    np.testing.assert_array_equal(out[0], np.where(x < y, 1 / x - y, np.maximum(x * 3, np.floor(y))) + np.sqrt(np.abs(x)) * np.sqrt(2.0))
+    np.testing.assert_array_equal(out[1], y.astype(np.float32).astype(np.float64) + np.arange(LANES) + 0.25)
+    expected = np.zeros(360, np.float32)
+    for row in range(4):
+        expected[1 + 30 * row :][:8] = x[8 * row :][:8]
+        expected[200 + 40 * row :][:24] = floats.reshape(3, LANES)[:, 8 * row :][:, :8].T.reshape(-1)
+    np.testing.assert_array_equal(rows, expected)
 
 
 @pytest.mark.parametrize("shape", [(7, 5, 6), (1, 9, 2), (270, 1, 1)])

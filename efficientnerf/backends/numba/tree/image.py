@@ -5,51 +5,61 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.simd import fetch_add, pointer
 from efficientnerf.backends.numba.tree.packets.layout import ENDS, FLOATS, INTS, LANES, TILE_RAYS, WARPED
-from efficientnerf.backends.numba.tree.packets.tiles import Outputs, Scene, TileScratch, render_tile
+from efficientnerf.backends.numba.tree.packets.pixels import Outputs, write_clear
+from efficientnerf.backends.numba.tree.packets.tiles import Scene, TileScratch, clear_block, render_tile
 from efficientnerf.backends.numba.tree.ray_batch import ray_pointers
 from efficientnerf.backends.numba.tree.view_colours import packed_pointers
 
 TILE = 8  # rays along each side of a tile
-RUNS = 32  # rectangles of neighbouring tiles per thread
+BLOCK = 4  # tiles along each side of a block of them, which a thread takes
+BAND = 4  # blocks
 WORK = 2**25  # of a thread in one call, about 0.2 s: samples tested, and what is counted as so many of them
-ALL_RUNS = 2**62  # as the run that a thread goes on with: it is done
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _run_size(down, across, threads):  # type: ignore[no-untyped-def]
-    """Rows and columns of tiles in a run, a rectangle of them that a thread takes."""
-    tiles = down * across // (threads * RUNS)
-    tall = min(down, max(1, int(np.sqrt(tiles))))
-    return tall, min(across, max(1, tiles // tall))
+def _place(block, down, across):  # type: ignore[no-untyped-def]
+    """Row and column of a block: they are taken column by column of bands of BAND rows, so that those taken one after the other share bricks."""
+    upper = block // (BAND * across) * BAND
+    tall, n = min(BAND, down - upper), block - upper * across
+    return upper + n % tall, n // tall
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _render_runs(worker, threads, budget, progress, height, tile, rays, background, scene, colours, voxel, scratch, outputs):  # type: ignore[no-untyped-def]
-    """Renders a thread's share of an image from where `progress` says, see `render_batch`, until it is done or the budget is spent.
-
-    Each thread takes runs of tiles from all over the image, for tiles of background are cheap; neighbouring tiles share bricks.
+def _render_blocks(worker, threads, budget, progress, height, tile, rays, background, scene, colours, voxel, scratch, outputs):  # type: ignore[no-untyped-def]
+    """Renders blocks of an image, which threads take one after the other, from where `progress` says, see `render_batch`, until none is left or the budget is
+    spent. Some blocks are of background and cost little.
     """
-    width, work = outputs.width, np.int64(budget)
-    down, across = (height + tile[0] - 1) // tile[0], (width + tile[1] - 1) // tile[1]
-    tall, wide = _run_size(down, across, threads)
-    columns = (across + wide - 1) // wide
-    for run in range(progress[worker, 0], (down + tall - 1) // tall * columns):
-        # Neighbouring runs, along rows and columns, go to different threads.
-        if (run // columns + run % columns) % threads != worker:
-            continue
-        for n in range(progress[worker, 1] if run == progress[worker, 0] else 0, tall * wide):
-            row, column = run // columns * tall + n // wide, run % columns * wide + n % wide
-            if row < down and column < across:
-                top, left = row * tile[0], column * tile[1]
-                low, right = min(top + tile[0], height), min(left + tile[1], width)
-                done = progress[worker, 2] if run == progress[worker, 0] and n == progress[worker, 1] else 0
-                done, work = render_tile(top, low, left, right, rays, background, scene, colours, voxel, scratch, outputs, done, work)
-                if work <= 0:
-                    progress[worker, 0], progress[worker, 1], progress[worker, 2] = run, n if done >= 0 else n + 1, max(done, 0)
+    width, work, place = outputs.width, np.int64(budget), progress[worker]
+    rows, columns = BLOCK * tile[0], BLOCK * tile[1]
+    down, across = (height + rows - 1) // rows, (width + columns - 1) // columns
+    while place[0] < down * across:
+        row, column = _place(place[0], down, across)
+        top, left = row * rows, column * columns
+        low, right = min(top + rows, height), min(left + columns, width)
+        if clear_block(top, low, left, right, rays, scene, scratch):
+            work -= write_clear(top, low, left, right, background, outputs)
+            place[1] = BLOCK * BLOCK
+        while place[1] < BLOCK * BLOCK:
+            upper, first = top + place[1] // BLOCK * tile[0], left + place[1] % BLOCK * tile[1]
+            if upper < height and first < width:
+                lower, last = min(upper + tile[0], height), min(first + tile[1], width)
+                place[2], work = render_tile(upper, lower, first, last, rays, background, scene, colours, voxel, scratch, outputs, place[2], work)
+                if place[2] >= 0:
                     return
-    progress[worker, 0] = ALL_RUNS
+                place[2] = 0
+            place[1] += 1
+            if work <= 0:
+                return
+        place[0], place[1] = fetch_add(pointer(progress), 3 * threads, 1), 0
+
+
+def beginning(threads: int) -> np.ndarray:
+    """The `progress` of an image of which nothing is rendered: threads begin with the first blocks."""
+    progress = np.zeros((threads + 1, 3), np.int64)
+    progress[:, 0] = np.arange(threads + 1)
+    return progress
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -66,7 +76,8 @@ def render_batch(  # type: ignore[no-untyped-def]
     voxel          size of a voxel of cascade 0, world units
     tile           (rows, columns) of a tile
     budget         of a thread's work, see WORK
-    progress       (threads, 3) int64, zero at first: the run, the tile in it and the subdivision of that which a thread goes on with
+    progress       (threads + 1, 3) int64, see `beginning`: the block, the tile in it and the subdivision of that which a thread goes on with; at last the
+                   block that no thread has taken
     colour         (H, W, 3) float32
     opacity        (H, W) float32
     depth          (H, W) float32, world units: along the view axis for a camera, along the ray for given rays
@@ -78,13 +89,13 @@ def render_batch(  # type: ignore[no-untyped-def]
     cascades = len(packed.grids)
     floats, ints = np.zeros((threads, FLOATS), np.float32), np.zeros((threads, INTS), np.int32)
     clear = ENDS + 2 * LANES * cascades
-    distances, warped = np.zeros((threads, clear + 2 * cascades)), np.zeros((threads, WARPED))
+    distances, warped = np.zeros((threads, clear + 3 * cascades)), np.zeros((threads, WARPED))
     looking = np.zeros((threads, 3 * TILE_RAYS), np.float32)
     for worker in numba.prange(threads):
         mine = distances[worker]
         scratch = TileScratch(
             pointer(floats[worker]), pointer(ints[worker]), pointer(mine), pointer(mine[clear:]), pointer(mine[clear + cascades :]),
-            pointer(warped[worker]), pointer(looking[worker]),
+            pointer(mine[clear + 2 * cascades :]), pointer(warped[worker]), pointer(looking[worker]),
         )  # fmt: skip
         outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), pointer(statistics), len(normal) > 0, len(statistics) > 0)
         rays = ray_pointers(batch)
@@ -92,11 +103,9 @@ def render_batch(  # type: ignore[no-untyped-def]
             cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointer(views.direction), views.direction_rate,
             pointer(views.min_distance), pointer(views.density_scale), views.step, views.degree,
         )  # fmt: skip
-        _render_runs(worker, threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
-    left = 0
-    for worker in range(threads):
-        left += progress[worker, 0] != ALL_RUNS
-    return left == 0
+        _render_blocks(worker, threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
+    rows, columns = BLOCK * tile[0], BLOCK * tile[1]
+    return progress[:threads, 0].min() >= (height + rows - 1) // rows * ((width + columns - 1) // columns)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -15,6 +15,7 @@ import numpy as np
 from efficientnerf.backends.numba.rays import warp_ray, world_distance, world_normal
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import advanced, pointer
+from efficientnerf.backends.numba.tree.packets.lanes import sqrt_lanes
 from efficientnerf.backends.numba.tree.packets.layout import (
     WARPED_BEGIN,
     WARPED_BEND,
@@ -99,10 +100,10 @@ def _rotate(r, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _pinhole_direction(x, y, rays):  # type: ignore[no-untyped-def]
-    """Unit direction through (x, y), pixels, and its component along the view axis."""
+def pinhole_direction(x, y, rays):  # type: ignore[no-untyped-def]
+    """Unit direction through (x, y), pixels, and its component along the view axis; of one ray or of those in lanes."""
     u, v = (x - rays.cx) / rays.fx, (y - rays.cy) / rays.fy
-    cosine = 1 / np.sqrt(u * u + v * v + 1)
+    cosine = 1.0 / sqrt_lanes(u * u + v * v + 1.0)
     dx, dy, dz = _rotate(rays.rotation, u * cosine, v * cosine, cosine)
     return dx, dy, dz, cosine
 
@@ -117,7 +118,7 @@ def ray_at(row, column, rays):  # type: ignore[no-untyped-def]
     if rays.kind == DIRECTION_TABLE:
         dx, dy, dz = _rotate(rays.rotation, rays.camera_directions[p], rays.camera_directions[p + 1], rays.camera_directions[p + 2])
         return rays.x, rays.y, rays.z, dx, dy, dz, np.float64(rays.camera_directions[p + 2])
-    dx, dy, dz, cosine = _pinhole_direction((column + 0.5) * rays.pitch, (rays.first_row + row + 0.5) * rays.pitch, rays)
+    dx, dy, dz, cosine = pinhole_direction((column + 0.5) * rays.pitch, (rays.first_row + row + 0.5) * rays.pitch, rays)
     return rays.x, rays.y, rays.z, dx, dy, dz, cosine
 
 
@@ -188,7 +189,7 @@ def _empty_radius(x, y, z, grid):  # type: ignore[no-untyped-def]
     if leap > 0:
         ux, uy, uz = qx - a * brick, qy - e * brick, qz - c * brick
         inner = (leap - 1) * brick + min(min(ux, brick - ux), min(uy, brick - uy), min(uz, brick - uz))
-    return np.sqrt(outside + inner * inner)
+    return np.sqrt(outside + inner * inner) if outside > 0 else inner
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -207,9 +208,10 @@ def _clear_cone(origin, direction, radius, widening, t, grid):  # type: ignore[n
         return t
     nx, ny, nz = grid.nx * grid.brick / 2, grid.ny * grid.brick / 2, grid.nz * grid.brick / 2
     beyond = np.sqrt((ox - nx) ** 2 + (oy - ny) ** 2 + (oz - nz) ** 2) + np.sqrt(nx * nx + ny * ny + nz * nz) + 2 * radius
+    slowed = 1 / (1 + widening)
     for _ in range(MAX_ADVANCES):
         # At t + a a ray is within radius + (t + a) * widening + a of the point here.
-        advance = (_empty_radius(ox + t * dx, oy + t * dy, oz + t * dz, grid) - radius - t * widening) / (1 + widening)
+        advance = (_empty_radius(ox + t * dx, oy + t * dy, oz + t * dz, grid) - radius - t * widening) * slowed
         if not advance > MIN_ADVANCE:
             return t
         t += advance
@@ -221,11 +223,11 @@ def _clear_cone(origin, direction, radius, widening, t, grid):  # type: ignore[n
 @numba.njit(cache=True, error_model="numpy")
 def _clear_pinhole(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
     """`clear_distance` for a pinhole camera: the corners of the tile are farthest from its middle."""
-    ax, ay, az, _ = _pinhole_direction((left + right) / 2 * rays.pitch, (top + low) / 2 * rays.pitch, rays)
+    ax, ay, az, _ = pinhole_direction((left + right) / 2 * rays.pitch, (top + low) / 2 * rays.pitch, rays)
     widening = 0.0
     for n in range(4):
         row, column = top if n & 1 else low, left if n & 2 else right
-        dx, dy, dz, _ = _pinhole_direction(column * rays.pitch, row * rays.pitch, rays)
+        dx, dy, dz, _ = pinhole_direction(column * rays.pitch, row * rays.pitch, rays)
         widening = max(widening, (dx - ax) ** 2 + (dy - ay) ** 2 + (dz - az) ** 2)
     return _clear_cone((rays.x, rays.y, rays.z), (ax, ay, az), 0.0, np.sqrt(widening), since, grid)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.rays import ndc_numbers
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.image import TILE, WORK, downsample, render_batch
+from efficientnerf.backends.numba.tree.image import TILE, WORK, beginning, downsample, render_batch
 from efficientnerf.backends.numba.tree.march import LOG2E
 from efficientnerf.backends.numba.tree.packed import VOXELS_PER_CALL, packed_of
 from efficientnerf.backends.numba.tree.ray_batch import RayBatch
@@ -126,7 +126,7 @@ def _render(
 ) -> None:  # fmt: skip
     statistics = np.zeros((0, 0, 4), np.int32) if statistics is None else statistics
     threads = numba.get_num_threads()
-    progress = np.zeros((threads, 3), np.int64)
+    progress = beginning(threads)
     # In pieces: signals are answered between calls.
     while not render_batch(
         batch, background, packed_of(tree), tree.brick, colours.colours, colours.views, float(tree.voxel), tile, threads, WORK, progress,

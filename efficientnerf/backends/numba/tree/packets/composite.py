@@ -11,24 +11,19 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import add_scaled4, advanced, load4, pack4, sigmoid, store4
 from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP, exp2_neg
+from efficientnerf.backends.numba.tree.packets.groups import channels, gather_fours, gather_pairs, prefetch_groups, store_channels, store_pairs
 from efficientnerf.backends.numba.tree.packets.halves import mix_pairs
 from efficientnerf.backends.numba.tree.packets.lanes import (
     bits_of,
     broadcast32,
-    channels,
     exp2_neg_lanes,
     floor_lanes,
-    gather_fours,
-    gather_pairs,
     load32,
     lowest_bit,
     mask32,
     popcount_lanes,
-    prefetch_groups,
     select_lanes,
-    store_channels,
     store_lanes,
-    store_pairs,
     to_ints,
 )
 from efficientnerf.backends.numba.tree.packets.layout import (

@@ -1,4 +1,4 @@
-"""Sixteen or thirty-two float32, int32 or booleans in SIMD lanes, with operators: what `simd` has for four.
+"""Sixteen or thirty-two float32, int32 or booleans, or thirty-two float64, in SIMD lanes, with operators: what `simd` has for four.
 
 Operands may be scalars: they are in all lanes. Comparisons give booleans. A vector that is wider than a register, as thirty-two lanes always are, LLVM divides.
 """
@@ -14,7 +14,6 @@ from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
 from efficientnerf.backends.numba.simd import broadcast_like, float32x16, float32x32, splat, store
-from efficientnerf.backends.numba.tree.packets.layout import LANES
 
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 
@@ -23,26 +22,38 @@ class _Ints(types.Type):
     """Type of a vector of int32."""
 
 
+class _Doubles(types.Type):
+    """Type of a vector of float64."""
+
+
 class _Bits(types.Type):
     """Type of a vector of booleans."""
 
 
 int32x16, bool16 = _Ints("SixteenInts"), _Bits("SixteenBits")
 int32x32, bool32 = _Ints("ThirtyTwoInts"), _Bits("ThirtyTwoBits")
-_FLOATS: dict[int, Any] = {16: float32x16, 32: float32x32}
-_INTS: dict[int, Any] = {16: int32x16, 32: int32x32}
+float64x32 = _Doubles("ThirtyTwoDoubles")
+FLOATS: dict[int, Any] = {16: float32x16, 32: float32x32}
+INTS: dict[int, Any] = {16: int32x16, 32: int32x32}
 _BITS: dict[int, Any] = {16: bool16, 32: bool32}
-_COUNTS = {kind: count for family in (_FLOATS, _INTS, _BITS) for count, kind in family.items()}
+_DOUBLES: dict[int, Any] = {32: float64x32}
+_COUNTS = {kind: count for family in (FLOATS, INTS, _BITS, _DOUBLES) for count, kind in family.items()}
 
 
 def _vector(kind: Any) -> Any:
     """The LLVM type of a vector."""
-    element = ir.FloatType() if kind in _FLOATS.values() else _I32 if kind in _INTS.values() else ir.IntType(1)
-    return ir.VectorType(element, _COUNTS[kind])
+    elements = ((FLOATS, ir.FloatType()), (INTS, _I32), (_BITS, ir.IntType(1)), (_DOUBLES, ir.DoubleType()))
+    return ir.VectorType(next(element for family, element in elements if kind in family.values()), _COUNTS[kind])
+
+
+def _of(element: Any, count: int) -> Any:
+    """The type of so many float32, float64, or integers."""
+    return (INTS if isinstance(element, types.Integer) else _DOUBLES if element == types.float64 else FLOATS)[count]
 
 
 @register_model(_Ints)
 @register_model(_Bits)
+@register_model(_Doubles)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _vector(kind))
@@ -59,7 +70,9 @@ def _spread(builder: Any, value: Any, kind: Any, count: int) -> Any:
 
 def _fits(kind: Any, vector: Any) -> bool:
     """Whether an operand may stand beside a vector."""
-    return kind == vector or (isinstance(kind, types.Integer) if vector in _INTS.values() else kind == types.float32 and vector in _FLOATS.values())
+    if vector in INTS.values():
+        return kind == vector or isinstance(kind, types.Integer)
+    return kind == vector or (kind, vector) in [(types.float32, each) for each in FLOATS.values()] + [(types.float64, each) for each in _DOUBLES.values()]
 
 
 def _overload_operator(operation: Any, vector: Any, result: Any, emit: Any) -> None:
@@ -80,9 +93,12 @@ def _overload_operator(operation: Any, vector: Any, result: Any, emit: Any) -> N
 
 
 _ORDERS = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">=", operator.eq: "==", operator.ne: "!="}
-for _float, _int, _bool in zip(_FLOATS.values(), _INTS.values(), _BITS.values(), strict=True):
+for _float, _bool in (*zip(FLOATS.values(), _BITS.values(), strict=True), (float64x32, bool32)):
     for _operation, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
         _overload_operator(_operation, _float, _float, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
+    for _operation, _order in _ORDERS.items():
+        _overload_operator(_operation, _float, _bool, lambda builder, a, b, order=_order: builder.fcmp_ordered(order, a, b))
+for _int, _bool in zip(INTS.values(), _BITS.values(), strict=True):
     for _operation, _name in (
         (operator.add, "add"), (operator.sub, "sub"), (operator.mul, "mul"), (operator.and_, "and_"), (operator.or_, "or_"), (operator.rshift, "lshr"),
         (operator.lshift, "shl"),
@@ -91,7 +107,6 @@ for _float, _int, _bool in zip(_FLOATS.values(), _INTS.values(), _BITS.values(),
     for _operation, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
         _overload_operator(_operation, _bool, _bool, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
     for _operation, _order in _ORDERS.items():
-        _overload_operator(_operation, _float, _bool, lambda builder, a, b, order=_order: builder.fcmp_ordered(order, a, b))
         _overload_operator(_operation, _int, _bool, lambda builder, a, b, order=_order: builder.icmp_signed(order, a, b))
 
 
@@ -107,7 +122,7 @@ def _invert(mask):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def select_lanes(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
-    """a where the mask is set, else b; of float32, int32 or booleans, one of which may be a scalar."""
+    """a where the mask is set, else b; of float32, float64, int32 or booleans, one of which may be a scalar."""
     vector = next(kind for kind in (a, b) if kind in _COUNTS)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -118,14 +133,16 @@ def select_lanes(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
 
 
 def _call(builder: Any, name: str, value: Any) -> Any:
-    """An LLVM intrinsic of a vector."""
+    """An LLVM intrinsic of a vector, or of a float64."""
     kind = value.type
-    letter = "f" if kind.element == ir.FloatType() else "i"
-    return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.v{kind.count}{letter}32", (), ir.FunctionType(kind, [kind])), [value])
+    suffix = "f64"
+    if isinstance(kind, ir.VectorType):
+        suffix = f"v{kind.count}" + {ir.FloatType(): "f32", ir.DoubleType(): "f64"}.get(kind.element, "i32")
+    return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.{suffix}", (), ir.FunctionType(kind, [kind])), [value])
 
 
 def _unary(name: str) -> Any:
-    """An intrinsic of a vector of float32."""
+    """An intrinsic of a vector of float32 or float64, or of one float64."""
 
     @intrinsic
     def elementwise(typing_context: Any, value: Any) -> Any:
@@ -138,7 +155,7 @@ floor_lanes, ceil_lanes, abs_lanes, sqrt_lanes = _unary("floor"), _unary("ceil")
 
 
 def _chosen(order: str) -> Any:
-    """An intrinsic of two vectors of float32, or of one and a scalar: of each lane the first if it stands in this order to the second."""
+    """An intrinsic of two vectors of float32 or float64, or of one and a scalar: of each lane the first if it stands in this order to the second."""
 
     @intrinsic
     def elementwise(typing_context: Any, a: Any, b: Any) -> Any:
@@ -157,11 +174,11 @@ min_lanes, max_lanes = _chosen("<"), _chosen(">")  # the second where either is 
 
 
 def _broadcast(count: int) -> Any:
-    """An intrinsic: a scalar, float32 or an integer, in so many lanes."""
+    """An intrinsic: a scalar, float32, float64 or an integer, in so many lanes."""
 
     @intrinsic
     def broadcast(typing_context: Any, value: Any) -> Any:
-        vector = (_INTS if isinstance(value, types.Integer) else _FLOATS)[count]
+        vector = _of(value, count)
         return vector(value), lambda context, builder, signature, args: _spread(builder, args[0], signature.args[0], count)
 
     return broadcast
@@ -173,15 +190,40 @@ broadcast16, broadcast32 = _broadcast(16), _broadcast(32)
 @intrinsic
 def to_ints(typing_context: Any, value: Any) -> Any:
     """Float32 to int32, truncated."""
-    vector = _INTS[_COUNTS[value]]
+    vector = INTS[_COUNTS[value]]
     return vector(value), lambda context, builder, signature, args: builder.fptosi(args[0], _vector(vector))
 
 
 @intrinsic
 def to_floats(typing_context: Any, value: Any) -> Any:
-    """Int32 to float32."""
-    vector = _FLOATS[_COUNTS[value]]
-    return vector(value), lambda context, builder, signature, args: builder.sitofp(args[0], _vector(vector))
+    """Int32 or float64 to float32."""
+    vector, convert = FLOATS[_COUNTS[value]], "fptrunc" if value in _DOUBLES.values() else "sitofp"
+    return vector(value), lambda context, builder, signature, args: getattr(builder, convert)(args[0], _vector(vector))
+
+
+@intrinsic
+def to_doubles(typing_context: Any, value: Any) -> Any:
+    """Float32 to float64."""
+    vector = _DOUBLES[_COUNTS[value]]
+    return vector(value), lambda context, builder, signature, args: builder.fpext(args[0], _vector(vector))
+
+
+@intrinsic
+def lane_numbers(typing_context: Any) -> Any:
+    """0, 1, ... in thirty-two lanes of float64."""
+    return float64x32(), lambda context, builder, signature, args: ir.Constant(_vector(float64x32), [float(n) for n in range(32)])
+
+
+@intrinsic
+def sum_lanes(typing_context: Any, value: Any) -> Any:
+    """Sum of a vector of int32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind = args[0].type
+        total = builder.module.declare_intrinsic(f"llvm.vector.reduce.add.v{kind.count}i32", (), ir.FunctionType(_I32, [kind]))
+        return builder.sext(builder.call(total, [args[0]]), _I64)
+
+    return types.int64(value), codegen
 
 
 @intrinsic
@@ -213,11 +255,11 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
 
 
 def _load(count: int) -> Any:
-    """An intrinsic: p[index : index + count] of a pointer to float32, or to int32 or uint16 as int32."""
+    """An intrinsic: p[index : index + count] of a pointer to float32 or float64, or to int32 or uint16 as int32."""
 
     @intrinsic
     def load(typing_context: Any, address: Any, index: Any) -> Any:
-        vector = (_FLOATS if address.dtype == types.float32 else _INTS)[count]
+        vector = _of(address.dtype, count)
         kind = _vector(vector)
         held, align = (ir.VectorType(ir.IntType(16), count), 2) if address.dtype == types.uint16 else (kind, 4)
 
@@ -246,7 +288,7 @@ def load_bytes8(typing_context: Any, address: Any, index: Any) -> Any:
 
 @intrinsic
 def store_lanes(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
-    """p[index : index + 16 or 32] = value for a pointer to float32 or int32."""
+    """p[index : index + 16 or 32] = value for a pointer to float32, float64 or int32."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         builder.store(args[2], builder.bitcast(builder.gep(args[0], [args[1]]), _vector(value).as_pointer()), align=4)
@@ -255,7 +297,8 @@ def store_lanes(typing_context: Any, address: Any, index: Any, value: Any) -> An
     return types.void(address, types.int64, value), codegen
 
 
-def _prefetch(builder: Any, address: Any) -> None:
+def ask_for(builder: Any, address: Any) -> None:
+    """`prefetch` of an address, for other intrinsics."""
     place = builder.bitcast(address, ir.IntType(8).as_pointer())
     kind = ir.FunctionType(ir.VoidType(), [place.type, _I32, _I32, _I32])
     to_read, into_all_caches, of_data = (ir.Constant(_I32, n) for n in (0, 3, 1))
@@ -267,7 +310,7 @@ def prefetch(typing_context: Any, address: Any, index: Any) -> Any:
     """Asks for the cache line of p[index], and does not wait for it."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        _prefetch(builder, builder.gep(args[0], [args[1]]))
+        ask_for(builder, builder.gep(args[0], [args[1]]))
         return context.get_dummy_value()
 
     return types.void(address, types.int64), codegen
@@ -283,7 +326,7 @@ def popcount_lanes(typing_context: Any, bits: Any) -> Any:
 def gather_lanes(typing_context: Any, address: Any, index: Any) -> Any:
     """The elements of a pointer that a vector of int32 says, all of which must exist: float32 as such, int32 and uint8 as int32."""
     count = _COUNTS[index]
-    vector = (_FLOATS if address.dtype == types.float32 else _INTS)[count]
+    vector = (FLOATS if address.dtype == types.float32 else INTS)[count]
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         out = ir.Constant(_vector(vector), ir.Undefined)
@@ -294,89 +337,6 @@ def gather_lanes(typing_context: Any, address: Any, index: Any) -> Any:
         return out
 
     return vector(address, index), codegen
-
-
-@intrinsic
-def channels(typing_context: Any, address: Any, index: Any) -> Any:
-    """LANES groups of four float32 or int32 from p[index] on: the first of each, the second, the third and the fourth, as four vectors."""
-    vector, element = (_INTS[LANES], _I32) if address.dtype == types.int32 else (_FLOATS[LANES], ir.FloatType())
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.VectorType(element, 4 * LANES)
-        whole = builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), kind.as_pointer()), align=4)
-        lanes = [ir.Constant(ir.VectorType(_I32, LANES), list(range(n, 4 * LANES, 4))) for n in range(4)]
-        return context.make_tuple(builder, signature.return_type, [builder.shuffle_vector(whole, whole, each) for each in lanes])
-
-    return types.UniTuple(vector, 4)(address, types.int64), codegen
-
-
-def _gather_groups(size: int) -> Any:
-    """An intrinsic: groups of so many int32 from p[q[at]] on, from p[q[at + 1]] on, and so on for LANES; the first of each, the second, ... as vectors."""
-
-    @intrinsic
-    def gather(typing_context: Any, address: Any, places: Any, at: Any) -> Any:
-        group = ir.VectorType(_I32, size)
-
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            parts = []
-            for n in range(LANES):
-                place = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(_I64, n))]))
-                parts.append(builder.load(builder.bitcast(builder.gep(args[0], [builder.sext(place, _I64)]), group.as_pointer()), align=4))
-            while len(parts) > 1:
-                order = ir.Constant(ir.VectorType(_I32, 2 * parts[0].type.count), list(range(2 * parts[0].type.count)))
-                parts = [builder.shuffle_vector(left, right, order) for left, right in zip(parts[::2], parts[1::2], strict=True)]
-            lanes = [ir.Constant(ir.VectorType(_I32, LANES), list(range(n, size * LANES, size))) for n in range(size)]
-            return context.make_tuple(builder, signature.return_type, [builder.shuffle_vector(parts[0], parts[0], each) for each in lanes])
-
-        return types.UniTuple(_INTS[LANES], size)(types.CPointer(types.int32), types.CPointer(types.int32), types.int64), codegen
-
-    return gather
-
-
-gather_pairs, gather_fours = _gather_groups(2), _gather_groups(4)
-
-
-@intrinsic
-def prefetch_groups(typing_context: Any, address: Any, places: Any) -> Any:
-    """`prefetch` of p[4 n] for each n of 4 LANES int32."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        for n in range(4 * LANES):
-            place = builder.sext(builder.load(builder.gep(args[1], [ir.Constant(_I64, n)])), _I64)
-            _prefetch(builder, builder.gep(args[0], [builder.shl(place, ir.Constant(_I64, 2))]))
-        return context.get_dummy_value()
-
-    return types.void(address, types.CPointer(types.int32)), codegen
-
-
-@intrinsic
-def store_pairs(typing_context: Any, address: Any, index: Any, a: Any, b: Any) -> Any:
-    """p[index : index + 2 LANES] = a[0], b[0], a[1], b[1], ... for a pointer to float32."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        order = [LANES * (n % 2) + n // 2 for n in range(2 * LANES)]
-        whole = builder.shuffle_vector(args[2], args[3], ir.Constant(ir.VectorType(_I32, 2 * LANES), order))
-        builder.store(whole, builder.bitcast(builder.gep(args[0], [args[1]]), whole.type.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return types.void(types.CPointer(types.float32), types.int64, _FLOATS[LANES], _FLOATS[LANES]), codegen
-
-
-@intrinsic
-def store_channels(typing_context: Any, address: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """The reverse of `channels`."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def joined(left: Any, right: Any) -> Any:
-            return builder.shuffle_vector(left, right, ir.Constant(ir.VectorType(_I32, 2 * left.type.count), list(range(2 * left.type.count))))
-
-        whole = joined(joined(args[2], args[3]), joined(args[4], args[5]))
-        order = ir.Constant(ir.VectorType(_I32, 4 * LANES), [LANES * (n % 4) + n // 4 for n in range(4 * LANES)])
-        target = builder.bitcast(builder.gep(args[0], [args[1]]), whole.type.as_pointer())
-        builder.store(builder.shuffle_vector(whole, whole, order), target, align=4)
-        return context.get_dummy_value()
-
-    return types.void(address, types.int64, a, b, c, d), codegen
 
 
 @overload(store)

@@ -1,0 +1,115 @@
+"""Pixels of a packet of rays (numba): what its rays met, written into the images."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.tree.packets.groups import store_rows, store_rows_of_three
+from efficientnerf.backends.numba.tree.packets.lanes import load32, sum_lanes, to_doubles, to_floats, to_ints
+from efficientnerf.backends.numba.tree.packets.layout import (
+    BLUE,
+    DEPTH,
+    GREEN,
+    INTERPOLATED,
+    LANES,
+    LOOKUPS,
+    NORMAL_X,
+    RED,
+    TESTED,
+    TRANSMITTANCE,
+    VISITED,
+)
+from efficientnerf.backends.numba.tree.ray_batch import normal_in_world, world_depth
+
+INTERPOLATION, LOOKUP = 8, 32  # work of a sample interpolated and of a colour looked up, in samples tested
+
+_NONE, _ONE = np.float32(0), np.float32(1)
+
+
+class Outputs(NamedTuple):
+    """The images that `render_batch` writes, as pointers, and whether the last two are wanted."""
+
+    width: int
+    colour: Any
+    opacity: Any
+    depth: Any
+    normal: Any
+    statistics: Any
+    with_normal: bool
+    with_statistics: bool
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _unwarp_packet(tile, voxel, rays, scratch, with_normal):  # type: ignore[no-untyped-def]
+    """Depths and normals of the warped rays of a tile's subdivision as those of the world, world units."""
+    lane, floats = 0, scratch.floats
+    for row in range(tile.upper, tile.lower):
+        begin = (row - tile.top) * (tile.right - tile.left) - tile.left
+        for n in range(begin + tile.first, begin + tile.last):
+            if floats[DEPTH + lane] < np.inf:
+                along, x, y, z = floats[DEPTH + lane] * voxel, NORMAL_X + lane, NORMAL_X + LANES + lane, NORMAL_X + 2 * LANES + lane
+                floats[DEPTH + lane] = world_depth(n, along, scratch.warped)
+                if with_normal:
+                    floats[x], floats[y], floats[z] = normal_in_world(n, along, floats[x], floats[y], floats[z], rays.ndc, scratch.warped)
+            lane += 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _write_rows(tile, background, scale, floats, outputs):  # type: ignore[no-untyped-def]
+    """Colours, opacities and depths of a packet of four rows of eight pixels, in lanes."""
+    first, width, transmittance = tile.upper * outputs.width + tile.first, outputs.width, load32(floats, TRANSMITTANCE)
+    red, green, blue = load32(floats, RED), load32(floats, GREEN), load32(floats, BLUE)
+    red, green, blue = red + transmittance * background[0], green + transmittance * background[1], blue + transmittance * background[2]
+    store_rows_of_three(outputs.colour, 3 * first, 3 * width, red, green, blue)
+    store_rows(outputs.opacity, first, width, _ONE - transmittance)
+    store_rows(outputs.depth, first, width, to_floats(to_doubles(load32(floats, DEPTH)) * scale))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _write_pixels(tile, background, scale, floats, outputs):  # type: ignore[no-untyped-def]
+    """All that is wanted of a packet of any shape, pixel by pixel."""
+    lane = 0
+    for row in range(tile.upper, tile.lower):
+        for pixel in range(row * outputs.width + tile.first, row * outputs.width + tile.last):
+            for c in range(3):
+                outputs.colour[3 * pixel + c] = floats[RED + LANES * c + lane] + floats[TRANSMITTANCE + lane] * background[c]
+                if outputs.with_normal:
+                    outputs.normal[3 * pixel + c] = floats[NORMAL_X + LANES * c + lane]
+            outputs.opacity[pixel], outputs.depth[pixel] = _ONE - floats[TRANSMITTANCE + lane], floats[DEPTH + lane] * scale
+            if outputs.with_statistics:
+                for m in range(4):
+                    outputs.statistics[4 * pixel + m] = np.int32(floats[VISITED + LANES * m + lane])
+            lane += 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def write_clear(top, low, left, right, background, outputs):  # type: ignore[no-untyped-def]
+    """Writes pixels whose rays met nothing; returns the work that they were."""
+    for row in range(top, low):
+        for pixel in range(row * outputs.width + left, row * outputs.width + right):
+            for c in range(3):
+                outputs.colour[3 * pixel + c] = background[c]
+            outputs.opacity[pixel], outputs.depth[pixel] = _NONE, np.float32(np.inf)
+        for n in range(3 * (row * outputs.width + left), 3 * (row * outputs.width + right) if outputs.with_normal else 0):
+            outputs.normal[n] = _NONE
+        for n in range(4 * (row * outputs.width + left), 4 * (row * outputs.width + right) if outputs.with_statistics else 0):
+            outputs.statistics[n] = np.int32(0)
+    return (low - top) * (right - left)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def write_packet(tile, background, voxel, rays, scratch, outputs):  # type: ignore[no-untyped-def]
+    """Writes the pixels of a tile's subdivision; returns the work that they were."""
+    floats, count = scratch.floats, (tile.lower - tile.upper) * (tile.last - tile.first)
+    if rays.warped:
+        _unwarp_packet(tile, voxel, rays, scratch, outputs.with_normal)
+    scale = 1.0 if rays.warped else voxel
+    if count == LANES and tile.last - tile.first == 8 and not (outputs.with_normal or outputs.with_statistics):
+        _write_rows(tile, background, scale, floats, outputs)
+    else:
+        _write_pixels(tile, background, scale, floats, outputs)
+    work = to_ints(load32(floats, VISITED) + load32(floats, TESTED)) + to_ints(load32(floats, INTERPOLATED)) * INTERPOLATION
+    return count + sum_lanes(work + to_ints(load32(floats, LOOKUPS)) * LOOKUP)
