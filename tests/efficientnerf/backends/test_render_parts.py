@@ -270,7 +270,7 @@ def in_doubles(doubles, floats, ints, rows, out):  # type: ignore[no-untyped-def
     chosen = lanes.select_lanes((x < y) & (y != 0.5), 1.0 / x - y, lanes.max_lanes(x * 3.0, lanes.floor_lanes(y)))
     lanes.store_lanes(pointer(out), 0, chosen + lanes.sqrt_lanes(lanes.abs_lanes(x)) * lanes.sqrt_lanes(2.0))
     lanes.store_lanes(pointer(out), LANES, lanes.to_doubles(lanes.to_floats(y)) + lanes.lane_numbers() + lanes.broadcast32(0.25))
-    a, b, c = (lanes.load32(pointer(floats), LANES * n) for n in (0, 1, 2))
+    a, b, c = lanes.load32(pointer(floats), 0), lanes.load32(pointer(floats), LANES), lanes.load32(pointer(floats), 2 * LANES)
     groups.store_rows(pointer(rows), 1, 30, lanes.to_floats(x))
     groups.store_rows_of_three(pointer(rows), 200, 40, a, b, c)
     return lanes.sum_lanes(lanes.load32(pointer(ints), 0))
