@@ -56,6 +56,7 @@ class PosesOutputs(Outputs):
     report = Name("report.json")  # images used and rejected, framing, warnings
     verdict = Name("verdict.json")  # stages.sfm.verdict: a grade, problems and what to do, and what is known of each photograph
     contact_sheet = Name("contact_sheet.png")
+    silhouettes = Name("silhouettes.png")  # those that were made of the foreground, over the photographs
     cameras = Name("cameras.png")  # from above and from the side
     matches = Name("matches.png")  # which photographs match, where they were compared
     sharpness = Name("sharpness.png")  # photographs, the most blurred first

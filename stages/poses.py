@@ -23,7 +23,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
 from stages.cores import count_cores, in_order
 from stages.io import importers
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
 from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.io.scene import SPLITS, Scene, View, save, save_points
 
@@ -65,11 +65,16 @@ class PosesSettings:
         " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
     )
     mask_from: Annotated[
-        str, Meta(pattern="^(auto|off|static|green|white|#[0-9a-fA-F]{6})$", description="auto, off, static, green, white or a colour as #rrggbb")
+        str,
+        Meta(
+            pattern="^(auto|off|foreground|static|green|white|#[0-9a-fA-F]{6})$",
+            description="auto, off, foreground, static, green, white or a colour as #rrggbb",
+        ),
     ] = setting(
         "auto",
-        "Background that silhouettes are made from where photographs have no masks: one that stands still while the object turns (static), a screen of one"
-        " colour (green, white, #rrggbb), or none (off); auto: static where cameras found by the object alone show that it turned.",
+        "What silhouettes are made from where photographs have no masks: the subject as a first quick training of the scene finds it (foreground), a background"
+        " that stands still while the object turns (static), a screen of one colour (green, white, #rrggbb), or nothing (off); auto: static where cameras found"
+        " by the object alone show that it turned.",
         advanced=True,
     )
     mask_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
@@ -187,6 +192,7 @@ STAGE = Stage(name="poses", version=10, settings=PosesSettings, needs=(), run=ru
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
+    from stages.masking.foreground import with_foreground_masks
     from stages.masking.photographs import cameras_of_photographs, masks_made_for
     from stages.masking.polarity import capture_kept_white
 
@@ -204,6 +210,8 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
         capture = replace(capture, photos=tuple(replace(photo, mask=made.get(photo.camera.name, photo.mask)) for photo in capture.photos))
     else:
         capture = cameras_of_photographs(job, warn)
+    if settings.mask_from == FOREGROUND:
+        capture = with_foreground_masks(job, capture, warn)
     if settings.strict and capture.rejected:
         which = abbreviated([f"{image} ({why})" for image, why in capture.rejected])
         raise BadInput(f"{job.source}: {len(capture.rejected)} images cannot be used: {which}. Refused by --strict.")
@@ -293,20 +301,6 @@ def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[
     for sentence in [*remarks[:3], *([f"... and {len(remarks) - 3} more remarks like these."] if len(remarks) > 3 else [])]:
         warn(sentence)
     return without(capture, kept, failed), written
-
-
-def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, str]]) -> Capture:
-    """The capture with only the photos `kept`; the others are rejected and leave the tracks."""
-    if not failed:
-        return capture
-    place = {index: new for new, index in enumerate(kept)}
-    files = {photo.camera.name: photo.image for index, photo in enumerate(capture.photos) if index not in place}
-    points = capture.points
-    if points is not None:
-        tracks = tuple(tuple(place[photo] for photo in track if photo in place) for track in points.tracks)
-        points = SparsePoints(points.xyz, points.rgb, points.error, tracks)
-    photos = tuple(capture.photos[index] for index in kept)
-    return replace(capture, photos=photos, points=points, rejected=(*capture.rejected, *failed), rejected_files=capture.rejected_files | files)
 
 
 def only(points: SparsePoints, kept: np.ndarray) -> SparsePoints:

@@ -112,6 +112,13 @@ def surface_points(samples: FieldSamples) -> np.ndarray:
     return out
 
 
+def picture_places(samples: FieldSamples, pixels: Pixels, rays: slice) -> np.ndarray:
+    """(n, 2) x, y of some of the rays in their images, from -1 to 1."""
+    view = samples.view[rays]
+    row, column = np.divmod(samples.pixel[rays] - pixels.offsets[view], pixels.width[view])
+    return np.stack([(2 * column + 1) / pixels.width[view] - 1, (2 * row + 1) / pixels.height[view] - 1], axis=-1)
+
+
 def weight_by_box(samples: FieldSamples, boxes: Sequence[np.ndarray]) -> np.ndarray:
     """(L + 1,) total weight of the samples in each of nested boxes (2, 3), that of the boxes inside of it left out, and of what lies beyond the last."""
     out = np.zeros(len(boxes) + 1)

@@ -144,7 +144,7 @@ def cascades_needed(samples: FieldSamples, bounds: np.ndarray, stated: int | Non
 
 def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> Region:
     """The foreground region; the scene bounds where they were given by hand (poses.crop_box), and where the field says too little."""
-    from efficientnerf.asset.field_samples import surface_points
+    from efficientnerf.asset.field_samples import picture_places, surface_points
     from efficientnerf.asset.region import Region
     from stages.framing.foreground import find_foreground
     from stages.io import scene
@@ -152,11 +152,9 @@ def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> R
     if bounds_are_given(poses):
         return Region(np.asarray(s.bounds, np.float64))
     every = slice(None, None, max(1, len(samples.pixel) // FOREGROUND_RAYS))
-    view = samples.view[every]
-    row, column = np.divmod(samples.pixel[every] - pixels.offsets[view], pixels.width[view])
-    place = np.stack([(2 * column + 1) / pixels.width[view] - 1, (2 * row + 1) / pixels.height[view] - 1], axis=-1)
     cameras = [one.camera for one in scene.views_of(s, "train")]
-    found = find_foreground(surface_points(samples)[every], view, place, cameras, weights=samples.opacity[every])
+    place = picture_places(samples, pixels, every)
+    found = find_foreground(surface_points(samples)[every], samples.view[every], place, cameras, weights=samples.opacity[every])
     return Region(np.asarray(s.bounds, np.float64)) if found is None else found
 
 

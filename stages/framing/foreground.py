@@ -11,13 +11,14 @@ P points, M cells, C cameras.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from efficientnerf.asset.region import Region, inside_distance
 from efficientnerf.geometry.cameras import Camera
 from stages.framing.cells import CENTRAL, CONNECTED, Cells, connected_parts, observed_cells
-from stages.framing.supports import find_supports, rays_that_end, with_feet
+from stages.framing.supports import Plane, find_supports, rays_that_end, with_feet
 
 MIN_POINTS = 200
 MIN_OPACITY = 0.5
@@ -33,10 +34,36 @@ MIN_INNER, MIN_ENDING = 3, 0.7  # views that show a cell off their border, where
 MIN_MIDDLING, MAX_BESIDE = 0.1, 1.8  # about a third of the way from the middle to the corner, in the mean
 
 
+@dataclass(frozen=True, eq=False)
+class Foreground:
+    """The foreground region and what it was made of.
+
+    side     of the cells
+    subject  (N, 3) centres of the cells of a subject, its feet on its supports included; none where the region is all that is well observed
+    planes   that support the subject: unit normals towards the cameras, and offsets
+    """
+
+    region: Region
+    side: float
+    subject: np.ndarray
+    planes: tuple[Plane, ...] = ()
+
+
+NOBODY = np.zeros((0, 3))
+
+
 def find_foreground(
     points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], *, weights: np.ndarray | None = None
 ) -> Region | None:
-    """The foreground region of a capture, in the training frame; None where the rays say too little.
+    """The foreground region of a capture, in the training frame; None where the rays say too little. See `find_subject`."""
+    found = find_subject(points, views, pixels, cameras, weights=weights)
+    return None if found is None else found.region
+
+
+def find_subject(
+    points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], *, weights: np.ndarray | None = None
+) -> Foreground | None:
+    """The foreground of a capture, in the training frame; None where the rays say too little.
 
     points   (P, 3) where rays of the photographs end (their median depth), training frame; not finite where a ray ends nowhere
     views    (P,) which camera each belongs to
@@ -65,7 +92,7 @@ def find_foreground(
     if trusted.sum() < 10:
         return None
     if not converging:
-        return _region_of(cells.centres[trusted & (cells.distance <= PATH_FARTHEST * reach)], cells.side)
+        return Foreground(_region_of(cells.centres[trusted & (cells.distance <= PATH_FARTHEST * reach)], cells.side), cells.side, NOBODY)
     share = cells.in_view / max(1.0, float(np.quantile(cells.in_view[trusted], 0.95)))
     centres = np.array([camera.centre for camera in cameras])
     ring = np.linalg.norm(centres[:, :2] - focus[:2], axis=1)
@@ -74,7 +101,7 @@ def find_foreground(
     close = trusted & (cells.distance <= FARTHEST * reach) & (cells.nearest >= 0.1 * reach) & (inside | (not round_it))
     observed = close & (share >= OBSERVED)
     if not observed.any():
-        return _region_of(cells.centres[trusted], cells.side)
+        return Foreground(_region_of(cells.centres[trusted], cells.side), cells.side, NOBODY)
     planes, support, hidden = find_supports(cells, observed, close, rays_that_end(points, views, pixels, cameras), centres, reach)
     level = any(normal[2] > 0.8 for normal, _ in planes)
     candidates = close & ~support & ~hidden & (share >= REACHED)
@@ -84,10 +111,13 @@ def find_foreground(
         central |= _ending_in_view(cells, subject & ~central, central, cells.trusted & ~candidates)
         subject = central if _volume(cells.centres[subject]) > MAX_BESIDE * _volume(cells.centres[central]) else subject
     if cells.central[subject].sum() < MIN_SHARE * cells.central[close].sum():
-        return _region_of(cells.centres[observed], cells.side, level=level)
+        return Foreground(_region_of(cells.centres[observed], cells.side, level=level), cells.side, NOBODY)
+    found = with_feet(cells.centres[subject], planes)
     if not planes:
-        return _region_of(cells.centres[subject], cells.side, level=round_it, margin=WIDE_MARGIN)
-    return _region_of(with_feet(cells.centres[subject], planes), cells.side, cells.centres[support & close], level=level)
+        region = _region_of(found, cells.side, level=round_it, margin=WIDE_MARGIN)
+    else:
+        region = _region_of(found, cells.side, cells.centres[support & close], level=level)
+    return Foreground(region, cells.side, found, tuple(planes))
 
 
 def find_focus(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, float, bool]:

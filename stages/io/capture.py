@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from efficientnerf.geometry.cameras import Camera
 
 # A fact of photographs whose background stands still while the subject turns: whether cameras were found without it.
 BACKGROUND, LEFT_OUT, SEEN = "background", "left out", "stands still"
+FOREGROUND = "foreground"  # a fact of photographs with silhouettes of it: how sure they are
 
 
 @dataclass(frozen=True)
@@ -99,3 +101,17 @@ class Capture:
     facts: dict[str, object] = field(default_factory=dict)
     rejected_files: dict[str, Path] = field(default_factory=dict)
     overlaps: tuple[tuple[str, str, int], ...] = ()
+
+
+def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, str]]) -> Capture:
+    """The capture with only the photos `kept`; the others are rejected and leave the tracks."""
+    if not failed:
+        return capture
+    place = {index: new for new, index in enumerate(kept)}
+    files = {photo.camera.name: photo.image for index, photo in enumerate(capture.photos) if index not in place}
+    points = capture.points
+    if points is not None:
+        tracks = tuple(tuple(place[photo] for photo in track if photo in place) for track in points.tracks)
+        points = SparsePoints(points.xyz, points.rgb, points.error, tracks)
+    photos = tuple(capture.photos[index] for index in kept)
+    return replace(capture, photos=photos, points=points, rejected=(*capture.rejected, *failed), rejected_files=capture.rejected_files | files)

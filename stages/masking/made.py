@@ -82,7 +82,7 @@ def _by_network(model: Path) -> Callable[[Path, Path], bool]:
         photo = _read(photograph, MASK_SIDE)
         mask = network.mask(photo.rgb)
         if mask is not None:
-            _write(sharpened(mask, photo.rgb), photo, target)
+            write_mask(sharpened(mask, photo.rgb), photo, target)
         return mask is not None
 
     return make
@@ -97,7 +97,7 @@ def _by_key(how: str) -> Callable[[Path, Path], bool]:
         photo = _read(photograph, MASK_SIDE)
         mask = keyed(photo.rgb, key)
         if mask is not None:
-            _write(mask, photo, target)
+            write_mask(mask, photo, target)
         return mask is not None
 
     return make
@@ -124,7 +124,7 @@ def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Calla
         mask = still.mask(small[photograph])
         if not mask.any():
             return False
-        _write(sharpened(mask, photo.rgb), photo, target)
+        write_mask(sharpened(mask, photo.rgb), photo, target)
         return True
 
     return make
@@ -136,7 +136,7 @@ def _read(path: Path, side: int) -> Any:
     return read_photo(path, side)
 
 
-def _write(mask: np.ndarray, photo: Any, target: Path) -> None:
+def write_mask(mask: np.ndarray, photo: Any, target: Path) -> None:
     """At the photograph's own size."""
     import cv2
 

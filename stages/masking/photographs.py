@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
-from stages.io.capture import BACKGROUND, LEFT_OUT, SEEN, Capture, Silhouettes
+from stages.io.capture import BACKGROUND, FOREGROUND, LEFT_OUT, SEEN, Capture, Silhouettes
 
 Find = Callable[[str, Mapping[str, Path | None]], Capture]
 
@@ -99,7 +99,7 @@ def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, 
         raise UsageError(f"--mask {job.settings.mask_from} and --mask-model: masks are made in one way. Give one of them.")
     if job.settings.mask_model != "off":
         return masks_by_network(paths, Path(job.settings.mask_model), job.work / "masks", **common)
-    if job.settings.mask_from in ("auto", "off"):
+    if job.settings.mask_from in ("auto", "off", FOREGROUND):  # the last needs cameras
         return {}
     return made_masks(paths, job.settings.mask_from, job.work / "masks", **common)
 

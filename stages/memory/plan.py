@@ -27,6 +27,7 @@ from stages.artifacts import (
     needs_of,
 )
 from stages.cores import count_cores
+from stages.io.capture import FOREGROUND
 from stages.memory.disk import files_below
 from stages.memory.need import Need
 
@@ -50,7 +51,9 @@ def _poses(own: Any, sources: Sequence[Path]) -> Need:
     """As if no cameras were known: of a set with cameras less is taken."""
     from stages.io.importers.source import IMAGE_SUFFIXES
     from stages.io.pictures import UnreadableImage, read_header
+    from stages.masking.first_training import FIRST, RAYS, SIDE
     from stages.memory.poses import features_needed, video_needed
+    from stages.memory.training import first_training_needed
     from stages.sfm.ladder import features_for
     from stages.video.reading import UnreadableVideo, opened
 
@@ -67,7 +70,10 @@ def _poses(own: Any, sources: Sequence[Path]) -> Need:
     count = len(pictures) or own.frames
     largest = max([*sizes, *films], key=lambda size: size[0] * size[1], default=(0, 0))
     finding = features_needed([largest] * count, own.feature_image_size, given(own.max_features) or features_for(count), count_cores())
-    return max(finding, video_needed(films), key=lambda need: need.total)
+    needs = [finding, video_needed(films)]
+    if own.mask_from == FOREGROUND:
+        needs.append(first_training_needed(count, SIDE, FIRST, RAYS))
+    return max(needs, key=lambda need: need.total)
 
 
 def _train(run: Path, settings: Mapping[str, Any], device: str) -> Need:

@@ -6,18 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
+from stages.io.scene import View
 from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
 from stages.training.data import MOST_OBSERVATIONS, channels_of, count_pixels
 
 if TYPE_CHECKING:
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import PixelRows
-    from stages.io.scene import View
 
 PIXELS = "training pixels"
 # Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes;
@@ -144,3 +145,25 @@ def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettin
     file = PosesOutputs(folder).points
     points = file.stat().st_size if file.is_file() else 0
     return needed(settings, views, channels_of(folder, views), intervals, voxels, stored=stored, device=device, points=points)
+
+
+FIELD_SAMPLES = 300  # bytes of a ray in which a first training's subject is looked for
+
+
+def first_training_needed(count: int, side: int, settings: TrainSettings, rays: int) -> Need:
+    """What a first quick training of so many photographs takes, from which silhouettes are made.
+
+    side      of the photographs at most, pixels
+    settings  without "auto" where `stages.training.hash_resolution` has numbers
+    rays      in which the subject is looked for
+    """
+    import numpy as np
+
+    from efficientnerf.geometry.spaces import space_from
+
+    space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=True)
+    camera = Camera("", side, side, "SIMPLE_PINHOLE", (side, side / 2, side / 2), np.eye(4))
+    intervals = space.max_intervals(space.sampled_length(None) / (given(settings.num_coarse_samples) or space.num_coarse_samples))
+    view = View("", None, "train", camera, camera, 0.1, 1.0)
+    need = needed(settings, [view] * count, 3, intervals, given(settings.occupancy_resolution) or space.occupancy_resolution, stored=False)
+    return Need({**need.terms, "samples of the field": FIELD_SAMPLES * rays})

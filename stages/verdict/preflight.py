@@ -19,6 +19,7 @@ import numpy as np
 from efficientnerf.settings import given
 from pipeline.errors import BadInput
 from stages.io import importers
+from stages.io.capture import FOREGROUND
 from stages.io.importers.photographs import photographs
 from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.photo import focal_from_exif, read_photo, working_size
@@ -47,6 +48,7 @@ TURNING = Problem(
 # Seconds of a processor that detects the features of a small picture in REFERENCE, by which others are scaled; docs/experiments/sfm.md
 REFERENCE = 0.028
 FEATURES_A_MEGAPIXEL, AN_IMAGE = 0.4, 0.2
+FIRST_TRAINING, A_SILHOUETTE = 110.0, 1.5  # of --mask foreground, docs/experiments/silhouettes.md
 A_PAIR, COMPARING, MANY = 0.006, 0.030, 4096  # of verifying a pair, and of comparing so many features of each with each
 CONTRAST = 0.02  # from which SIFT detects about as many features as COLMAP's does
 PAIRS_AN_IMAGE = 20  # of retrieval
@@ -268,7 +270,10 @@ def forecast(
 
     joined  share of the photographs that overlap, in the largest component
     """
+    from stages.masking.first_training import FIRST, RAYS
+    from stages.masking.first_training import SIDE as SIDE_OF_FIRST
     from stages.memory.poses import decoding_needed, features_needed
+    from stages.memory.training import first_training_needed
     from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
 
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
@@ -277,11 +282,15 @@ def forecast(
     with contextlib.suppress(UnreadableImage):
         rgb = read_photo(files[first], side).rgb
     reading = 2.5 * (time.thread_time() - before) * count  # for structure from motion, as a working image, and to be looked at
+    slower = _slower(small)
+    memory = 0
+    if settings.mask_from == FOREGROUND:
+        reading += slower * (FIRST_TRAINING + A_SILHOUETTE * count) / threads
+        memory = first_training_needed(count, SIDE_OF_FIRST, FIRST, RAYS).total
     if posed:
         seconds = {"poses_seconds": round(reading, 1), "poses_seconds_at_most": round(reading, 1)}
-        return {**seconds, "poses_bytes": int(decoding_needed(sizes).total), "pairs": 0}
-    memory = features_needed(sizes * -(-count // len(sizes)), side, features, threads).total
-    slower = _slower(small)
+        return {**seconds, "poses_bytes": max(memory, int(decoding_needed(sizes).total)), "pairs": 0}
+    memory = max(memory, features_needed(sizes * -(-count // len(sizes)), side, features, threads).total)
     reduced = [working_size(*size, side) for size in sizes]
     pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
     how = ladder.matching_for(count) if settings.matching == "auto" else settings.matching

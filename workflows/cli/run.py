@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 @click.option("--budget", metavar="TIME", help="Time for training the field and the asset, as 90s, 10m or 1h; sets train.time_budget and bake.time_budget.")
 @click.option("--target-mib", type=float, metavar="N", help="Largest size of the asset in MiB; sets bake.max_mib.")
 @click.option("--frames", type=int, metavar="N", help="Most frames that are chosen of videos, 150 by default; sets poses.frames.")
-@click.option("--mask", "mask_from", metavar="BACKGROUND",
-              help="Make silhouettes: static (the object turns before it) or a screen's colour: green, white or #rrggbb; sets poses.mask_from.")  # fmt: skip
+@click.option("--mask", "mask_from", metavar="HOW",
+              help="Make silhouettes: foreground (the subject, found by a first quick training), static (the object turns before it) or a screen's colour:"
+              " green, white or #rrggbb; sets poses.mask_from.")  # fmt: skip
 @click.option("--mask-model", metavar="FILE", help="Make silhouettes by this network, an ONNX file as rembg has them; sets poses.mask_model.")
 @click.option("--lens", metavar="LENS", help="fisheye, or equirectangular (360 degrees); sets poses.lens. By default photographs that say so are taken so.")
 @click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")

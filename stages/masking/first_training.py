@@ -1,0 +1,86 @@
+"""A first quick training of all that photographs show, from which it is told what of them is the subject.
+
+It is small and always on the CPU: a scene has the same bytes whatever its later stages compute on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, resized
+from efficientnerf.training.settings import TrainSettings
+from pipeline.stage import Job
+from stages.io.capture import Capture
+
+if TYPE_CHECKING:
+    from efficientnerf.model import Model
+    from efficientnerf.training.pixels import Pixels
+    from stages.io.scene import Scene
+
+# docs/experiments/silhouettes.md
+SIDE = 320  # px, longest side of the photographs that it is trained on
+RAYS = 2**18  # of theirs, in which the subject is looked for
+FIRST = TrainSettings(iterations=1500, log2_hashmap_size=17, finest_resolution=1024, num_coarse_samples=128, occupancy_resolution=192)
+
+
+@dataclass(frozen=True, eq=False)
+class FirstField:
+    """A trained field of a whole scene.
+
+    near, far  of all views, along their axes
+    cameras    of the photographs, in the training frame, at the size that was trained on
+    pixels     that it was trained on
+    """
+
+    model: Model
+    near: float
+    far: float
+    cameras: tuple[Camera, ...]
+    pixels: Pixels
+
+
+def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settings: TrainSettings = FIRST) -> FirstField:
+    """The field of a capture, without regard to masks. What an interrupted training did is done again: it is short.
+
+    images  (H, W, 3) uint8 of the photographs, upright
+    """
+    from efficientnerf.model import model
+    from efficientnerf.training import loop
+    from efficientnerf.training.pixels import Pixels
+    from stages.cores import use_all_cores
+    from stages.io.field_file import space_of
+    from stages.training.data import mask_cells_by, sparse_depth_of
+
+    use_all_cores()
+    folder = job.work / "first_training"
+    folder.mkdir(exist_ok=True)
+    scene = _scene(capture, [(image.shape[1], image.shape[0]) for image in images], folder)
+    cameras = [view.camera for view in scene.views]
+    near, far = np.array([(view.near, view.far) for view in scene.views]).T
+    pixels = Pixels(cameras, images, [None] * len(images), near, far, 3)
+    m = model(space_of(scene), settings, None, "cpu", (float(near.min()), float(far.max())))
+    mask_cells_by(m, cameras, near.tolist(), None)
+    for done in loop.train(loop.trainer(m, len(cameras)), pixels, sparse_depth_of(folder, scene, settings.seed)):
+        job.reached(done.step, settings.iterations, "a first training, to find the foreground")
+    return FirstField(m, float(near.min()), float(far.max()), tuple(cameras), pixels)
+
+
+def _scene(capture: Capture, sizes: list[tuple[int, int]], folder: Path) -> Scene:
+    """The scene of a capture with photographs of these sizes (width, height), all of them for training; its points are written to the folder."""
+    from stages.framing.training_frame import find_training_frame
+    from stages.io.scene import Scene, View, save_points
+
+    framed = find_training_frame(capture, space="contracted")
+    world = framed.world_from_capture
+    views = []
+    for photo, size, (near, far) in zip(capture.photos, sizes, framed.near_far_planes, strict=True):
+        camera = world.camera(resized(photo.camera, *size))
+        views.append(View(photo.camera.name, None, "train", camera, photo.camera, float(near), float(far)))
+    if capture.points is not None:
+        save_points(replace(capture.points, xyz=world.points(capture.points.xyz)), folder)
+    return Scene(capture.kind, tuple(views), framed.bounds, None, world, framed.orbit, points=capture.points is not None, space="contracted")

@@ -1,0 +1,205 @@
+"""Silhouettes of the foreground: what of a trained scene is its subject, how masks of it are made, and when they are refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.region import Region
+from efficientnerf.geometry.cameras import Camera, rays
+from pipeline.errors import BadInput, UsageError
+from pipeline.stage import Job
+from stages import poses
+from stages.framing import mask_use
+from stages.framing.foreground import Foreground
+from stages.io import scene
+from stages.masking import foreground
+from stages.masking.foreground import cleaned
+from stages.masking.subject import Subject, may_show, subject_of
+from stages.poses import PosesSettings
+from tests.stages import captures
+
+RADIUS = 0.6
+FLOOR = ((np.array([0.0, 0.0, 1.0]), 0.0),)
+
+
+def on_plane(count: int, noise: float) -> np.ndarray:
+    generator = np.random.default_rng(1)
+    places = generator.uniform(-2, 2, (count, 3))
+    places[:, 2] = noise * generator.normal(size=count)
+    return places
+
+
+def test_a_subject_is_cut_off_close_to_what_supports_it() -> None:
+    """By a plane found anew from all points round it: the one that is given is off by half a cell, and tilted."""
+    side = 0.1
+    grid = np.stack(np.meshgrid(*(np.arange(-0.5, 0.55, side),) * 2, np.arange(0.05, 0.9, side), indexing="ij"), axis=-1).reshape(-1, 3)
+    tilted = np.array([0.02, 0.0, 1.0]) / np.linalg.norm([0.02, 0.0, 1.0])
+    given = Foreground(Region(np.array([[-0.8] * 3, [0.8, 0.8, 1.1]])), side, grid, ((tilted, 0.05),))
+    slab = np.random.default_rng(3).uniform([0.55, -0.3, 0.02], [0.75, 0.3, 0.06], (2000, 3))  # within the tolerance by which the support was found
+    seen_of_it = np.random.default_rng(4).uniform([-0.5, -0.5, 0.01], [0.55, 0.5, 0.9], (20_000, 3))
+    found = subject_of(given, np.concatenate([on_plane(20_000, 0.004), slab, seen_of_it]))
+    ((normal, offset), above), *others = found.planes
+    assert not others
+    np.testing.assert_allclose(normal, [0, 0, 1], atol=1e-3)
+    assert abs(offset) < 1e-3
+    assert 0.004 < above < 0.02
+    places = np.array([[0, 0, 0.5], [0, 0, above + 0.01], [0, 0, 0.0], [1.5, 0, 0.5], [0.56, 0, 0.4], [0.7, 0, 0.04], [0.7, 0, 0.0]])
+    assert found.holds(places).tolist() == [True, True, False, False, True, True, False]
+
+
+def test_a_support_that_few_points_show_stays_as_it_was_found() -> None:
+    grid = np.random.default_rng(0).uniform(0.05, 0.5, (50, 3))
+    found = subject_of(Foreground(Region(np.array([[0.0] * 3, [1.0] * 3])), 0.1, grid, FLOOR), np.full((10, 3), np.inf))
+    assert found.planes == ((FLOOR[0], 0.05),)
+
+
+def test_rays_that_cannot_show_the_subject_are_left_out() -> None:
+    camera = captures.cameras()[0]
+    subject = Subject(np.random.default_rng(2).uniform(-0.1, 0.1, (200, 3)), 0.05, ())
+    shown = may_show(subject, camera)
+    assert 0.01 < shown.mean() < 0.5
+    assert shown[camera.height // 2, camera.width // 2]
+    beside = Subject(camera.centre[None], 0.5, ())
+    assert may_show(beside, camera).all()
+
+
+def test_small_parts_and_small_gaps_go_and_soft_edges_stay() -> None:
+    covered = np.zeros((120, 160))
+    covered[30:90, 40:100] = 1
+    covered[30, 40:100] = 0.6
+    covered[50:52, 60:63] = 0  # a gap
+    covered[60:80, 60:80] = 0.1  # a hole
+    covered[100:103, 10:13] = 1  # a part
+    mask = cleaned(covered)
+    assert (mask[50:52, 60:63] == 255).all()
+    assert (mask[62:78, 62:78] < 128).all()
+    assert not mask[95:, :20].any()
+    assert mask[30, 70] == 153
+    assert not cleaned(np.zeros((20, 30))).any()
+
+
+def ball_pictures(made: list[Camera], offset: float = 0.0) -> dict[str, np.ndarray]:
+    """How much of each pixel a ball covers; it is elsewhere in each picture by so much."""
+    found = {}
+    for index, camera in enumerate(made):
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        origins, directions = rays(camera, np.stack([x, y], -1).reshape(-1, 2))
+        to = np.array([offset * np.cos(2.4 * index), offset * np.sin(2.4 * index), 0]) - origins
+        away = np.linalg.norm(to - (to * directions).sum(1)[:, None] * directions, axis=1)
+        found[camera.name] = (away < RADIUS).astype(float).reshape(camera.height, camera.width)
+    return found
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A posed data set whose first training is left out: a ball is found in it."""
+    made = captures.cameras(8)
+    seen(monkeypatch, ball_pictures(made))
+    return captures.nerfstudio(tmp_path / "source", made)
+
+
+def seen(monkeypatch: pytest.MonkeyPatch, pictures: dict[str, np.ndarray]) -> list[str]:
+    """Let the silhouettes be these; returns the names of those that were asked for, as they are."""
+    asked: list[str] = []
+
+    class Field:
+        model, near, far = None, 0.1, 10.0
+
+        def __init__(self, cameras: list[Camera]) -> None:
+            self.cameras = cameras
+
+    def coverage(_: object, subject: object, camera: Camera, *planes: float) -> np.ndarray:
+        asked.append(camera.name)
+        return pictures[camera.name.rsplit("/", 1)[-1]]
+
+    monkeypatch.setattr(foreground, "first_field", lambda job, capture, images: Field([photo.camera for photo in capture.photos]))
+    monkeypatch.setattr(foreground, "_subject", lambda field: Subject(np.zeros((1, 3)), 0.1, FLOOR_ABOVE))
+    monkeypatch.setattr(foreground, "coverage", coverage)
+    return asked
+
+
+FLOOR_ABOVE = ((FLOOR[0], 0.01),)
+
+
+def job_of(source: Path, out: Path, **settings: Any) -> Job:
+    return Job(settings=PosesSettings(mask_from="foreground", **settings), out=out / "poses", work=out / "work", source=source, stage="poses")
+
+
+def test_the_foreground_is_trained_alone_on_silhouettes_as_on_masks_of_users(source: Path, tmp_path: Path) -> None:
+    poses.run(job_of(source, tmp_path))
+    made = scene.load(tmp_path / "poses")
+    assert made.background == (1.0, 1.0, 1.0)
+    assert not made.contracted
+    for view in made.views:
+        alpha = scene.read_image(tmp_path / "poses", view)[..., 3]
+        truth = ball_pictures([view.source_camera])[view.source_camera.name] > 0
+        assert ((alpha >= 128) & truth).sum() > 0.75 * ((alpha >= 128) | truth).sum()
+    report = json.loads((tmp_path / "poses/report.json").read_text())
+    assert report["facts"]["foreground"]["photographs"] == 8
+    assert report["facts"]["foreground"]["overlap"] > 0.8
+    assert report["masks"]["masks"]["use"] == "silhouette"
+
+
+def test_masks_are_made_once_and_the_same_bytes_come_of_them_again(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    poses.run(job_of(source, tmp_path / "a"))
+    asked = seen(monkeypatch, ball_pictures(captures.cameras(8)))
+    again = Job(settings=PosesSettings(mask_from="foreground"), out=tmp_path / "b/poses", work=tmp_path / "a/work", source=source, stage="poses")
+    poses.run(again)
+    assert not asked
+    files = sorted(path.relative_to(tmp_path / "a/poses") for path in (tmp_path / "a/poses").rglob("*") if path.is_file())
+    assert Path("silhouettes.png") in files
+    assert all((tmp_path / "a/poses" / path).read_bytes() == (tmp_path / "b/poses" / path).read_bytes() for path in files)
+    (tmp_path / "a/work/foreground/00003.png").write_bytes(b"damaged")
+    poses.run(Job(settings=PosesSettings(mask_from="foreground"), out=tmp_path / "c/poses", work=tmp_path / "a/work", source=source, stage="poses"))
+    assert len(asked) == 8
+    assert all((tmp_path / "a/poses" / path).read_bytes() == (tmp_path / "c/poses" / path).read_bytes() for path in files)
+
+
+def test_a_photograph_whose_silhouette_does_not_fit_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = captures.cameras(12)
+    seen(monkeypatch, ball_pictures(made))
+    monkeypatch.setattr(mask_use, "hull_overlaps", lambda capture, pictures: np.array([0.95] * 5 + [0.6] + [0.95] * 6))
+    events: list[dict[str, Any]] = []
+    job = Job(
+        settings=PosesSettings(mask_from="foreground"), out=tmp_path / "poses", work=tmp_path / "work", source=captures.nerfstudio(tmp_path / "source", made),
+        report=events.append,
+    )  # fmt: skip
+    poses.run(job)
+    kept = {view.name for view in scene.load(tmp_path / "poses").views}
+    assert len(kept) == 11
+    (left,) = {f"images/{camera.name}" for camera in made} - kept
+    assert any("have no silhouette" in event["text"] and left in event["text"] for event in events if event["event"] == "warning")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda pictures: {name: np.ones_like(each) for name, each in pictures.items()}, "keep more than 80% of the picture"),
+        (lambda pictures: {name: np.zeros_like(each) for name, each in pictures.items()}, "keep next to nothing"),
+        (lambda pictures: {name: np.roll(each, each.shape[0] // 2, axis=0) for name, each in pictures.items()}, "the border of the picture cuts off"),
+        (lambda pictures: ball_pictures(captures.cameras(8), 0.6), "no thing has all of these silhouettes"),
+    ],
+)
+def test_silhouettes_of_no_compact_thing_are_refused(change: Any, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = captures.cameras(8)
+    seen(monkeypatch, change(ball_pictures(made)))
+    with pytest.raises(BadInput, match=rf"--mask foreground: .*{why}.* Photograph it from all round.*masks/") as error:
+        poses.run(job_of(captures.nerfstudio(tmp_path / "source", made), tmp_path))
+    assert error.value.exit_code == 2
+    assert not (tmp_path / "poses/scene.json").exists()
+
+
+def test_other_masks_and_alpha_channels_are_not_written_over(source: Path, tmp_path: Path) -> None:
+    captures.write_picture(source / "images/masks/img_0.png", np.zeros((captures.HEIGHT, captures.WIDTH), np.uint8))
+    document = json.loads((source / "transforms.json").read_text())
+    document["frames"][0]["mask_path"] = "images/masks/img_0.png"
+    (source / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(UsageError, match=r"1 of 8 photographs have a mask or an alpha channel already: .*img_0\.png\. Leave --mask away"):
+        poses.run(job_of(source, tmp_path))
+    with pytest.raises(UsageError, match="--mask foreground and --mask-model"):
+        poses.run(job_of(source, tmp_path, mask_model="/net.onnx"))
