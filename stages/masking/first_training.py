@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # docs/experiments/silhouettes.md
 SIDE = 320  # px, longest side of the photographs that it is trained on
 RAYS = 2**18  # of theirs, in which the subject is looked for
-FIRST = TrainSettings(iterations=1500, log2_hashmap_size=17, finest_resolution=1024, num_coarse_samples=128, occupancy_resolution=192)
+FIRST = TrainSettings(iterations=1200, log2_hashmap_size=17, finest_resolution=1024, num_coarse_samples=128, occupancy_resolution=192)
 
 
 @dataclass(frozen=True, eq=False)

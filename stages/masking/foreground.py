@@ -25,8 +25,7 @@ from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header
 from stages.masking.first_training import FIRST, RAYS, SIDE, first_field
-from stages.masking.made import MASK_SIDE, write_mask
-from stages.masking.static import sharpened
+from stages.masking.made import write_mask
 from stages.masking.subject import Subject, coverage, subject_of
 
 if TYPE_CHECKING:
@@ -156,9 +155,9 @@ def _made(job: Job, capture: Capture, field: FirstField, subject: Subject, folde
     masks = {}
     for number, (photo, mask) in enumerate(small):
         if photo.camera.name in fits:
-            job.reached(number, len(small), "edges of silhouettes")
+            job.safe_point()
             masks[photo.camera.name] = f"{number:05d}.png"
-            _write(photo, mask, folder / masks[photo.camera.name])
+            write_mask(mask, (photo.camera.width, photo.camera.height), folder / masks[photo.camera.name])
     shares = [float(kept.mean()) for _, kept in compact]
     facts = {"photographs": len(masks), "overlap": round(float(np.median(overlap)), 3), "kept": [round(min(shares), 4), round(max(shares), 4)]}
     return _Made(masks, {**facts, "cut_by_border": cut, "supports": len(subject.planes)})
@@ -182,12 +181,6 @@ def cleaned(covered: np.ndarray) -> np.ndarray:
 
 def _border_share(kept: np.ndarray) -> float:
     return float(np.concatenate([kept[0], kept[-1], kept[1:-1, 0], kept[1:-1, -1]]).mean())
-
-
-def _write(photo: Photo, mask: np.ndarray, target: Path) -> None:
-    """The mask of a photograph at its size, its edges those of the photograph."""
-    picture = read_photo(photo.image, MASK_SIDE)
-    write_mask(sharpened(mask, picture.rgb), picture, target)
 
 
 def _draw(photos: Sequence[Photo], images: Sequence[np.ndarray], path: Path) -> None:

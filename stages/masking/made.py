@@ -82,7 +82,7 @@ def _by_network(model: Path) -> Callable[[Path, Path], bool]:
         photo = _read(photograph, MASK_SIDE)
         mask = network.mask(photo.rgb)
         if mask is not None:
-            write_mask(sharpened(mask, photo.rgb), photo, target)
+            write_mask(sharpened(mask, photo.rgb), (photo.width, photo.height), target)
         return mask is not None
 
     return make
@@ -97,7 +97,7 @@ def _by_key(how: str) -> Callable[[Path, Path], bool]:
         photo = _read(photograph, MASK_SIDE)
         mask = keyed(photo.rgb, key)
         if mask is not None:
-            write_mask(mask, photo, target)
+            write_mask(mask, (photo.width, photo.height), target)
         return mask is not None
 
     return make
@@ -124,7 +124,7 @@ def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Calla
         mask = still.mask(small[photograph])
         if not mask.any():
             return False
-        write_mask(sharpened(mask, photo.rgb), photo, target)
+        write_mask(sharpened(mask, photo.rgb), (photo.width, photo.height), target)
         return True
 
     return make
@@ -136,12 +136,12 @@ def _read(path: Path, side: int) -> Any:
     return read_photo(path, side)
 
 
-def write_mask(mask: np.ndarray, photo: Any, target: Path) -> None:
-    """At the photograph's own size."""
+def write_mask(mask: np.ndarray, size: tuple[int, int], target: Path) -> None:
+    """At the photograph's own size (width, height)."""
     import cv2
 
     from stages.io.png import write_png
 
-    if mask.shape != (photo.height, photo.width):
-        mask = cv2.resize(mask, (photo.width, photo.height), interpolation=cv2.INTER_LINEAR)
+    if mask.shape[::-1] != size:
+        mask = cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR)
     write_png(mask, target, durable=False)

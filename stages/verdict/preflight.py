@@ -48,7 +48,7 @@ TURNING = Problem(
 # Seconds of a processor that detects the features of a small picture in REFERENCE, by which others are scaled; docs/experiments/sfm.md
 REFERENCE = 0.028
 FEATURES_A_MEGAPIXEL, AN_IMAGE = 0.4, 0.2
-FIRST_TRAINING, A_SILHOUETTE = 110.0, 1.5  # of --mask foreground, docs/experiments/silhouettes.md
+FIRST_TRAINING, A_SILHOUETTE = 92.0, 0.8  # of --mask foreground, docs/experiments/silhouettes.md
 A_PAIR, COMPARING, MANY = 0.006, 0.030, 4096  # of verifying a pair, and of comparing so many features of each with each
 CONTRAST = 0.02  # from which SIFT detects about as many features as COLMAP's does
 PAIRS_AN_IMAGE = 20  # of retrieval
@@ -106,7 +106,8 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
     about = forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed, joined=_share_in_largest(len(small), overlaps))
     if later is not None:
-        about |= _forecast_of_run(about, small, len(names), later, threads, whole=kind != "llff" and not _rendered(kind, files[next(iter(small))]))
+        whole = kind != "llff" and settings.mask_from != FOREGROUND and not _rendered(kind, files[next(iter(small))])
+        about |= _forecast_of_run(about, small, len(names), later, threads, whole=whole)
     figures = {
         "source": str(folder),
         "format": kind,
