@@ -219,7 +219,7 @@ def test_masks_are_made_from_a_green_screen(tmp_path: Path, masks: str) -> None:
     for index, camera in enumerate(made):
         inside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < 6 + index % 2
         captures.write_picture(source / "images" / camera.name, np.where(inside[..., None], captures.picture(index), np.uint8([60, 190, 80])))
-    with pytest.raises(UsageError, match="expected auto, off, static, green, white or a colour as #rrggbb"):
+    with pytest.raises(UsageError, match="expected auto, off, foreground, static, green, white or a colour as #rrggbb"):
         settings_from(PosesSettings, {"mask_from": "purple"})
     plain, _ = run(source, tmp_path / "a")
     assert plain.background is None
