@@ -137,6 +137,8 @@ def run(job: Job) -> None:
     small = SmallPictures()
     capture, mask_facts = with_mask_use(job, capture, small, warn)
     capture, written = _write_images(job, capture, warn)
+    judged = capture  # by all sparse points that its cameras were found with
+    capture = with_points_of_object(capture, small)
     framed = training_frame.find_training_frame(
         capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
     )
@@ -170,7 +172,7 @@ def run(job: Job) -> None:
         forward=framed.forward,
     )
     save(scene, job.out)
-    judge(job, capture, scene, _may_be_renders(capture), warn)
+    judge(job, judged, scene, _may_be_renders(capture), warn)
     _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
@@ -187,7 +189,7 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
     return [*importers.files(source, settings), *network]
 
 
-STAGE = Stage(name="poses", version=10, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
+STAGE = Stage(name="poses", version=11, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
@@ -235,9 +237,7 @@ def _format_of(capture: Capture) -> str:
 
 def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
     """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
-    import numpy as np
-
-    from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
+    from stages.framing.mask_use import doubts, find_mask_use, without_silhouette
     from stages.masking.photographs import mask_choice
 
     renders = _may_be_renders(capture)
@@ -253,10 +253,18 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
     capture = without(capture, kept, [(name, "has no silhouette, and the others do") for name in sorted(names)])
     if not use.silhouettes:
         return replace(capture, background=None), use.facts
-    capture = replace(capture, background=WHITE, silhouettes=use.silhouettes)
-    if capture.points is not None:
-        capture = replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, small))))
-    return capture, use.facts
+    return replace(capture, background=WHITE, silhouettes=use.silhouettes), use.facts
+
+
+def with_points_of_object(capture: Capture, small: SmallPictures) -> Capture:
+    """Without the sparse points that lie outside of silhouettes."""
+    import numpy as np
+
+    from stages.framing.mask_use import points_of_object
+
+    if not capture.silhouettes or capture.points is None:
+        return capture
+    return replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, small))))
 
 
 def _may_be_renders(capture: Capture) -> bool:

@@ -202,6 +202,14 @@ def test_points_of_the_background_go(tmp_path: Path) -> None:
     assert (everything < 0.45).sum() <= len(found) < len(everything)
 
 
+def test_cameras_are_judged_by_the_points_of_the_background_too(tmp_path: Path) -> None:
+    """They were found with them: that few lie on the object makes no camera less sure."""
+    run(with_masks("colmap", tmp_path / "source", ball), tmp_path)
+    judged = json.loads((tmp_path / "poses/verdict.json").read_text())["points"]
+    assert judged == len(captures.sparse_points())
+    assert len(scene.read_points(tmp_path / "poses").xyz) < judged
+
+
 @pytest.mark.parametrize(
     ("levels", "suffix", "expected"),
     [
