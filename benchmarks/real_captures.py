@@ -87,7 +87,7 @@ def row_of(folder: Path, work: Path, reference: dict[str, np.ndarray] | None) ->
     if done[0]["exit_code"] == 0:
         verdict = json.loads((runs[0] / "poses" / "verdict.json").read_text(encoding="utf-8"))
         row |= {"registered": verdict["registered"], "grade": verdict["grade"], "problems": [problem["what"] for problem in verdict["problems"]]}
-        row["processor_seconds"] = json.loads((runs[0] / "poses" / "manifest.json").read_text(encoding="utf-8"))["cpu_seconds"]
+        row["processor_seconds"] = round(json.loads((runs[0] / "poses" / "manifest.json").read_text(encoding="utf-8"))["cpu_seconds"], 1)
         row["the_same_again"] = digest_of(runs[0] / "poses") == digest_of(runs[1] / "poses")
         row["percent_off_reference"] = None if reference is None else percent_off(runs[0], reference)
     return row
