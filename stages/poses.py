@@ -145,18 +145,7 @@ def run(job: Job) -> None:
     _say_what_is_cut(framed.facts.get("silhouettes_cut", ()), warn)
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
-    views = tuple(
-        View(
-            image=files.image,
-            mask=files.mask,
-            split=split,
-            camera=world.camera(resized(photo.camera, files.width, files.height)),
-            source_camera=photo.camera,
-            near=float(near),
-            far=float(far),
-        )
-        for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far_planes, strict=True)
-    )
+    views = _views(capture, written, splits, framed)
     if capture.points is not None:
         save_points(replace(capture.points, xyz=world.points(capture.points.xyz)), job.out)
     scene = Scene(
@@ -176,6 +165,23 @@ def run(job: Job) -> None:
     _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
+
+
+def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], framed: Any) -> tuple[View, ...]:
+    """Of the photographs, in the training frame."""
+    world = framed.world_from_capture
+    return tuple(
+        View(
+            image=files.image,
+            mask=files.mask,
+            split=split,
+            camera=world.camera(resized(photo.camera, files.width, files.height)),
+            source_camera=photo.camera,
+            near=float(near),
+            far=float(far),
+        )
+        for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far_planes, strict=True)
+    )
 
 
 def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
