@@ -25,7 +25,7 @@ EVALUATION, AN_EVALUATED_MEGAPIXEL, TEST_SHARE = 40.0, 1.5, 0.125
 A_TURNTABLE, A_TURNTABLE_MEGAPIXEL = 10.0, 0.8
 POINTS = 31.0
 
-BYTES_A_VOXEL = 12.2  # of a file
+BYTES_A_VOXEL, PACKED_BYTES_A_VOXEL = 12.2, 3.0  # of a file; docs/experiments/sfm.md
 BAKED_BYTES_A_VOXEL = 560  # at the peak of baking
 
 
@@ -63,11 +63,12 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
 
 
 def bytes_of(settings: Mapping[str, Any]) -> int:
-    """At the peak of the stages after poses: baking, as a rule."""
+    """At the peak of the stages after poses, where the asset is as large as it may be: baking, as a rule."""
     return int(libraries() + BAKED_BYTES_A_VOXEL * _voxels(settings["bake"]))
 
 
 def _voxels(bake: Any) -> int:
-    """That the asset may hold."""
-    stated = given(bake.max_mib)
-    return int((MAX_MIB if stated is None else stated) * 2**20 / BYTES_A_VOXEL)
+    """That the asset may hold; a packed one has a third of the bytes by default (`stages.baking.resolution.budget_of`)."""
+    packed, stated = bake.layout == "packed", given(bake.max_mib)
+    mib = (MAX_MIB / 3 if packed else MAX_MIB) if stated is None else stated
+    return int(mib * 2**20 / (PACKED_BYTES_A_VOXEL if packed else BYTES_A_VOXEL))

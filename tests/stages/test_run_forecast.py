@@ -64,6 +64,12 @@ def test_networks_that_were_not_measured_are_not_forecast() -> None:
     assert seconds(train__field="nerf") == {}
 
 
+def test_a_packed_asset_holds_more_voxels_in_as_many_bytes_and_takes_longer() -> None:
+    assert seconds(bake__layout="packed", bake__max_mib=8.0, whole=False)["bake"] > 3 * seconds(bake__max_mib=8.0, whole=False)["bake"]
+    packed = {"bake": replace(DEFAULTS["bake"], layout="packed", max_mib=8.0)}
+    assert run_forecast.bytes_of(DEFAULTS | packed) > run_forecast.bytes_of(DEFAULTS | {"bake": replace(DEFAULTS["bake"], max_mib=8.0)})
+
+
 def test_a_larger_asset_takes_more_memory() -> None:
     small, large = (run_forecast.bytes_of(DEFAULTS | {"bake": replace(DEFAULTS["bake"], max_mib=mib)}) for mib in (4.0, 64.0))
     assert 5e8 < small < run_forecast.bytes_of(DEFAULTS) < large

@@ -91,8 +91,8 @@ def in_words(found: dict[str, Any]) -> list[str]:
 def _of_the_run(about: dict[str, Any]) -> str:
     from workflows.cli.progress import duration, size
 
-    room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are"
-    memory = f"about {size(about['run_bytes'])} of memory{room}"
+    room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are: a lower --target-mib takes less"
+    memory = f"up to about {size(about['run_bytes'])} of memory{room}"
     if about["run_seconds"] is None:
         return f"Then training, for as long as --budget says, or 'enerf presets' has it; {memory}."
     longest = sorted(about["stage_seconds"].items(), key=lambda stage: -stage[1])[:3]
