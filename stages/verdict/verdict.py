@@ -311,7 +311,7 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
             "compressed so strongly that blocks of 8 pixels show",
             "Give the originals, not what a messenger or a web page has made of them, or save them at quality 75 or more.",
         ),
-        ("clipped", looks_of.clipped(looks), "black or white in more than 40 % of their pixels", "Expose for the subject; black and white hold no detail."),
+        ("clipped", looks_of.clipped(looks), "black or white in more than 40 % of the pixels", "Expose for the subject; black and white hold no detail."),
     ):
         if names:
             share = len(names) / len(looks)
