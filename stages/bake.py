@@ -266,7 +266,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan, gains: np.ndarray | None) -> 
 
 STAGE = Stage(
     name="bake",
-    version=17,
+    version=18,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

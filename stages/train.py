@@ -179,7 +179,7 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
 
 STAGE = Stage(
     name="train",
-    version=5,
+    version=6,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,

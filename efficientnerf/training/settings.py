@@ -103,8 +103,8 @@ class TrainSettings:
     )
     min_views: Annotated[int, Meta(ge=1, le=64)] | Off = setting(
         2,
-        "Training views that a point of the box must lie in for density to be learned there, in unbounded scenes; a quarter of the views is always enough;"
-        " off: density is learned everywhere.",
+        "Training views that a point of the box, or before it, must lie in for density to be learned there, in unbounded scenes; a quarter of the views is"
+        " always enough; off: density is learned everywhere.",
         advanced=True,
     )
     occupancy_rule: Literal["momentum", "maximum"] = setting(

@@ -200,15 +200,14 @@ def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], ind
 
 
 def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
-    """The voxels that are not close to the path of the training cameras, and that in the box of the field enough training images have in view."""
-    from stages.framing.view_coverage import close_to_path, has_min_views, kept_pixels
+    """The voxels that are not close to the path of the training cameras, and that are not poorly seen."""
+    from stages.framing.view_coverage import close_to_path, kept_pixels, poorly_seen
     from stages.io import scene
 
     views = scene.views_of(s, "train")
     masks = kept_pixels(job.inputs["poses"], views)
     cameras = [view.camera for view in views]
     _, voxel, low = grid
-    box = np.asarray(m.space.bounds, np.float64)
     min_views = given(m.settings.min_views) if m.space.contracted else None
     kept = []
     for at in range(0, len(indices), CENTRES_PER_BLOCK):
@@ -216,8 +215,7 @@ def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> n
         centre = (indices[at : at + CENTRES_PER_BLOCK] + 0.5) * voxel + low
         keep = ~close_to_path(centre, cameras, [view.near for view in views], BAKED_CLEARANCE)
         if min_views is not None:
-            inside = np.flatnonzero(((centre >= box[0]) & (centre <= box[1])).all(axis=1) & keep)
-            keep[inside] = has_min_views(centre[inside], cameras, min_views, masks)
+            keep[keep] = ~poorly_seen(centre[keep], m.space.bounds, cameras, min_views, masks)
         kept.append(keep)
     return indices[np.concatenate(kept)] if kept else indices
 

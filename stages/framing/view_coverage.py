@@ -1,8 +1,8 @@
 """View coverage: how many training views have a point in view.
 
-What one photograph alone shows is explained by density at any distance along its rays. In unbounded scenes, the density voxels in the box that fewer
-than `train.min_views` views have in view are masked; what these views show is learned in the contracted shell instead. Occlusion is not considered.
-See docs/experiments/min-views.md.
+What one photograph alone shows is explained by density at any distance along its rays. In unbounded scenes, the density voxels that fewer than
+`train.min_views` views have in view are masked in the box, and beside it where they would stand before it for a camera; what these views show is learned
+farther away instead. Occlusion is not considered. See docs/experiments/min-views.md.
 
 A view counts only where its mask keeps the pixel: pixels that are left out tell nothing of what lies behind them. In scenes with masks, in every space, the
 density voxels are masked, too, that no view shows by a pixel that is kept, so that nothing fills them.
@@ -37,6 +37,10 @@ CLEARANCE = 0.8  # of the near plane's distance: how far from the cameras' path 
 NEIGHBOURS = 8  # of a camera that its path leads to, where they are within twice the near plane's distance
 NEAR_BLOCK = 2  # density voxels along a side of the blocks before the near planes
 MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is required
+NEAREST = 0.1  # share of the cameras that may be nearer to the box's centre than what counts as standing before it
+BEFORE = 0.75  # of the depth of the box's centre: what is nearer to a camera stands before the box
+WIDENED = 1.5  # times a picture's sides: what misses the picture by no more is what cameras beside this one see before the box
+FEW_BLOCK = 2  # density voxels along a side of the blocks beside the box that few views show
 
 
 def kept_pixels(folder: Path, views: Sequence[View]) -> Masks | None:
@@ -48,14 +52,51 @@ def kept_pixels(folder: Path, views: Sequence[View]) -> Masks | None:
 
 
 def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: int, side: int, masks: Masks | None = None) -> np.ndarray:
-    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those in the box that `has_min_views` is false for."""
+    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those that are `poorly_seen`. Beside the box the middles of blocks of FEW_BLOCK
+    voxels a side decide: what is there is larger, for it is contracted."""
+    import torch
+
+    count = -(-side // FEW_BLOCK)
+    lattice = np.minimum((np.arange(count) + 0.5) * (FEW_BLOCK / side), 1.0)
+    grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    out = poorly_seen(space.world(torch.from_numpy(grid)).numpy(), space.bounds, cameras, min_views, masks).reshape((count,) * 3)
+    for axis in range(3):
+        out = np.repeat(out, FEW_BLOCK, axis)
+    out = out[:side, :side, :side]
     centre = (np.arange(side) + 0.5) / side * (2 * space.reach) - space.reach  # contraction is the identity in the box
     inside = np.flatnonzero(np.abs(centre) <= 1)
-    out = np.zeros((side, side, side), bool)
     unit = np.stack(np.meshgrid(*(centre[inside],) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     few = ~has_min_views(unit * space.half + space.centre, cameras, min_views, masks)
     out[np.ix_(inside, inside, inside)] = few.reshape((len(inside),) * 3)
     return out
+
+
+def poorly_seen(points: np.ndarray, bounds: np.ndarray, cameras: Sequence[Camera], min_views: int, masks: Masks | None = None) -> np.ndarray:
+    """(N,) bool: at which points (N, 3) of the world density would be a guess that cameras between the given ones may see: those that `has_min_views` is
+    false for, in the box `bounds` (2, 3), or beside it where a camera that just misses them (`stands_before`) would have them before the box. Farther from its
+    centre than nine in ten of the cameras nothing is asked. A wall that one view shows beside the subject is as far away as the subject, and stays."""
+    low, high = np.asarray(bounds, np.float64)
+    middle = (low + high) / 2
+    reach = np.quantile([np.linalg.norm(camera.centre - middle) for camera in cameras], NEAREST)
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    at = np.flatnonzero(inside | (np.linalg.norm(points - middle, axis=1) < reach))
+    at = at[~has_min_views(points[at], cameras, min_views, masks)]
+    found = inside[at]
+    for camera in cameras:
+        left = np.flatnonzero(~found)
+        found[left] = stands_before(points[at[left]], camera, middle)
+    out = np.zeros(len(points), bool)
+    out[at[found]] = True
+    return out
+
+
+def stands_before(points: np.ndarray, camera: Camera, middle: np.ndarray) -> np.ndarray:
+    """(N,) bool: which points (N, 3) are nearer to a camera than BEFORE of the depth of `middle` (3,), beside its picture, within WIDENED times its sides."""
+    pixels, depth = project(camera, points)
+    size = np.array([camera.width, camera.height])
+    with np.errstate(invalid="ignore"):
+        off = np.abs(pixels / size * 2 - 1).max(axis=1)  # 1 at the border
+        return np.asarray((depth > 0) & (depth < BEFORE * float((middle - camera.centre) @ camera.forward)) & (off > 1) & (off <= WIDENED))
 
 
 def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int, masks: Masks | None = None) -> np.ndarray:
@@ -67,7 +108,8 @@ def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int,
     count = np.zeros(len(points), np.int32)
     undecided = np.arange(len(points) if needed > 1 else 0)
     for n in bit_reversed_order(len(cameras)):
-        count[undecided] += in_view(points[undecided], [cameras[n]])[0] if masks is None else shows(points[undecided], cameras[n], masks[n])
+        ahead = undecided[(points[undecided] - cameras[n].centre) @ cameras[n].forward > 0]  # cheaper than to project all
+        count[ahead] += in_view(points[ahead], [cameras[n]])[0] if masks is None else shows(points[ahead], cameras[n], masks[n])
         undecided = undecided[count[undecided] < needed]
     return (count >= needed) | (needed < 2)
 
