@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from pathlib import Path
 
+STAT = Path("/proc/stat")
+
 
 def processor() -> str:
-    """The processor's name."""
+    """The processor's name, with its family and model: names such as AMD EPYC leave the generation open."""
     try:
-        return next(line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or "unknown"
+        lines = Path("/proc/cpuinfo").read_text().split("\n\n", 1)[0].splitlines()
+    except OSError:
+        lines = []
+    said = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    name = said.get("model name") or platform.processor() or "unknown"
+    return f"{name}, family {said['cpu family']}, model {said['model']}" if {"cpu family", "model"} <= said.keys() else name
+
+
+def busy_seconds() -> float | None:
+    """Seconds that the processors have worked since the machine began, for whatever program; None where the system does not say."""
+    try:
+        user, nice, system, _idle, _wait, interrupts, soft = (int(word) for word in STAT.read_text().split("\n", 1)[0].split()[1:8])
+    except (OSError, ValueError):
+        return None
+    return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")

@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 OURS = "efficientnerf"
 PACKAGES = ("pipeline", "efficientnerf", "stages", "workflows")
+OTHERS = 0.1  # cores that other programs may take of a row that counts as undisturbed
 NAMED_BY = ("method", "set", "minutes", "options")
 COLUMNS = ("scene", "method", "minutes", "PSNR / dB", "SSIM", "MB", "peak MiB", "seconds", "pixels")
 BEGIN, END = "<!-- begin quality over minutes -->", "<!-- end quality over minutes -->"
@@ -65,7 +66,11 @@ def in_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     versions = {row["code"] for row in rows if row["method"] == OURS}
     if len(versions) > 1:
         lines += ["", f"Rows of {OURS} were measured with {len(versions)} versions of the code: {', '.join(sorted(versions))}."]
-    loaded = [row for row in rows if row["load"][0] > 0.5]
+    disturbed = [row for row in rows if (row.get("others") or 0) > OTHERS]
+    if disturbed:
+        names = ", ".join(f"{row['set']} {row['minutes']:g} ({row['others']:.1f})" for row in disturbed)
+        lines += ["", f"So many cores were busy with other work meanwhile: {names}."]
+    loaded = [row for row in rows if row.get("others") is None and row["load"][0] > 0.5]
     if loaded:
         names = ", ".join(f"{row['set']} {row['minutes']:g}" for row in loaded)
         lines += ["", f"Other work was running at the beginning of: {names}."]

@@ -23,6 +23,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from benchmarks.machine import busy_seconds, processor
 from benchmarks.minutes import OURS, RESULTS, code_version, read_rows, same_row, show, with_row, write_rows
 from benchmarks.stage_runs import cost_of, read_json
 from stages.artifacts import BakeOutputs, EvaluateOutputs
@@ -67,8 +68,10 @@ def row_of(name: str, poses: Path, run: Path, minutes: float, options: Sequence[
     """Copy the run of the cameras, train for so long, bake, evaluate, and read the figures."""
     shutil.rmtree(run, ignore_errors=True)
     shutil.copytree(poses, run, ignore=shutil.ignore_patterns(".lock"))
-    load = os.getloadavg()
+    load, busy = os.getloadavg(), busy_seconds()
     cost = cost_of([*ENERF, "run", "--out", str(run), "--budget", f"{60 * minutes:g}s", "--until", "bake", "--quiet", *options])
+    now = busy_seconds()
+    others = None if busy is None or now is None else round((now - busy - cost["cpu_seconds"]) / cost["seconds"], 2)
     settings = [word for each in EVALUATION for word in ("--set", each)]
     subprocess.run([*ENERF, "run", "--out", str(run), "--until", "evaluate", "--quiet", *settings], check=True)
     status = json.loads(subprocess.run([*ENERF, "status", str(run), "--json"], stdout=subprocess.PIPE, check=True).stdout)
@@ -80,7 +83,8 @@ def row_of(name: str, poses: Path, run: Path, minutes: float, options: Sequence[
         "megabytes": BakeOutputs.of_run(run).asset.stat().st_size / 1e6,
         "peak_mib": max(stage["peak_memory"] for key, stage in stages.items() if key != "evaluate") / 2**20,
         "seconds": stages["train"]["seconds"] + stages["bake"]["seconds"], "stage_seconds": {key: stage["seconds"] for key, stage in stages.items()},
-        "cpu_seconds": cost["cpu_seconds"], "load": load, "versions": {library: version(library) for library in LIBRARIES},
+        "cpu_seconds": cost["cpu_seconds"], "load": load, "others": others, "processor": processor(),
+        "versions": {library: version(library) for library in LIBRARIES},
     }  # fmt: skip
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import minutes, quality_over_minutes
+from benchmarks import machine, minutes, quality_over_minutes
+from benchmarks.machine import busy_seconds
 
 FIGURES = {
     "psnr": 33.456, "ssim": 0.98765, "views": 200, "stride": 1, "megabytes": 12.34, "peak_mib": 1234.5, "seconds": 61.0, "load": (0.1, 0.1, 0.1), "code": "one",
@@ -60,6 +62,27 @@ def test_the_table_says_what_differs_between_rows() -> None:
     assert lines[6].endswith("2 versions of the code: one, two.")
     assert lines[8] == "Other work was running at the beginning of: chair 1."
     assert len(minutes.in_markdown([row()]).splitlines()) == 3
+    measured = [row(load=(2.0, 1, 1), others=0.02), row(budget=5, others=0.94)]
+    assert minutes.in_markdown(measured).splitlines()[4:] == ["", "So many cores were busy with other work meanwhile: chair 5 (0.9)."]
+
+
+@pytest.mark.skipif(not machine.STAT.exists(), reason="no /proc/stat")
+def test_what_processors_worked_grows_by_what_this_process_works() -> None:
+    begin, own = busy_seconds(), time.process_time()
+    assert begin is not None
+    while time.process_time() - own < 0.3:
+        pass
+    end = busy_seconds()
+    assert end is not None
+    assert end - begin > 0.2
+
+
+@pytest.mark.parametrize("text", [None, "", "cpu one two", "cpu 1 2 3"])
+def test_where_the_system_does_not_say_what_processors_worked_there_is_no_figure(text: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if text is not None:
+        (tmp_path / "stat").write_text(text)
+    monkeypatch.setattr(machine, "STAT", tmp_path / "stat")
+    assert busy_seconds() is None
 
 
 @pytest.mark.parametrize("text", ["", minutes.BEGIN, f"{minutes.END} {minutes.BEGIN}", f"{minutes.BEGIN}{minutes.END}{minutes.BEGIN}{minutes.END}"])
