@@ -38,8 +38,8 @@ NEIGHBOURS = 8  # of a camera that its path leads to, where they are within twic
 NEAR_BLOCK = 2  # density voxels along a side of the blocks before the near planes
 MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is required
 NEAREST = 0.1  # share of the cameras that may be nearer to the box's centre than what counts as standing before it
-BEFORE = 0.75  # of the depth of the box's centre: what is nearer to a camera stands before the box
-WIDENED = 1.5  # times a picture's sides: what misses the picture by no more is what cameras beside this one see before the box
+BEFORE, BEHIND = 0.75, 1.1  # of the depth of the box's centre: what is nearer to a camera stands before the box, what is farther away behind it
+WIDENED = 1.5  # times a picture's sides: what misses the picture by no more is what cameras beside this one see
 FEW_BLOCK = 2  # density voxels along a side of the blocks beside the box that few views show
 
 
@@ -73,30 +73,32 @@ def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: in
 
 def poorly_seen(points: np.ndarray, bounds: np.ndarray, cameras: Sequence[Camera], min_views: int, masks: Masks | None = None) -> np.ndarray:
     """(N,) bool: at which points (N, 3) of the world density would be a guess that cameras between the given ones may see: those that `has_min_views` is
-    false for, in the box `bounds` (2, 3), or beside it where a camera that just misses them (`stands_before`) would have them before the box. Farther from its
-    centre than nine in ten of the cameras nothing is asked. A wall that one view shows beside the subject is as far away as the subject, and stays."""
+    false for, in the box `bounds` (2, 3), or beside it before the box for a camera that just misses them and behind it for those that have them in view
+    (`stands_between`). Farther from its centre than nine in ten of the cameras nothing is asked. What one view shows of a wall beside the subject, or of the
+    floor before it, stays."""
     low, high = np.asarray(bounds, np.float64)
     middle = (low + high) / 2
     reach = np.quantile([np.linalg.norm(camera.centre - middle) for camera in cameras], NEAREST)
     inside = ((points >= low) & (points <= high)).all(axis=1)
     at = np.flatnonzero(inside | (np.linalg.norm(points - middle, axis=1) < reach))
     at = at[~has_min_views(points[at], cameras, min_views, masks)]
-    found = inside[at]
-    for camera in cameras:
-        left = np.flatnonzero(~found)
-        found[left] = stands_before(points[at[left]], camera, middle)
     out = np.zeros(len(points), bool)
-    out[at[found]] = True
+    out[at] = inside[at] | stands_between(points[at], cameras, middle)
     return out
 
 
-def stands_before(points: np.ndarray, camera: Camera, middle: np.ndarray) -> np.ndarray:
-    """(N,) bool: which points (N, 3) are nearer to a camera than BEFORE of the depth of `middle` (3,), beside its picture, within WIDENED times its sides."""
-    pixels, depth = project(camera, points)
-    size = np.array([camera.width, camera.height])
-    with np.errstate(invalid="ignore"):
-        off = np.abs(pixels / size * 2 - 1).max(axis=1)  # 1 at the border
-        return np.asarray((depth > 0) & (depth < BEFORE * float((middle - camera.centre) @ camera.forward)) & (off > 1) & (off <= WIDENED))
+def stands_between(points: np.ndarray, cameras: Sequence[Camera], middle: np.ndarray) -> np.ndarray:
+    """(N,) bool: which points (N, 3) a camera has beside its picture, within WIDENED times its sides, nearer than BEFORE of the depth of `middle` (3,), while
+    every camera that has them in view has them farther away than BEHIND of that depth."""
+    before, behind = np.zeros(len(points), bool), np.ones(len(points), bool)
+    for camera in cameras:
+        pixels, depth = project(camera, points)
+        subject = float((middle - camera.centre) @ camera.forward)
+        with np.errstate(invalid="ignore"):
+            off = np.abs(pixels / (camera.width, camera.height) * 2 - 1).max(axis=1)  # 1 at the picture's border
+            before |= (depth > 0) & (depth < BEFORE * subject) & (off > 1) & (off <= WIDENED)
+            behind &= ~((depth > 0) & (depth < BEHIND * subject) & (off <= 1))
+    return before & behind
 
 
 def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int, masks: Masks | None = None) -> np.ndarray:
