@@ -81,8 +81,8 @@ class BakeSettings:
     max_mib: Annotated[float, Meta(gt=0.0)] | Auto = setting(
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
-        " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed; less where voxels as fine as pixels"
-        " resolve are fewer, or where time_budget is too short for as many.",
+        " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed, whose codes"
+        " become finer with more, not its voxels; less where voxels as fine as pixels resolve are fewer, or where time_budget is too short for as many.",
         unit="MiB",
     )
     layout: Literal["compact", "packed", "small", "sparse"] = setting(
@@ -156,6 +156,7 @@ def run(job: Job) -> None:
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
     mib, views = _size_limit(job, s, whole=whole), scene.views_of(s, "train")
+    most = given(settings.max_mib) or mib  # of the file
     phases = schedule.PHASES
     splits = schedule.count_splits(phases)
     pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole))
@@ -174,12 +175,12 @@ def run(job: Job) -> None:
     outputs = BakeOutputs(job.out)
     tree = tree.with_metadata(provenance=provenance)
     if settings.layout == "packed":
-        tree, psnr = packed_tree(job, tree, targets, int(mib * 2**20) - PSNR_BYTES)
+        tree, psnr = packed_tree(job, tree, targets, int(most * 2**20) - PSNR_BYTES)
         metrics["training_psnr"] = report["psnr_written"] = round(psnr, 3)
     format.save(tree, outputs.asset, settings.layout)
     found: dict[str, Any] = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index)}
     found |= {"bytes": outputs.asset.stat().st_size, "optimisation": report}
-    found |= {"voxels_along_longest_side": plan.choice.resolution, "resolution_decided_by": plan.choice.why, "max_mib": mib}
+    found |= {"voxels_along_longest_side": plan.choice.resolution, "resolution_decided_by": plan.choice.why, "max_mib": most}
     if whole:
         found |= {"cascades": np.bincount(voxel_cascades(tree), minlength=len(plan.grids)).tolist(), "voxel": tree.voxel}
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
@@ -197,7 +198,8 @@ def check(settings: Mapping[str, Any]) -> None:
 
 
 def _size_limit(job: Job, s: Scene, *, whole: bool) -> float:
-    """MiB that the asset may have; where it is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other cores."""
+    """MiB that voxels are chosen by; where the size is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other
+    cores."""
     from stages.baking.resolution import size_limits
     from stages.cores import count_cores
     from stages.scratch import note, noted
@@ -206,7 +208,7 @@ def _size_limit(job: Job, s: Scene, *, whole: bool) -> float:
     seconds = given(settings.time_budget)
     mib, timed = size_limits(settings, s, job.device, count_cores(), whole=whole)
     if seconds is None or settings.max_mib != "auto" or job.device != "cpu":
-        return mib
+        return timed
     found = noted(job.work / SIZE_NOTE, float, job.warn)
     if found is not None:
         return found
@@ -266,7 +268,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan, gains: np.ndarray | None) -> 
 
 STAGE = Stage(
     name="bake",
-    version=18,
+    version=19,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

@@ -70,5 +70,6 @@ def bytes_of(settings: Mapping[str, Any]) -> int:
 def _voxels(bake: Any) -> int:
     """That the asset may hold; a packed one has a third of the bytes by default (`stages.baking.resolution.budget_of`)."""
     packed, stated = bake.layout == "packed", given(bake.max_mib)
-    mib = (MAX_MIB / 3 if packed else MAX_MIB) if stated is None else stated
+    usual = MAX_MIB / 3 if packed else MAX_MIB
+    mib = usual if stated is None else min(stated, usual) if packed and bake.resolution == "auto" else stated
     return int(mib * 2**20 / (PACKED_BYTES_A_VOXEL if packed else BYTES_A_VOXEL))

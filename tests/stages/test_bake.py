@@ -27,7 +27,7 @@ from pipeline.stage import Job
 from stages import bake, train
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
-from stages.baking import checkpoint, memory, refinement, resolution
+from stages.baking import checkpoint, economy, memory, refinement, resolution
 from stages.evaluation.views import ground_truth
 from stages.figures import plots
 from stages.io.field_file import load_renderer, save_model
@@ -377,6 +377,29 @@ def test_a_packed_asset_keeps_to_a_part_of_a_mib_and_says_what_its_codes_show(in
     assert about["layout"] == "packed"
     assert about["provenance"]["metrics"]["training_psnr"] == report["optimisation"]["psnr_written"]
     assert report["optimisation"]["psnr_written"] > report["optimisation"]["psnr_after"] - 3
+
+
+def test_bytes_beyond_the_usual_size_of_a_packed_asset_give_no_more_voxels(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def use(size: float) -> None:
+        monkeypatch.setattr(resolution, "budget_of", lambda s, stated, packed=False: stated or (size if packed else 3 * size))
+
+    use(0.018)
+    s, stated = load(inputs["poses"]), BakeSettings(layout="packed", max_mib=0.2)
+    assert resolution.size_limits(stated, s, "cpu", 2, whole=False) == (0.2, 0.018)
+    assert resolution.size_limits(dataclasses.replace(stated, max_mib=0.01), s, "cpu", 2, whole=False) == (0.01, 0.01)
+    for more in (dataclasses.replace(stated, resolution=40), dataclasses.replace(stated, layout="compact")):
+        assert resolution.size_limits(more, s, "cpu", 2, whole=False) == (0.2, 0.2)
+    use(0.1)
+    asked: list[float] = []
+    plan, pack = bake._plan, economy.packed_tree
+    monkeypatch.setattr(bake, "_plan", lambda job, m, s, pixels, mib, *rest, **named: asked.append(mib) or plan(job, m, s, pixels, mib, *rest, **named))
+    monkeypatch.setattr(economy, "packed_tree", lambda job, tree, targets, size: asked.append(size / 2**20) or pack(job, tree, targets, size))
+    made = job(tmp_path, dataclasses.replace(stated, samples_per_voxel=1, visibility_rays=4000, refine_steps=2, refine_rays_per_batch=512), **inputs)
+    run(made)
+    report = json.loads((made.out / "report.json").read_text())
+    assert asked == [0.1, pytest.approx(0.2, abs=1e-4)]
+    assert report["max_mib"] == 0.2
+    assert (made.out / BakeOutputs.asset).stat().st_size == report["bytes"] <= 0.2 * 2**20
 
 
 def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: Path, inputs: dict[str, Path]) -> None:
