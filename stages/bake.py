@@ -155,7 +155,7 @@ def run(job: Job) -> None:
     _refuse_nerf(m.settings)
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
-    mib, views = _size_limit(job, s, whole=whole), scene.views_of(s, "train")
+    mib, views = _size_limit(job, s, whole=whole, discretise=given(m.settings.discretise)), scene.views_of(s, "train")
     most = given(settings.max_mib) or mib  # of the file
     phases = schedule.PHASES
     splits = schedule.count_splits(phases)
@@ -197,7 +197,7 @@ def check(settings: Mapping[str, Any]) -> None:
         _refuse_nerf(settings["train"])
 
 
-def _size_limit(job: Job, s: Scene, *, whole: bool) -> float:
+def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> float:
     """MiB that voxels are chosen by; where the size is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other
     cores."""
     from stages.baking.resolution import size_limits
@@ -206,7 +206,7 @@ def _size_limit(job: Job, s: Scene, *, whole: bool) -> float:
 
     settings: BakeSettings = job.settings
     seconds = given(settings.time_budget)
-    mib, timed = size_limits(settings, s, job.device, count_cores(), whole=whole)
+    mib, timed = size_limits(settings, s, job.device, count_cores(), whole=whole, discretise=discretise)
     if seconds is None or settings.max_mib != "auto" or job.device != "cpu":
         return timed
     found = noted(job.work / SIZE_NOTE, float, job.warn)

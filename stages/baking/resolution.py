@@ -124,13 +124,13 @@ def timed_budget(mib: float, seconds: float, cores: int, *, whole: bool, packed:
     return min(mib, timed / 3 if packed else timed)
 
 
-def size_limits(settings: BakeSettings, s: Scene, device: str, cores: int, *, whole: bool) -> tuple[float, float]:
+def size_limits(settings: BakeSettings, s: Scene, device: str, cores: int, *, whole: bool, discretise: int | None = None) -> tuple[float, float]:
     """MiB that an asset may have; and those that its voxels are chosen by: where the size is left to us, no more than can be refined in bake.time_budget. A
-    packed asset has no more voxels than the default size would give it, unless bake.resolution is stated: bytes beyond that go into finer codes. See
-    docs/experiments/packed.md."""
+    packed asset has no more voxels than the default size would give it, unless bake.resolution or train.discretise is stated: bytes beyond
+    that go into finer codes. See docs/experiments/packed.md."""
     packed, seconds = settings.layout == "packed", given(settings.time_budget)
     mib = budget_of(s, given(settings.max_mib), packed=packed)
-    if settings.max_mib != "auto" and packed and settings.resolution == "auto":
+    if settings.max_mib != "auto" and packed and (given(settings.resolution) or discretise) is None:
         return mib, min(mib, budget_of(s, None, packed=True))
     if seconds is None or settings.max_mib != "auto" or device != "cpu":
         return mib, mib

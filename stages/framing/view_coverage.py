@@ -1,8 +1,8 @@
 """View coverage: how many training views have a point in view.
 
 What one photograph alone shows is explained by density at any distance along its rays. In unbounded scenes, the density voxels that fewer than
-`train.min_views` views have in view are masked in the box, and beside it where they would stand before it for a camera; what these views show is learned
-farther away instead. Occlusion is not considered. See docs/experiments/min-views.md.
+`train.min_views` views have in view are masked in the box; and beside it where they would stand before it for a camera that just misses them, and behind it
+for those that show them. What these views show is learned farther away instead. Occlusion is not considered. See docs/experiments/min-views.md.
 
 A view counts only where its mask keeps the pixel: pixels that are left out tell nothing of what lies behind them. In scenes with masks, in every space, the
 density voxels are masked, too, that no view shows by a pixel that is kept, so that nothing fills them.

@@ -104,7 +104,7 @@ def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
     s = load_scene(folder, TrainOutputs.of_run(run).folder)
     views, whole = views_of(s, "train"), constant_background(s) is None
     trained = with_auto_sizes(settings["train"], s, count_pixels(views))
-    mib = size_limits(own, s, device, count_cores(), whole=whole)[1]
+    mib = size_limits(own, s, device, count_cores(), whole=whole, discretise=given(trained.discretise))[1]
     splits = schedule.count_splits(schedule.PHASES)
     known = Trained(trained, space_of(s), trained.sh_degree)
     _, voxels, at_most = most_needed(own, known, s, views, channels_of(folder, views), mib, splits, whole, device)

@@ -389,6 +389,7 @@ def test_bytes_beyond_the_usual_size_of_a_packed_asset_give_no_more_voxels(input
     assert resolution.size_limits(dataclasses.replace(stated, max_mib=0.01), s, "cpu", 2, whole=False) == (0.01, 0.01)
     for more in (dataclasses.replace(stated, resolution=40), dataclasses.replace(stated, layout="compact")):
         assert resolution.size_limits(more, s, "cpu", 2, whole=False) == (0.2, 0.2)
+    assert resolution.size_limits(stated, s, "cpu", 2, whole=False, discretise=20) == (0.2, 0.2)
     use(0.1)
     asked: list[float] = []
     plan, pack = bake._plan, economy.packed_tree
