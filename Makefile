@@ -6,7 +6,7 @@
 # make faults    let each file operation of a run fail, by five errors: half an hour on two cores (make faults JOBS=2)
 # make fuzz      100,000 damaged inputs to each reader; FUZZ_OPTIONS go to benchmarks/fuzz; `pip install -e '.[fuzz]'` guides it by coverage
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
-# make gpu-packages   the packages that `make gpu` needs beside torch, Triton and numba, into build/gpu-packages: for a machine without a package index
+# make gpu-packages   wheels that `make gpu` needs besides torch, Triton and numba, into build/gpu-packages: for a machine without a package index
 # make viewer-page   write docs/still_life_viewer.html, which the README links: ten minutes on two cores
 # make docs      rewrite the pages under docs/ that are made from the code
 # make lint      ruff and mypy
@@ -44,12 +44,15 @@ fuzz: $(INSTALLED)
 	$(BIN)/python -m benchmarks.fuzz $(FUZZ_OPTIONS)
 
 # A machine with a device often has a python whose torch sees it, and no way to a package index: then that one is used, and nothing is installed.
-# What it lacks beside them is read from build/gpu-packages, which `make gpu-packages` fills elsewhere, for python GPU_PYTHON.
+# What it lacks is installed into build/gpu-site from the wheels in build/gpu-packages, which `make gpu-packages` downloads elsewhere, for python GPU_PYTHON.
 # GPU_OPTIONS go to benchmarks/gpu.py, which ends within ten minutes.
 GPU_PACKAGES := build/gpu-packages
 GPU_PYTHON ?= 3.12
 gpu:
-	@export PYTHONPATH="$(GPU_PACKAGES)$${PYTHONPATH:+:$$PYTHONPATH}"; \
+	@if ls $(GPU_PACKAGES)/*.whl >/dev/null 2>&1; then \
+		$(PYTHON) -m pip install --quiet --no-index --no-deps --upgrade --target build/gpu-site $(GPU_PACKAGES)/*.whl; \
+	fi; \
+	export PYTHONPATH="build/gpu-site$${PYTHONPATH:+:$$PYTHONPATH}"; \
 	if $(PYTHON) -c "import sys, numba, torch, triton; sys.exit(not torch.cuda.is_available())" 2>/dev/null; then \
 		$(PYTHON) -c "import msgspec, platformdirs" || { echo "fill $(GPU_PACKAGES) with 'make gpu-packages' where there is a package index, and bring it here"; exit 1; }; \
 		$(PYTHON) benchmarks/gpu.py $(GPU_OPTIONS); \
@@ -59,7 +62,7 @@ gpu:
 
 gpu-packages:
 	rm -rf $(GPU_PACKAGES)
-	$(PYTHON) -m pip install --quiet --target $(GPU_PACKAGES) --no-deps --only-binary=:all: --python-version $(GPU_PYTHON) --implementation cp \
+	$(PYTHON) -m pip download --quiet --dest $(GPU_PACKAGES) --no-deps --only-binary=:all: --python-version $(GPU_PYTHON) --implementation cp \
 		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt msgspec platformdirs trimesh OpenEXR av fast_simplification
 
 viewer-page: $(INSTALLED)
