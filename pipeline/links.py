@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from pipeline import files
@@ -36,21 +36,24 @@ def is_stage_name(name: str) -> bool:
     return _STAGE.fullmatch(name) is not None
 
 
-def refuse_links(run: Path) -> None:
+def refuse_links(run: Path, stages: Collection[str] | None = None) -> None:
     """Raise CorruptArtifact if a run holds what is neither a file nor a folder under a name that is used; see `failed` where it cannot be listed.
+
+    stages  names of the stages that the run may have; None: all that a stage could have. Other names are not looked at
 
     Takes no lock: what another process removes meanwhile is not there.
     """
     try:
-        for name, status in _used(run):
+        for name, status in _used(run, stages):
             _check(run, name, status)
     except OSError as error:
         raise failed(run, error) from None
 
 
-def _used(run: Path) -> Iterator[tuple[str, os.stat_result]]:
+def _used(run: Path, stages: Collection[str] | None) -> Iterator[tuple[str, os.stat_result]]:
     """(name relative to the run, lstat) of all that the engine or a stage may open, write or delete."""
-    pending = [(name, 1) for name in _names(run) if name in _FILES or name in _FOLDERS or is_stage_name(name)]
+    own = (name for name in _names(run) if name in _FILES or name in _FOLDERS or (is_stage_name(name) if stages is None else name in stages))
+    pending = [(name, 1) for name in own]
     while pending:
         name, depth = pending.pop()
         try:

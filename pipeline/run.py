@@ -85,6 +85,7 @@ class Run:
     settings     stage -> the resolved values of its settings, plain JSON
     memory       bytes that stages may take; None: what the machine has
     resume_text  how to go on with the run, for messages
+    stages       names of the stages that it may have, see `refuse_links`
     """
 
     path: Path
@@ -97,6 +98,7 @@ class Run:
     also: tuple[Path, ...] = ()
     created: float = field(default_factory=time.time)
     resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)
+    stages: frozenset[str] | None = field(default=None, repr=False, compare=False)
     _holds: int = field(default=0, init=False, repr=False, compare=False)
     _lease: Lease | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -132,13 +134,15 @@ class Run:
             raise BadInput(f"{self.path}: exists and is not a run (no {NAME}; it holds {found[0]!r}). Give a new or an empty folder.")
 
     @classmethod
-    def open(cls, path: Path, resume_text: ResumeText = resume_in_words) -> Run:
+    def open(cls, path: Path, resume_text: ResumeText = resume_in_words, stages: frozenset[str] | None = None) -> Run:
         """Read run.json. Raises BadInput if it is no run or one of a newer format, CorruptArtifact if it is damaged or the run holds links."""
         path = _absolute(path)
         if not path.is_dir():
             raise BadInput(f"{path}: {'is not a folder' if files.exists(path) else 'no such folder'}. Give the folder of a run.")
-        refuse_links(path)
-        return cls(path, **_recorded(path), resume_text=resume_text)
+        if not files.exists(path / NAME):
+            raise _no_run(path)  # and nothing in it is looked at
+        refuse_links(path, stages)
+        return cls(path, **_recorded(path), resume_text=resume_text, stages=stages)
 
     def update(self, **changes: Any) -> None:
         """Change source, further sources, settings (all of them), preset, seed, device or memory, and write run.json if that makes a difference.
@@ -196,7 +200,7 @@ class Run:
             finally:
                 self._holds -= 1
             return
-        refuse_links(self.path)  # before the lock's file is opened
+        refuse_links(self.path, self.stages)  # before the lock's file is opened
         with lock(self.path) as self._lease:
             self._holds = 1
             try:
@@ -279,13 +283,17 @@ def _absolute(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
+def _no_run(path: Path) -> BadInput:
+    return BadInput(f"{path}: is not a run (it has no {NAME}).")
+
+
 def _recorded(run: Path) -> dict[str, Any]:
     """What run.json holds, checked."""
     path = run / NAME
     try:
         value = files.read_json(path, limit=16 * 2**20, follow=False)
     except FileNotFoundError:
-        raise BadInput(f"{run}: is not a run (it has no {NAME}).") from None
+        raise _no_run(run) from None
     except files.Unreadable as error:
         if error.denied is not None:
             raise failed(run, error.denied) from None

@@ -7,6 +7,7 @@ links between the two, files are copied.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Collection
 from pathlib import Path
 
 from pipeline import artifact, files, manifest
@@ -33,7 +34,7 @@ def take_over(run: Run, stage: Stage, donor: Path) -> bool:
             decision = decide(stage, run)
             if decision.fresh or decision.request is None:
                 return False
-            made = _made(donor, stage)
+            made = _made(donor, stage, run.stages)
             if made is None or made.request != decision.request:
                 return False
             place = artifact.workplace(run.path, stage.name, decision.request)
@@ -48,9 +49,9 @@ def take_over(run: Run, stage: Stage, donor: Path) -> bool:
     return True
 
 
-def _made(donor: Path, stage: Stage) -> Manifest | None:
+def _made(donor: Path, stage: Stage, stages: Collection[str] | None) -> Manifest | None:
     """The manifest of the donor's artifact, or None where there is none that can be read."""
-    refuse_links(donor)
+    refuse_links(donor, stages)
     with contextlib.suppress(CorruptArtifact):
         return manifest.read_manifest(donor / stage.name)
     return None

@@ -114,13 +114,18 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
         return {"resident": resident(), **program.describe(path)}
     name = request["stage"]
     stage = next(each for each in program.stages if each.name == name)
-    if request.get("donor") and take_over(Run.open(path), stage, Path(request["donor"])):
+    if request.get("donor") and take_over(_opened(program, path), stage, Path(request["donor"])):
         channel.send({"event": "message", "stage": name, "text": f"{name}: taken over from {Path(request['donor']).name}", "time": time.time()})
     memory = None if request["memory"] is None else Limit(request["memory"], "its share of the worker's memory")
-    outcome = run_stages(Run.open(path), program.stages, only=name, device=request["device"], memory=memory, report=channel.send, execute=execute_alone)[0]
+    run = _opened(program, path)
+    outcome = run_stages(run, program.stages, only=name, device=request["device"], memory=memory, report=channel.send, execute=execute_alone)[0]
     surveyed = _survey(program, path)
     made = next(each for each in surveyed if each["name"] == name)
     return {**made, "action": outcome.action, **_estimates(program, path, surveyed, request, channel), **program.describe(path)}
+
+
+def _opened(program: Program, path: Path) -> Run:
+    return Run.open(path, stages=frozenset(stage.name for stage in program.stages))
 
 
 def _estimates(program: Program, path: Path, surveyed: Sequence[dict[str, Any]], request: dict[str, Any], channel: _Channel) -> dict[str, Any]:
@@ -143,7 +148,7 @@ def _estimates(program: Program, path: Path, surveyed: Sequence[dict[str, Any]],
 def _survey(program: Program, path: Path) -> list[dict[str, Any]]:
     """The stages of a run, whether each is up to date, and what it took."""
     stages = []
-    for decision in survey(program.stages, Run.open(path)):
+    for decision in survey(program.stages, _opened(program, path)):
         made = decision.manifest
         facts = {} if made is None else {"seconds": made.seconds, "cpu_seconds": made.cpu_seconds, "peak_memory": made.peak_memory, "digest": made.digest}
         stages.append({"name": decision.stage, "fresh": decision.fresh, "reason": decision.reason, **facts})

@@ -51,7 +51,8 @@ def workflow() -> Workflow:
     """The workflow that `main` was given, or that of this package."""
     from workflows.asset import WORKFLOW
 
-    given: Workflow | None = click.get_current_context().find_root().obj
+    context = click.get_current_context(silent=True)
+    given: Workflow | None = None if context is None else context.find_root().obj
     return given or WORKFLOW
 
 

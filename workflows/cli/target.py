@@ -34,7 +34,13 @@ def open_run(path: Path) -> Run:
     """The run of a folder, whose messages name commands. Raises BadInput and CorruptArtifact."""
     from pipeline.run import Run
 
-    return Run.open(path, resume_command)
+    return Run.open(path, resume_command, _stage_names())
+
+
+def _stage_names() -> frozenset[str]:
+    from workflows.cli.options import workflow
+
+    return frozenset(stage.name for stage in workflow().stages)
 
 
 def is_run(path: Path) -> bool:
@@ -58,7 +64,7 @@ def asset_of(path: Path) -> Path:
     if not path.exists():
         raise BadInput(f"{path}: no such file or folder. Give a run or an asset ({ASSET}).")
     if is_run(path):
-        refuse_links(path)
+        refuse_links(path, _stage_names())
         found = BakeOutputs.of_run(path).asset
         if not found.is_file():
             raise BadInput(f"{path}: has no asset yet. Make it first: enerf run --out {path} --until bake")

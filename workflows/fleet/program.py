@@ -29,9 +29,7 @@ class WorkflowProgram:
     def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
         """As `enerf run` does it: of a run that is there, settings that the manifest does not have become those of its preset again."""
         from workflows.cli.request import Options, plan_run
-        from workflows.cli.target import open_run
-
-        preset = scene["preset"] or (open_run(run).preset if (run / NAME).is_file() else None)
+        preset = scene["preset"] or (self._open(run).preset if (run / NAME).is_file() else None)
         sources = [Path(source) for source in scene["sources"]]
         options = Options(source=sources[0] if sources else None, also=tuple(sources[1:]), preset=preset, seed=scene["seed"], table=scene["settings"])
         plan = plan_run(run, self.workflow, options)
@@ -60,21 +58,25 @@ class WorkflowProgram:
         opened, settings = self._opened(run)
         return self.workflow.memory(stage, run, tuple(opened.sources.values()), settings, device)
 
+    def _open(self, run: Path) -> Run:
+        from workflows.cli.target import resume_command
+
+        return Run.open(run, resume_command, frozenset(stage.name for stage in self.stages))
+
     def _opened(self, run: Path) -> tuple[Run, dict[str, Any]]:
         """A run, and the settings of its stages by their names."""
-        opened = Run.open(run)
+        opened = self._open(run)
         kinds = {each.name: each.settings for each in self.stages}
         return opened, {name: settings_from(kind, opened.settings.get(name, {}), where=name) for name, kind in kinds.items()}
 
     def is_finished(self, run: Path) -> bool:
         from workflows.report.pages import has_pages
 
-        return has_pages(Run.open(run), self.stages)
+        return has_pages(self._open(run), self.stages)
 
     def finish(self, run: Path) -> None:
-        from workflows.cli.target import open_run
         from workflows.report.pages import write_pages
 
-        opened = open_run(run)
+        opened = self._open(run)
         with opened.locked():
             write_pages(opened, self.stages)

@@ -90,3 +90,26 @@ def test_recorded_values_of_any_kind(enerf: Enerf, toys: Path, tmp_path: Path, v
             assert result.code in (0, 2, 4), document
             assert "\x1b[31m" not in result.err + result.out
             assert "Traceback" not in result.err
+
+
+def test_names_that_no_stage_has_are_not_looked_at(enerf: Enerf, toys: Path, tmp_path: Path, canary: Path) -> None:
+    """A user's own link, pipe or folder in a run, under a name that a stage could have."""
+    run = tmp_path / "run"
+    assert enerf("run", toys, "--out", run).code == 0
+    (run / "foo").symlink_to("/etc")
+    os.mkfifo(run / "pipe")
+    (run / "notes").mkdir()
+    (run / "notes" / "link").symlink_to(canary)
+    before = snapshot(canary)
+    for command in (*COMMANDS, *READERS[1:]):
+        assert enerf(*command, run).code == 0, command
+    assert snapshot(canary) == before
+    assert (run / "foo").is_symlink()
+
+
+@pytest.mark.parametrize("command", [*COMMANDS[:3], ("inspect",), ("stage", "train"), ("view", "--no-browser")])
+def test_a_folder_that_is_no_run_is_not_looked_at(enerf: Enerf, tmp_path: Path, canary: Path, command: tuple[str, ...]) -> None:
+    """As /usr is: it holds links under names that a stage could have."""
+    (tmp_path / "usr").mkdir()
+    (tmp_path / "usr" / "train").symlink_to(canary)
+    assert enerf(*command, tmp_path / "usr").code == 2
