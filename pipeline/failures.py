@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.errors import BadInput, DiskFull, Interrupted, PipelineError, StageFailed
+from pipeline.files import NOTHING_FREE
 from pipeline.text import printable
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -16,7 +17,6 @@ _OF_THE_PATH = (
     errno.ENAMETOOLONG, errno.EXDEV, errno.ENXIO, errno.ENODEV, errno.ESPIPE, errno.EBUSY, errno.ETXTBSY,
 )  # fmt: skip
 _FULL_TEXTS = ("no space left on device", "disk quota exceeded", "disk is full", "disk full")  # of libraries that drop the number of the error
-_NOTHING_FREE = 2**16  # bytes
 
 
 def history(error: BaseException) -> Iterator[BaseException]:
@@ -64,7 +64,7 @@ def _full_folder(error: BaseException, run: Path) -> Path | None:
             return Path(name).absolute().parent if isinstance(name, str) else run
         if any(text in str(cause).lower() for text in _FULL_TEXTS):
             return run
-    if not isinstance(error, PipelineError) and shutil.disk_usage(run).free < _NOTHING_FREE:
+    if not isinstance(error, PipelineError) and shutil.disk_usage(run).free < NOTHING_FREE:
         return run  # a library that gave no reason
     return None
 

@@ -26,6 +26,8 @@ SafePoint = Callable[[], None]
 MAX_JSON = 32 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
 MAX_DEPTH = 100  # of nested JSON; whoever walks through a value by recursion stays far from Python's limit
 
+NOTHING_FREE = 2**16  # bytes of a disk that is full
+
 _CONTAINERS = 2**20  # lists and objects that a small file may hold; each takes about a hundred bytes of memory, and two in the file
 _RANDOM = 8  # bytes; nobody guesses the name of a temporary file
 # Names that `atomic` and `discard` give now, and those with a process's number that they gave before release 0.2.
@@ -173,9 +175,12 @@ def atomic(path: Path, *, durable: bool = True) -> Iterator[Path]:
         if durable:
             sync_file(temporary)
         rename(temporary, path)
-    except BaseException:
+    except BaseException as error:
+        full = _disk_full_behind(error, path)
         with contextlib.suppress(OSError):  # the error in flight is the one to report
             temporary.unlink(missing_ok=True)
+        if full is not None:
+            raise full from error
         raise
     if durable:
         sync_folder(path.parent)
@@ -200,11 +205,24 @@ def atomic_together(paths: Sequence[Path]) -> Iterator[list[Path]]:
                 new.append(path)
             rename(temporary, path)
         sync_folder(paths[-1].parent)
-    except BaseException:
+    except BaseException as error:
+        full = _disk_full_behind(error, paths[-1])
         for each in (*temporaries, *new):
             with contextlib.suppress(OSError):  # the error in flight is the one to report
                 each.unlink(missing_ok=True)
+        if full is not None:
+            raise full from error
         raise
+
+
+def _disk_full_behind(error: BaseException, path: Path) -> OSError | None:
+    """The error of a full disk where a library failed without the number of an error, as long as what it has written still fills the disk."""
+    if not isinstance(error, Exception) or (isinstance(error, OSError) and error.errno is not None):
+        return None
+    with contextlib.suppress(OSError):
+        if shutil.disk_usage(path.parent).free < NOTHING_FREE:
+            return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    return None
 
 
 def _created_beside(path: Path) -> Path:

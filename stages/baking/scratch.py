@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -17,8 +18,15 @@ def write_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
     for name, values in arrays.items():
         outputs.append(path.with_name(f"{path.name}_{name}.npy"))
         with atomic(outputs[-1], durable=False) as temporary, open(temporary, "wb") as file:
-            np.save(file, values, allow_pickle=False)
+            _write_array(values, file)
     note(_note(path), list(arrays), outputs)
+
+
+def _write_array(values: np.ndarray, file: BinaryIO) -> None:
+    """The bytes of `np.save`, which writes past Python's file: its errors have no number, and a full disk reads "1501528 requested and 475104 written"."""
+    values = np.asarray(values, order="C")
+    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(values))
+    file.write(values.reshape(-1).view(np.uint8).data)
 
 
 def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]], warn: Warn) -> dict[str, np.ndarray] | None:

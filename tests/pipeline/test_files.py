@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from pipeline import files
+from pipeline.errors import DiskFull
+from pipeline.failures import translated
 
 
 @pytest.mark.parametrize("name", ["a", "a/b.txt", "images/0 1.jpg", "..a", "a..", ".hidden", "a\\b"])
@@ -79,3 +83,31 @@ def test_remove_takes_a_link_and_leaves_its_target(tmp_path: Path) -> None:
     files.discard(tmp_path / "link", tmp_path)
     assert os.listdir(tmp_path) == ["target"]
     files.discard(tmp_path / "none", tmp_path)
+
+
+@pytest.mark.parametrize("error", [OSError("1501528 requested and 475104 written"), RuntimeError("encoder error -2"), ValueError()])
+@pytest.mark.parametrize("together", [False, True])
+def test_the_error_of_a_library_that_drops_its_number_is_a_full_disk_where_nothing_is_free(
+    error: Exception, together: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Looked at before what was written is removed: then there is room again."""
+
+    def disk_usage(folder: Path) -> SimpleNamespace:
+        return SimpleNamespace(free=0 if any(path.stat().st_size for path in tmp_path.iterdir()) else 2**30)
+
+    def write(error: Exception) -> None:
+        with files.atomic_together([tmp_path / "b", tmp_path / "a"]) if together else files.atomic(tmp_path / "a") as found:
+            (found[0] if isinstance(found, list) else found).write_bytes(b"half")
+            raise error
+
+    with pytest.raises(type(error)) as caught:
+        write(error)
+    assert caught.value is error
+    monkeypatch.setattr(files.shutil, "disk_usage", disk_usage)
+    with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)) as full:
+        write(error)
+    assert full.value.errno == errno.ENOSPC
+    assert isinstance(translated(full.value, "bake", tmp_path), DiskFull)
+    assert not any(tmp_path.iterdir())
+    with pytest.raises(PermissionError):
+        write(PermissionError(errno.EACCES, "denied"))
