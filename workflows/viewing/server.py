@@ -2,7 +2,7 @@
 
 Whoever runs on this machine may ask it, a page of another site in this machine's browser too. Hence: it listens on the loopback interface unless told
 otherwise; requests must name it by that (a name that was made to point here, DNS rebinding, is refused); no other site may embed or read its answers; no
-part of a request becomes part of a path; files are opened from the run's folder downwards, through no link.
+part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; who is slow keeps nobody else waiting.
 """
 
 from __future__ import annotations
@@ -14,18 +14,23 @@ import shutil
 import socket
 import stat
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from pipeline.errors import UsageError
 
 LOOPBACK = "127.0.0.1"
-TIMEOUT = 20.0  # seconds that a browser may take for its next bytes
-MOST_AT_ONCE = 32  # requests
+READING = 10.0  # seconds that a request may take to come
+SENDING, SLOWEST = 20.0, 2**15  # seconds, and bytes a second, that its answer may take to go
+MOST_AT_ONCE, MOST_OF_A_PEER = 32, 16  # connections; a browser opens six. Who comes then takes the place of the oldest
+MOST_THREADS = 2 * MOST_AT_ONCE  # those that are hung up on may still be at work on an answer
 HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -52,6 +57,14 @@ class Answer:
     policy: str = NOTHING
 
 
+@dataclass
+class _Connection:
+    """peer: its address; due: when it is hung up on, None while its answer is made"""
+
+    peer: str
+    due: float | None
+
+
 Site = Callable[[str], Answer | None]  # the answer to a path, as the request spells it; None: there is none
 
 
@@ -65,10 +78,13 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
     allow_reuse_address = True
+    request_queue_size = 128  # connections that wait to be taken; with Python's five, those of a burst try again after seconds
 
     def __init__(self, site: Site, address: str, port: int) -> None:
         self.site, self.address = site, address
-        self.slots = threading.BoundedSemaphore(MOST_AT_ONCE)
+        self.slots = threading.BoundedSemaphore(MOST_THREADS)
+        self._open: dict[socket.socket, _Connection] = {}  # the oldest first
+        self._opened = threading.Lock()
         self.address_family = socket.AF_INET6 if ":" in address else socket.AF_INET
         try:
             super().__init__((address, port), _Handler)
@@ -93,17 +109,53 @@ class Server(ThreadingHTTPServer):
         if not self.slots.acquire(blocking=False):
             self.shutdown_request(request)
             return
+        with self._opened:
+            self._make_room(client_address[0])
+            self._open[request] = _Connection(client_address[0], time.monotonic() + READING)
         try:
             super().process_request(request, client_address)
         except BaseException:
-            self.slots.release()
+            self._forget(request)
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.slots.release()
+            self._forget(request)
+
+    def _forget(self, request: socket.socket) -> None:
+        with self._opened:
+            self._open.pop(request, None)
+        self.slots.release()
+
+    def _make_room(self, peer: str) -> None:
+        """Hang up on the oldest connection of a peer that has as many as it may, or of who has most where there are as many as may be."""
+        peers = Counter(each.peer for each in self._open.values())
+        if peers[peer] < MOST_OF_A_PEER:
+            if len(self._open) < MOST_AT_ONCE:
+                return
+            peer = peers.most_common(1)[0][0]
+        self._hang_up(next(request for request, each in self._open.items() if each.peer == peer))
+
+    def _hang_up(self, request: socket.socket) -> None:
+        """What its thread reads ends, and what it writes fails."""
+        del self._open[request]
+        with suppress(OSError):
+            request.shutdown(socket.SHUT_RDWR)
+
+    def service_actions(self) -> None:
+        """Now and then: hang up on those whose time is over."""
+        now = time.monotonic()
+        with self._opened:
+            for request in [request for request, each in self._open.items() if each.due is not None and each.due < now]:
+                self._hang_up(request)
+
+    def set_due(self, request: socket.socket, seconds: float | None) -> None:
+        """When a connection is hung up on: so many seconds from now."""
+        with self._opened:
+            if (found := self._open.get(request)) is not None:
+                found.due = None if seconds is None else time.monotonic() + seconds
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that goes away is no news."""
@@ -131,10 +183,10 @@ class _Handler(BaseHTTPRequestHandler):
     """One request, one answer, and the connection is closed."""
 
     server: Server
-    timeout: ClassVar[float] = TIMEOUT
     protocol_version = "HTTP/1.0"
 
     def do_GET(self) -> None:
+        self.server.set_due(self.connection, None)
         hosts = self.headers.get_all("Host") or []
         if len(hosts) != 1 or not self.server.is_named(hosts[0]):
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
@@ -161,6 +213,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
         try:
             length = len(answer.data) if answer.file is None else os.fstat(answer.file).st_size
+            self.server.set_due(self.connection, SENDING + length / SLOWEST)
             self.close_connection = True
             self.send_response_only(status)
             allowed = {"Allow": "GET, HEAD"} if status is HTTPStatus.METHOD_NOT_ALLOWED else {}

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -132,7 +133,7 @@ def test_an_error_of_its_own_is_not_told(ask: Ask) -> None:
 
 
 def test_one_that_says_nothing_keeps_nobody_else_waiting(server: Server, ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server_module._Handler, "timeout", 0.2)
+    monkeypatch.setattr(server_module, "READING", 0.2)
     with socket.create_connection(server.server_address[:2], timeout=10) as silent:
         silent.sendall(b"GET / HT")
         assert ask()[0] == 200
@@ -140,14 +141,62 @@ def test_one_that_says_nothing_keeps_nobody_else_waiting(server: Server, ask: As
 
 
 def test_more_than_it_answers_at_once_are_turned_away_and_later_welcome(server: Server, ask: Ask) -> None:
-    held = [server.slots.acquire(blocking=False) for _ in range(server_module.MOST_AT_ONCE)]
+    held = [server.slots.acquire(blocking=False) for _ in range(server_module.MOST_THREADS)]
     assert all(held)
     with socket.create_connection(server.server_address[:2], timeout=10) as late:
         assert late.recv(10) == b""
     for _ in held:
         server.slots.release()
-    for _ in range(2 * server_module.MOST_AT_ONCE):
+    for _ in range(2 * server_module.MOST_THREADS):
         assert ask()[0] == 200, "a slot is given back after each"
+
+
+def test_slow_connections_keep_no_other_request_waiting(server: Server, ask: Ask) -> None:
+    """As many as it ever answered at once, and more: none of them says all that it has to."""
+    with ExitStack() as held:
+        slow = [held.enter_context(socket.create_connection(server.server_address[:2], timeout=10)) for _ in range(3 * server_module.MOST_AT_ONCE)]
+        for connection in slow:
+            with suppress(OSError):  # of those that others have taken the place of
+                connection.sendall(b"GET / HTTP/1.1\r\nHost: local")
+        assert [ask()[0] for _ in range(3)] == [200] * 3
+        assert slow[0].recv(10) == b"", "the oldest was hung up on"
+
+
+def test_a_request_that_comes_byte_by_byte_is_hung_up_on(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "READING", 0.3)
+    with socket.create_connection(server.server_address[:2], timeout=0.05) as slow:
+        for _ in range(1000):
+            try:
+                slow.sendall(b"G")
+                if slow.recv(10) == b"":
+                    return
+            except TimeoutError:
+                continue
+            except OSError:
+                return
+    raise AssertionError("it is still listened to")
+
+
+def test_an_answer_that_nobody_takes_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "SENDING", 0.1)
+    monkeypatch.setattr(server_module, "SLOWEST", 2**40)
+    with Server(lambda path: Answer("text/plain", bytes(2**26)), LOOPBACK, 0) as made:
+        threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        with socket.create_connection(made.server_address[:2], timeout=20) as idle:
+            idle.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            for _ in range(server_module.MOST_THREADS):
+                assert made.slots.acquire(timeout=20), "its thread has ended"
+        made.shutdown()
+
+
+def test_who_opens_many_connections_takes_no_others_place(server: Server) -> None:
+    """Peers of other addresses: the loopback interface has many."""
+    with ExitStack() as held:
+        first = held.enter_context(socket.create_connection(server.server_address[:2], timeout=10, source_address=("127.0.0.2", 0)))
+        for _ in range(3 * server_module.MOST_AT_ONCE):
+            held.enter_context(socket.create_connection(server.server_address[:2], timeout=10))
+        first.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert first.recv(8) == b"HTTP/1.0"
 
 
 def test_a_port_that_is_taken_is_refused(server: Server) -> None:
@@ -200,7 +249,7 @@ def test_an_open_file_is_sent_and_closed(tmp_path: Path) -> None:
         with socket.create_connection(made.server_address[:2], timeout=10) as gone:
             gone.sendall(b"GET /x HTTP/1.1\r\nHost: localhost\r\n\r\n")
         deadline = time.monotonic() + 10
-        while (len(sent) < 3 or made.slots._value < server_module.MOST_AT_ONCE) and time.monotonic() < deadline:  # type: ignore[attr-defined]
+        while (len(sent) < 3 or made.slots._value < server_module.MOST_THREADS) and time.monotonic() < deadline:  # type: ignore[attr-defined]
             time.sleep(0.01)
         made.shutdown()
     assert len(sent) == 3
