@@ -1,4 +1,4 @@
-"""The captured cameras as an asset keeps them (metadata `captured_path`), and the part of the sphere round a subject that they cover."""
+"""The captured cameras as an asset keeps them (metadata `captured_path`), where their axes meet, and the part of the sphere round a subject that they cover."""
 
 from __future__ import annotations
 
@@ -114,3 +114,19 @@ def coverage(centres: np.ndarray, target: np.ndarray) -> Coverage:
         heading=float((heading + 180.0) % 360.0 - 180.0),
         arc=360.0 if closed else float(last - first),
     )
+
+
+def meeting_point(cameras: Sequence[Camera]) -> tuple[np.ndarray, bool]:
+    """The point (3,) nearest to all view axes, and whether they meet there, before the cameras and from different sides."""
+    centres, forward = np.array([camera.centre for camera in cameras]), np.array([camera.forward for camera in cameras])
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (C, 3, 3)
+    point = centres.mean(axis=0)
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < 0.03:  # about 10 degrees apart
+        return point, False
+    weight = np.ones(len(cameras))
+    for _ in range(20):
+        point = np.linalg.solve((weight[:, None, None] * across).sum(0), (weight[:, None, None] * across @ centres[:, :, None]).sum(0)[:, 0])
+        miss = np.linalg.norm((across @ (point - centres)[:, :, None])[..., 0], axis=1)
+        weight = 1 / (1 + (miss / max(float(np.median(miss)), 1e-12)) ** 2)
+    ahead = ((point - centres) * forward).sum(axis=1)
+    return point, bool((ahead > 0).mean() >= 0.8 and np.median(miss) < 0.5 * np.median(np.linalg.norm(point - centres, axis=1)))

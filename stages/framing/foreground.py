@@ -17,6 +17,7 @@ import numpy as np
 
 from efficientnerf.asset.region import Region, inside_distance
 from efficientnerf.geometry.cameras import Camera
+from stages.framing.captured import meeting_point
 from stages.framing.cells import CENTRAL, CONNECTED, Cells, connected_parts, observed_cells
 from stages.framing.supports import Plane, find_supports, rays_that_end, with_feet
 
@@ -140,28 +141,12 @@ def find_focus(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, camera
     reach = float(np.median(reaches))
     # The points that are seen lie on the surface, towards their cameras. Where they go with the cameras there is no subject.
     centres = np.array([camera.centre for camera in cameras])
-    focus, converging = _meeting_point(cameras)
+    focus, converging = meeting_point(cameras)
     off = np.median(np.linalg.norm(np.array(seen) - np.median(seen, axis=0), axis=1))
     if not converging:
         focus = np.median(seen, axis=0)
         converging = bool(off <= 0.35 * reach and off <= 0.5 * max(float(np.median(np.linalg.norm(centres - focus, axis=1))), 1e-9))
     return focus, reach, converging
-
-
-def _meeting_point(cameras: Sequence[Camera]) -> tuple[np.ndarray, bool]:
-    """The point nearest to all view axes, and whether they meet there, before the cameras and from different sides."""
-    centres, forward = np.array([camera.centre for camera in cameras]), np.array([camera.forward for camera in cameras])
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (C, 3, 3)
-    point = centres.mean(axis=0)
-    if np.linalg.eigvalsh(across.mean(axis=0))[0] < 0.03:  # about 10 degrees apart
-        return point, False
-    weight = np.ones(len(cameras))
-    for _ in range(20):
-        point = np.linalg.solve((weight[:, None, None] * across).sum(0), (weight[:, None, None] * across @ centres[:, :, None]).sum(0)[:, 0])
-        miss = np.linalg.norm((across @ (point - centres)[:, :, None])[..., 0], axis=1)
-        weight = 1 / (1 + (miss / max(float(np.median(miss)), 1e-12)) ** 2)
-    ahead = ((point - centres) * forward).sum(axis=1)
-    return point, bool((ahead > 0).mean() >= 0.8 and np.median(miss) < 0.5 * np.median(np.linalg.norm(point - centres, axis=1)))
 
 
 def _all_round(centres: np.ndarray, focus: np.ndarray) -> bool:

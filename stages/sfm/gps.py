@@ -50,7 +50,7 @@ def robust_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
 
 
 def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]:
-    """The capture in metres, and with the upward axis of the earth, as far as GPS positions determine them; and a sentence, empty without positions.
+    """The capture in metres, and with the upward axis of the earth, as far as GPS positions determine them; and a sentence, empty where they are not used.
 
     files  of the photographs, by name
     """
@@ -64,15 +64,14 @@ def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]
             positions[photo.camera.name] = position
     if not positions:
         return capture, ""
-    words = f"{len(positions)} of {len(capture.photos)} photographs have a GPS position"
     if len(positions) < max(FEWEST, len(capture.photos) / 2):
-        return _with_facts(capture, {"photographs": len(positions), "used": "nothing"}), f"{words}: too few to be used."
+        return _with_facts(capture, {"photographs": len(positions), "used": "nothing"}), ""
     places = enu_from_gps(np.array([positions[photo.camera.name] for photo in capture.photos if photo.camera.name in positions]))
     aligned, distance, extent, straight = _aligned(capture, [*positions], places)
     facts: dict[str, object] = {"photographs": len(positions), "extent": round(extent, 3), "distance": round(distance, 3)}
-    words += f", {distance:.2g} m from the cameras found in the median"
     if not distance <= SCALE * extent or aligned.scale <= 0:
-        return _with_facts(capture, facts | {"used": "nothing"}), f"{words}: too far for an extent of {extent:.2g} m, and not used."
+        return _with_facts(capture, facts | {"used": "nothing"}), ""
+    words = f"{len(positions)} of {len(capture.photos)} photographs have a GPS position, {distance:.2g} m from the cameras found in the median"
     if distance > UP * extent or straight:
         scaled = Similarity(aligned.scale, np.eye(3), np.zeros(3))
         return _moved(_with_facts(capture, facts | {"used": "scale"}), scaled), f"{words}: the scale is taken from them."

@@ -29,7 +29,8 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
 from stages.sfm.images import Callables, Masks, WorkImage, prepare_images
 from stages.verdict.looks import look_at_all
-from stages.verdict.verdict import CROPPED, LENS, MOVING, WITHOUT_TEXTURE, ZOOMED, failed, triangulation_angle
+from stages.verdict.parallax import parallax
+from stages.verdict.verdict import CROPPED, LENS, MOVING, WITHOUT_TEXTURE, ZOOMED, failed
 
 WAIT = 0.05  # seconds between two looks at a lock
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
@@ -314,7 +315,7 @@ def _capture(
         "photographs": len(images),
         "registered": len(photos),
         "points": len(points.xyz),
-        "triangulation_angle": round(triangulation_angle(points, photos), 3),
+        "triangulation_angle": round(parallax(points, photos).angle, 3),
         "pairs_agreeing": round(agreement, 4),
         **found,
     }
@@ -347,9 +348,9 @@ def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
 def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:
     """What is suspicious in a model whose counts and reprojection error are fine."""
     warnings = []
-    angle = triangulation_angle(points, photos)
-    if angle < 2.0:
-        warnings.append(f"The photographs were taken from almost one place (triangulation angle {angle:.1f} degrees): depth will be poor.")
+    seen = parallax(points, photos)
+    if seen.small and seen.angle < 2.0:
+        warnings.append(f"The photographs were taken from almost one place (triangulation angle {seen.angle:.1f} degrees): depth will be poor.")
     if agreement < 0.8:
         warnings.append(
             f"Only {agreement:.0%} of the verified matches agree with the cameras found: repeated structure may have folded the scene. "

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
-from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo, SparsePoints
+from stages.io.capture import BACKGROUND, LEFT_OUT, Capture
 from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.verdict import looks as looks_of
 from stages.verdict.looks import Look
+from stages.verdict.parallax import Parallax, parallax
 
 LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose photographs have focal lengths, or principal points, of their own
 MOVING = "moving_parts"  # fact: name of a photograph -> share of it that moves
@@ -34,7 +35,6 @@ MOST_PLANAR = 0.8  # share of the pairs
 DOUBTFUL = 0.94  # of the matches, that agree with the cameras; docs/experiments/sfm.md
 TINY = 150  # px of the longest side, below which too few features are detected
 LARGE_PART = 0.05  # of the picture, from which what moves may have more matches than what stands still
-SMALL_ANGLE = 4.0  # degrees of parallax
 ZOOM = 1.05  # between focal lengths, from which they differ
 OFF_MIDDLE = 0.03  # of the longest side, from the middle to the principal point of a photograph that was cropped
 WITHOUT_TEXTURE = "blurred, dark or without texture"
@@ -111,13 +111,13 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
     """
     names = [photo.camera.name for photo in capture.photos]
     total = max(len(names) + len(capture.rejected), in_folder or 0)
-    angle = None if capture.points is None or not any(capture.points.tracks) else triangulation_angle(capture.points, capture.photos)
+    seen = None if capture.points is None or not any(capture.points.tracks) else parallax(capture.points, capture.photos)
     counts = points_of_images(capture)
     figures: dict[str, Any] = {
         "photographs": total,
         "registered": len(names),
         "reprojection_error": None if capture.reprojection_error is None else min(capture.reprojection_error, 1e9),
-        "triangulation_angle": angle if angle is None else round(angle, 2),
+        "triangulation_angle": None if seen is None else round(seen.angle, 2),
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "points_per_image": None if counts is None else float(np.median(counts)),
         **{key: capture.facts[key] for key in FACTS if key in capture.facts},
@@ -125,10 +125,11 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
     }
     problems = [
         *_of_registration(capture, len(names), total, in_folder),
-        *_of_matches(capture, flat=angle is None or angle < SMALL_ANGLE),
+        *_of_matches(capture, flat=seen is None or seen.small),
         *_of_lens(capture),
         *_of_moving_parts(capture),
-        *_of_geometry(capture, angle, counts),
+        *_of_geometry(capture, seen, counts),
+        *_of_gps(capture),
         *of_looks(looks),
         *(of_sizes(looks) if capture.kind == "photographs" else ()),
     ]
@@ -269,7 +270,7 @@ def _of_parts(capture: Capture) -> list[Problem]:
     return found
 
 
-def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | None) -> list[Problem]:
+def _of_geometry(capture: Capture, seen: Parallax | None, counts: np.ndarray | None) -> list[Problem]:
     found = []
     agreeing = capture.facts.get("pairs_agreeing")
     if isinstance(agreeing, float) and agreeing < 0.8:
@@ -278,9 +279,9 @@ def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | Non
     elif isinstance(agreeing, float) and agreeing < DOUBTFUL:
         sentence = f"Only {agreeing:.0%} of the matches agree with the cameras, as where photographs were zoomed, cropped or blurred, or where something moved."
         found.append(Problem("disagreement", "usable", sentence, "Look at cameras.png. Use one lens at one zoom, and photographs as they were taken."))
-    if angle is not None and angle < SMALL_ANGLE:
-        sentence = f"The photographs were taken from almost one place (parallax {angle:.1f} degrees): depth will be poor."
-        found.append(Problem("parallax", "poor" if angle < 2.0 else "usable", sentence, "Move sideways between photographs, not only turn."))
+    if seen is not None and seen.small:
+        sentence = f"The photographs were taken from almost one place (parallax {seen.angle:.1f} degrees): depth will be poor."
+        found.append(Problem("parallax", "poor" if seen.angle < 2.0 else "usable", sentence, "Move sideways between photographs, not only turn."))
     if capture.reprojection_error is not None and capture.photos:
         longest = float(np.median([max(photo.camera.width, photo.camera.height) for photo in capture.photos]))
         if capture.reprojection_error > LARGE_ERROR * max(1.0, longest / LONGEST):
@@ -295,6 +296,19 @@ def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | Non
             sentence = f"{len(few)} {seeing} fewer than {FEW_POINTS} sparse points; {unsure} less sure: {abbreviated(list(few))}."
             found.append(Problem("few points", grade, sentence, "Texture helps: leave more of the surroundings in view.", few))
     return found
+
+
+def _of_gps(capture: Capture) -> list[Problem]:
+    """Why GPS positions are not used: that stands against nothing, and indoors, or round a small subject, it is usual."""
+    gps = capture.facts.get("gps")
+    if not isinstance(gps, dict) or gps["used"] != "nothing":
+        return []
+    words = f"{gps['photographs']} of {len(capture.photos)} photographs {worded(gps['photographs'], 'have', 'has')} a GPS position"
+    if "distance" in gps:
+        words += f", {gps['distance']:.2g} m from the cameras found in the median: too far for an extent of {gps['extent']:.2g} m, and not used."
+    else:
+        words += ": too few to be used."
+    return [Problem("gps", "good", words, "Nothing need be done: a phone's positions are metres off. Lengths are in no unit then, and up is estimated.")]
 
 
 def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
@@ -365,20 +379,3 @@ def points_of_images(capture: Capture) -> np.ndarray | None:
     if capture.points is None or not any(capture.points.tracks):
         return None
     return np.bincount([photo for track in capture.points.tracks for photo in set(track)], minlength=len(capture.photos))
-
-
-def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
-    """Median over the points of the largest angle between two rays of a track, degrees; below about two, depth is unreliable."""
-    if not len(points.xyz):
-        return 0.0
-    centres = np.array([photo.camera.centre for photo in photos])
-    step = max(1, len(points.xyz) // 2000)
-    widest = []
-    for xyz, track in zip(points.xyz[::step], points.tracks[::step], strict=True):
-        if len(track) < 2:
-            continue
-        towards = centres[list(track)] - xyz
-        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
-        widest.append(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1, 1))))
-    return float(np.median(widest)) if widest else 0.0
-

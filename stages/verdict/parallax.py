@@ -1,0 +1,61 @@
+"""The angles at which cameras see what they look at: below some, depth is unreliable.
+
+Where the view axes meet there is a subject, and what lies behind it says nothing of it: of photographs all round a table in a large room most sparse points
+are of the room, which all cameras see from about one place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.framing.captured import meeting_point
+from stages.io.capture import Photo, SparsePoints
+
+SMALL_ANGLE = 4.0  # degrees of parallax
+AROUND = 0.5  # of the distance of the cameras from where their axes meet: what lies nearer to it than that is the subject, with what it stands on
+OBSERVERS, FEWEST = 3, 10  # photographs that see a point of the subject, and such points, that wrong matches hardly make: then something is there
+MOST = 2000  # points that are looked at
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """
+    angle    degrees: the median over the points of the subject, else over all, of the largest angle between two rays of a track
+    subject  whether the cameras look from different sides at a subject that is there
+    """
+
+    angle: float
+    subject: bool
+
+    @property
+    def small(self) -> bool:
+        """Whether the photographs were taken from almost one place."""
+        return self.angle < SMALL_ANGLE and not self.subject
+
+
+def parallax(points: SparsePoints, photos: Sequence[Photo]) -> Parallax:
+    """Of cameras and the sparse points that they see."""
+    cameras = [photo.camera for photo in photos]
+    chosen = np.arange(len(points.xyz))
+    centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3)
+    subject = False
+    if len(cameras) >= OBSERVERS:
+        middle, meeting = meeting_point(cameras)
+        if meeting:
+            reach = AROUND * float(np.median(np.linalg.norm(centres - middle, axis=1)))
+            near = np.linalg.norm(points.xyz - middle, axis=1) < reach
+            there = np.flatnonzero(near & np.array([len(set(track)) >= OBSERVERS for track in points.tracks], bool))
+            subject = len(there) >= FEWEST
+            chosen = there if subject else chosen
+    chosen = chosen[:: max(1, len(chosen) // MOST)]
+    widest = [_widest(centres[list(points.tracks[n])] - points.xyz[n]) for n in chosen.tolist() if len(points.tracks[n]) > 1]
+    return Parallax(float(np.median(widest)) if widest else 0.0, subject)
+
+
+def _widest(towards: np.ndarray) -> float:
+    """The largest angle between two of (N, 3) directions, degrees."""
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
+    return float(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1, 1))))
