@@ -8,6 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import Mistakes, PipelineError, UsageError
+from pipeline.files import canonical_json
+from pipeline.fleet.state import Scene
+from pipeline.run import NAME as RUN_NAME
+from pipeline.stage import Stage, settings_from
 from pipeline.text import printable
 from workflows.asset import Workflow
 from workflows.budget import share_budget
@@ -15,6 +19,7 @@ from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, s
 
 Table = dict[str, dict[str, Any]]
 
+DEFAULT_PRESET = "preview"  # where none is stated, and which settings are chosen by the device makes no difference
 MOST_SHOWN = 50  # mistakes
 OPTIONS = ("preset", "as", "seed", "budget")  # what a manifest says beside settings, by the names of the options of `enerf run`
 GIVEN_BY_HAND = ("poses.allow_outside", "poses.mask_model")  # settings that no manifest decides, for they lead out of its folder: the operator does
@@ -102,8 +107,10 @@ class Checker:
             self._known[key] = _plain(self._settings.values[stage][name])
         return self._known[key]
 
-    def given(self, table: Mapping[str, Mapping[str, Any]]) -> Table:
-        """Settings of the command line, whose values may be Text, as JSON holds them. Raises UsageError."""
+    def given(self, table: Mapping[str, Mapping[str, Any]], seed: int | None = None) -> Table:
+        """Settings of the command line, whose values may be Text, as JSON holds them. Raises UsageError, for a seed that no stage takes, too."""
+        if seed is not None:
+            self._settings.put_seed(seed)
         return {stage: {name: self.value(stage, name, value, by_hand=True) for name, value in entries.items()} for stage, entries in table.items()}
 
     def settings(self, table: Mapping[str, Any], where: Mapping[str, int | None], *, scene: str | None = None) -> Table:
@@ -149,8 +156,9 @@ class Checker:
                 found.seed = int(value) if isinstance(value, Text) else value
             except ValueError:
                 found.seed = None
-            if type(found.seed) is not int or not -(2**63) <= found.seed < 2**63:
+            if type(found.seed) is not int:
                 raise UsageError(f"seed: found {printable(repr(value), 100)}, expected a whole number.")
+            self._settings.put_seed(found.seed)
         elif not isinstance(value, str):
             raise UsageError(f"{name}: found {printable(repr(value), 100)}, expected text.")
         elif name == "preset":
@@ -159,6 +167,41 @@ class Checker:
             found.settings.setdefault("poses", {})["format"] = self.value("poses", "format", str(value))
         else:
             found.budget = seconds_of(str(value))
+
+
+def refuse_what_cannot_work(scenes: Sequence[Scene], workflow: Workflow, fleet: Path, what: str) -> None:
+    """Raise Mistakes for the scenes whose settings a stage cannot work with (`Stage.check`); those that were begun are left to their runs.
+
+    what  was given, the beginning of the message
+    """
+    checker = Checker(workflow, what)
+    presets: dict[str, Mapping[str, Any]] = {}
+    refused: dict[bytes, str | None] = {}  # scenes are many, and their settings few
+    for scene in scenes:
+        if (fleet / scene.name / RUN_NAME).is_file():
+            continue
+        name = scene.preset or DEFAULT_PRESET
+        if name not in presets:
+            presets[name] = read_preset(name, workflow.presets).table
+        key = canonical_json([name, scene.settings])
+        if key not in refused:
+            refused[key] = _why_refused(scene.settings, presets[name], workflow.stages)
+        if (why := refused[key]) is not None:
+            checker.mistake(why, scene=scene.name)
+    checker.end()
+
+
+def _why_refused(given: Mapping[str, Mapping[str, Any]], preset: Mapping[str, Any], stages: Sequence[Stage]) -> str | None:
+    settings: dict[str, Any] = {
+        stage.name: settings_from(stage.settings, {**preset.get(stage.name, {}), **given.get(stage.name, {})}, where=stage.name) for stage in stages
+    }
+    try:
+        for stage in stages:
+            if stage.check is not None:
+                stage.check(settings)
+    except UsageError as error:
+        return str(error)
+    return None
 
 
 def _plain(value: Any) -> Any:

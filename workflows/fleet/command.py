@@ -77,7 +77,7 @@ def run(
     done, 3 where some are not.
     """
     from workflows.cli.resolve import read_preset
-    from workflows.fleet.checked import Choice
+    from workflows.fleet.checked import Choice, refuse_what_cannot_work
     from workflows.fleet.manifest import read_manifest
     from workflows.fleet.options import settings_of
     from workflows.fleet.running import check_fleet_folder
@@ -88,6 +88,7 @@ def run(
         read_preset(preset, workflow().presets)
     over = Choice(settings_of(sets, workflow()), preset, seed)
     chosen = swept(read_manifest(scenes, workflow(), folder, over=over, roots=roots), read_sweeps(sweeps, workflow()), workflow().stages)
+    refuse_what_cannot_work(chosen, workflow(), folder, scenes[0])
     return _run(folder, chosen, as_json=as_json, quiet=quiet, retry=None, **options)
 
 

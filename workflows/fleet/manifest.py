@@ -82,7 +82,7 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
         raise UsageError(f"{printable(checker.what, 1000)}: found {len(entries)} scenes, expected at most {MOST_SCENES}.")
     _check_names(entries, checker)
     given_by_hand = over or Choice()
-    given_by_hand = replace(given_by_hand, settings=Checker(workflow, "--set").given(given_by_hand.settings))
+    given_by_hand = replace(given_by_hand, settings=Checker(workflow, "--set").given(given_by_hand.settings, given_by_hand.seed))
     reader = _Reader(checker, base, inside, fleet, common, given_by_hand)
     scenes = [reader.scene(entry) for entry in entries]
     checker.end()

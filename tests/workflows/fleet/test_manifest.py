@@ -180,6 +180,36 @@ def test_mistakes_of_a_csv(place: Path) -> None:
     assert "name and source" in details("scene,path\na,b\n", "fleet.csv")[0]
 
 
+@pytest.mark.parametrize("seed", ["-1", str(2**31), str(2**63), "9" * 400, "true", "'1'"])
+def test_a_seed_that_no_run_takes_is_a_mistake_of_the_manifest(seed: str, enerf: Enerf, place: Path) -> None:
+    """Nothing is run, and nothing of the fleet is written."""
+    text = f"seed = 1\n[scenes.a]\nsource = 'shoots/a'\nseed = {seed}\n[scenes.b]\nsource = 'shoots/b'\n"
+    (found,) = details(text)
+    assert found.startswith("line 4, scene a: seed")
+    assert enerf("fleet", written(text), "--out", "fleet").code == 2
+    assert enerf("fleet", written(f"name,source,seed\na,shoots/a,{seed}\n", "fleet.csv"), "--out", "fleet").code == 2
+    if seed.lstrip("-").isdigit():
+        assert enerf("fleet", "shoots", "--out", "fleet", "--seed", seed).code == 2
+    assert not Path("fleet").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "options"),
+    [
+        ("train.field = 'nerf'", ()),
+        ("train.near_plane = 2.0\ntrain.far_plane = 1.0", ()),
+        ("train.near_plane = 2.0\ntrain.far_plane = 4.0", ("--set", "poses.space=contracted")),
+        ("", ("--sweep", "train.field=hash,nerf")),
+    ],
+)
+def test_settings_that_no_stage_can_work_with_are_mistakes_of_the_manifest(settings: str, options: tuple[str, ...], enerf: Enerf, place: Path) -> None:
+    manifest = written(f"[scenes.a]\nsource = 'shoots/a'\n{settings}\n")
+    told = enerf("fleet", manifest, "--out", "fleet", *options)
+    assert told.code == 2
+    assert "scene a" in told.err
+    assert not Path("fleet").exists()
+
+
 def test_mistakes_are_told_by_the_command_line(enerf: Enerf, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A line each, and in the JSON object."""
 
