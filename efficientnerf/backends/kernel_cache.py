@@ -92,13 +92,17 @@ def first_private(roots: Iterable[Path], key: str) -> tuple[Path | None, list[st
     return None, refusals
 
 
+def cache_folder() -> Path:
+    """$ENERF_CACHE_DIR, else the user's cache folder. Raises RuntimeError where there is no home."""
+    return Path(os.environ.get("ENERF_CACHE_DIR") or platformdirs.user_cache_dir("efficientnerf", appauthor=False)).absolute()
+
+
 def _roots() -> Iterator[Path]:
-    if chosen := os.environ.get("ENERF_CACHE_DIR"):
-        yield Path(chosen).absolute() / "kernels"
-    elif chosen := os.environ.get("NUMBA_CACHE_DIR"):
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    if chosen and not os.environ.get("ENERF_CACHE_DIR"):
         yield Path(chosen).absolute() / "efficientnerf"
     else:
-        yield Path(platformdirs.user_cache_dir("efficientnerf", appauthor=False)).absolute() / "kernels"
+        yield cache_folder() / "kernels"
     yield Path(tempfile.gettempdir()).absolute() / (f"efficientnerf-{os.geteuid()}" if hasattr(os, "geteuid") else "efficientnerf")
 
 

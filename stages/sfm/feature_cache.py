@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from efficientnerf.backends.kernel_cache import first_private
+from efficientnerf.backends.kernel_cache import cache_folder, first_private
 from pipeline.files import open_plain, remove, write_atomically
 from stages.sfm.colmap import import_pycolmap
 from stages.sfm.database import FEATURES, Row, insert_features, rows_of
@@ -36,14 +36,11 @@ def max_bytes() -> int:
 @functools.cache
 def folder() -> Path | None:
     """Where the files are, made if need be; None where none are kept, or where there is no folder that the user alone can write to."""
-    import platformdirs
-
     if not max_bytes():
         return None
     pycolmap = import_pycolmap()
-    chosen = os.environ.get("ENERF_CACHE_DIR") or platformdirs.user_cache_dir("efficientnerf", appauthor=False)
     try:
-        return first_private([Path(chosen).absolute() / "features"], _sha256(f"{LAYOUT} {pycolmap.__version__} {pycolmap.COLMAP_build}".encode())[:16])[0]
+        return first_private([cache_folder() / "features"], _sha256(f"{LAYOUT} {pycolmap.__version__} {pycolmap.COLMAP_build}".encode())[:16])[0]
     except RuntimeError:  # no home
         return None
 

@@ -69,13 +69,17 @@ def viewer_page(
     entries = [_camera(camera, (photographs or {}).get(camera.name)) for camera in cameras] or _captured_path(asset)
     facts = {"title": title, "bytes": len(asset), "cameras": entries, "home": None}
     script, style = script_text(), (FOLDER / "viewer.css").read_text(encoding="utf-8")
-    head = _template().render(
-        title=title, script_hash=policy_hash(script), style_hash=policy_hash(style), style=Markup(style), facts=Markup(json_for_html(facts))
-    )
+    head = _template().render(title=title, policy=Markup(policy()), style=Markup(style), facts=Markup(json_for_html(facts)))
     parts = [head.encode("utf-8"), b"\n"]
     for part in _parts(asset):
         parts += [b'<script type="text/plain" data-part>', part, b"</script>\n"]
     return b"".join([*parts, b"<script>", script.encode("utf-8"), b"</script>\n</body>\n</html>\n"])
+
+
+def policy() -> str:
+    """The page's Content-Security-Policy: its own script and style, and pictures that it holds."""
+    script, style = policy_hash(script_text()), policy_hash((FOLDER / "viewer.css").read_text(encoding="utf-8"))
+    return f"default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src data: blob:; base-uri 'none'; form-action 'none'"
 
 
 @functools.cache

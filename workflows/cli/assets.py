@@ -86,8 +86,8 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
 @quiet_option
 @common_options
 def view(what: Path, no_browser: bool, port: int | None, address: str | None, force: bool, as_json: bool, quiet: bool) -> None:
-    """Open the viewer page of RUN or ASSET, which needs no network: RUN/viewer.html, made if it is missing or older than the asset; for an asset file a new
-    one in a temporary folder.
+    """Open the viewer page of RUN or ASSET, which needs no network: RUN/viewer.html, made if it is missing, older than the asset or written by another; for
+    an asset file a new one in a temporary folder.
 
     With --serve, the stages, curves and previews of a RUN are shown while it trains, and the viewer once there is an asset. From another machine:
     'ssh -L 8000:localhost:PORT HOST', then http://localhost:8000/. The server reads, and answers for these pages alone.
@@ -113,6 +113,6 @@ def view(what: Path, no_browser: bool, port: int | None, address: str | None, fo
         if not no_browser and loopback:
             open_in_browser(url)
 
-    serve(what, workflow().stages, address, port, ready, force=force)
+    serve(what, workflow().stages, address, port, ready)
     if as_json:
         write_json({"event": "summary", "ok": True, "exit_code": 0})

@@ -82,7 +82,7 @@ def status(run_folder: Path, as_json: bool) -> None:
 @quiet_option
 @common_options
 def verify(what: Path, as_json: bool, quiet: bool) -> None:
-    """Hash every file of RUN and compare it with the recorded hashes; or read ASSET, which carries its own hashes, and check every rule of its
+    """Hash every file of RUN, its pages too, and compare it with the recorded hashes; or read ASSET, which carries its own hashes, and check every rule of its
     format. Exit code 4 if anything was altered.
     """
     if what.is_file():
@@ -117,11 +117,12 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
     from workflows.cli.output import closing, write_json
     from workflows.cli.progress import display, size
     from workflows.cli.target import open_run
+    from workflows.report.signature import altered_pages
 
     run = open_run(run_folder)
     try:
         with display(as_json=as_json, quiet=quiet) as show:
-            outcomes = verify_run(run, workflow().stages, show)
+            outcomes = verify_run(run, workflow().stages, show, altered=altered_pages(run.path))
     except CorruptArtifact as error:
         raise Reported(error, {"run": str(run.path), "damaged": list(error.files)}) from error
     if as_json:

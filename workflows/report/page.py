@@ -63,8 +63,8 @@ def write_report(run: Run, stages: Sequence[Stage]) -> Path:
     No lock is taken: where a stage is replaced meanwhile, the page is made again, so that all of it is of the same artifacts.
     """
     from pipeline.decide import survey
-    from pipeline.files import write_atomically
     from pipeline.run import cannot_write
+    from workflows.report.signature import write_page
 
     path = run.path / NAME
     for _ in range(ATTEMPTS):
@@ -73,7 +73,7 @@ def write_report(run: Run, stages: Sequence[Stage]) -> Path:
         if _published(run, stages) == before:
             break
     try:
-        write_atomically(path, text.encode("utf-8"))
+        write_page(path, text.encode("utf-8"))
     except OSError as error:
         raise cannot_write(path, error) from error
     return path

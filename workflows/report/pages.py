@@ -21,10 +21,13 @@ def write_pages(run: Run, stages: Sequence[Stage]) -> None:
 
 
 def has_pages(run: Run, stages: Sequence[Stage]) -> bool:
-    """Whether the report is there and no artifact was published after it: that is a rename of its folder, which sets ctime."""
+    """Whether the report is there and no artifact was published after it (that is a rename of its folder, which sets ctime), and no page is another's."""
+    from workflows.report.signature import PAGES, is_own
+
     try:
         written = os.stat(run.path / "report.html", follow_symlinks=False).st_mtime_ns
     except OSError:
         return False
     folders = (run.folder(stage.name) for stage in stages)
-    return all(os.stat(folder, follow_symlinks=False).st_ctime_ns <= written for folder in folders if os.path.lexists(folder))
+    newest = all(os.stat(folder, follow_symlinks=False).st_ctime_ns <= written for folder in folders if os.path.lexists(folder))
+    return newest and all(is_own(run.path / name) for name in PAGES if os.path.lexists(run.path / name))

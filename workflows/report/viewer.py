@@ -18,14 +18,14 @@ NAME = "viewer.html"
 
 
 def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
-    """Write RUN/viewer.html atomically, where it is missing or older than what it shows, or `anew`; returns its path.
+    """Write RUN/viewer.html atomically, where it is missing, not this program's own or older than what it shows, or `anew`; returns its path.
 
     None, and no page, for a run without a sound asset, and for one whose asset is too large for a page that is made by itself. Raises DiskFull, and
     BadInput where the folder cannot be written.
     """
     from efficientnerf.asset.format import FormatError
     from pipeline.run import cannot_write
-    from stages.viewer.page import LARGEST, write_viewer
+    from stages.viewer.page import LARGEST
 
     path, asset = run.path / NAME, BakeOutputs.of_run(run.path).asset
     size = _size(asset)
@@ -35,15 +35,23 @@ def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
         if size is None or size > LARGEST:
             path.unlink(missing_ok=True)
             return None
-        cameras, photographs = captured(run.path)
         try:
-            write_viewer(asset, path, cameras=cameras, photographs=photographs, title=run.path.name)
+            write_viewer_of(run.path, asset, path)
         except FormatError:  # `enerf verify` says what is wrong
             path.unlink(missing_ok=True)
             return None
     except OSError as error:
         raise cannot_write(path, error) from error
     return path
+
+
+def write_viewer_of(run: Path, asset: Path, target: Path) -> None:
+    """Write the page of a run's asset, signed. Raises FormatError and OSError."""
+    from stages.viewer.page import compact_bytes, viewer_page
+    from workflows.report.signature import write_page
+
+    cameras, photographs = captured(run)
+    write_page(target, viewer_page(compact_bytes(asset), cameras=cameras, photographs=photographs, title=os.path.basename(os.path.abspath(run))))
 
 
 def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
@@ -65,11 +73,13 @@ def _size(path: Path) -> int | None:
 
 
 def _is_newest(run: Run, path: Path) -> bool:
-    """Whether the page is there and none of the artifacts that it shows was published after it: that is a rename of its folder, which sets ctime."""
+    """Whether the page is our own, and none of the artifacts that it shows was published after it: that is a rename of its folder, which sets ctime."""
+    from workflows.report.signature import is_own
+
     try:
         status = os.stat(path, follow_symlinks=False)
         folders = [run.folder(stage) for stage in (BakeOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)]
         changed = [os.stat(folder, follow_symlinks=False).st_ctime_ns for folder in folders if os.path.lexists(folder)]
     except OSError:
         return False
-    return stat.S_ISREG(status.st_mode) and all(each <= status.st_mtime_ns for each in changed)
+    return all(each <= status.st_mtime_ns for each in changed) and is_own(path)

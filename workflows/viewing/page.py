@@ -1,9 +1,8 @@
-"""The viewer page of a run or of an asset file: the one that is there, or a new one."""
+"""The viewer page of a run or of an asset file: the one that is there, if this program wrote it, or a new one."""
 
 from __future__ import annotations
 
 import os
-import stat
 from pathlib import Path
 
 from pipeline.errors import CorruptArtifact
@@ -12,8 +11,9 @@ from stages.viewer.page import NAME
 
 
 def present_page(what: Path, asset: Path) -> Path | None:
-    """The page that a run has of its present asset, or None."""
+    """The page that a run has of its present asset, or None: one that another may have written is none."""
     from workflows.cli.target import is_run
+    from workflows.report.signature import is_own
 
     if not is_run(what):
         return None
@@ -21,7 +21,7 @@ def present_page(what: Path, asset: Path) -> Path | None:
         page, of = os.lstat(what / NAME), os.lstat(asset)
     except OSError:
         return None
-    return what / NAME if stat.S_ISREG(page.st_mode) and page.st_size and page.st_mtime_ns >= of.st_mtime_ns else None
+    return what / NAME if page.st_mtime_ns >= of.st_mtime_ns and is_own(what / NAME) else None
 
 
 def make_page(what: Path, asset: Path, target: Path) -> None:
@@ -32,19 +32,14 @@ def make_page(what: Path, asset: Path, target: Path) -> None:
     from efficientnerf.asset.format import FormatError
     from stages.viewer.page import write_viewer
     from workflows.cli.target import is_run
-    from workflows.report.viewer import captured
+    from workflows.report.viewer import write_viewer_of
 
-    cameras, photographs = captured(what) if is_run(what) else ([], {})
     try:
-        write_viewer(asset, target, cameras=cameras, photographs=photographs, title=title_of(what, asset))
+        if is_run(what):
+            write_viewer_of(what, asset, target)
+        else:
+            write_viewer(asset, target)
     except FormatError as error:
         raise CorruptArtifact(f"{asset}: {error}", (str(asset),)) from error
     except OSError as error:
         raise cannot_write(target, error) from error
-
-
-def title_of(what: Path, asset: Path) -> str:
-    """The name of the run, or of the file."""
-    from workflows.cli.target import is_run
-
-    return Path(os.path.abspath(what)).name if is_run(what) else asset.stem

@@ -218,7 +218,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_response_only(status)
             allowed = {"Allow": "GET, HEAD"} if status is HTTPStatus.METHOD_NOT_ALLOWED else {}
             facts = {"Content-Type": answer.kind, "Content-Length": str(length), "Content-Security-Policy": answer.policy, "Connection": "close"}
-            for name, value in {**facts, **HEADERS, **allowed}.items():
+            # A page in a sandbox has no origin that others could share, and browsers refuse one that says that others may not.
+            opener = {"Cross-Origin-Opener-Policy": "unsafe-none"} if "sandbox" in answer.policy else {}
+            for name, value in {**facts, **HEADERS, **opener, **allowed}.items():
                 self.send_header(name, value)
             self.end_headers()
             if self.command == "HEAD":

@@ -23,14 +23,14 @@ LOOK = 0.2  # seconds between two looks whether a signal came
 
 
 def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
-    """The viewer page of a run or an asset file, and whether it was made now: in the run, or in a new temporary folder that stays."""
+    """The viewer page of a run or an asset file, and whether it was made now: in a run that can be written, or in a new temporary folder that stays."""
     from workflows.cli.target import asset_of, is_run
 
     asset = asset_of(what)
     there = None if force else present_page(what, asset)
     if there is not None:
         return there, False
-    target = (what if is_run(what) else Path(tempfile.mkdtemp(prefix="enerf-view-"))) / NAME
+    target = (what if is_run(what) and os.access(what, os.W_OK) else Path(tempfile.mkdtemp(prefix="enerf-view-"))) / NAME
     make_page(what, asset, target)
     return target, True
 
@@ -61,12 +61,11 @@ def open_in_browser(url: str) -> bool:
         return False
 
 
-def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, ready: Callable[[str], None], *, force: bool = False) -> None:
+def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, ready: Callable[[str], None]) -> None:
     """Serve a run, finished or not, or an asset file, until a signal comes. Raises as `asset_of` and `Server` do.
 
     address  None: this machine alone
     ready    is told the URL
-    force    make the page even if the run has one
     """
     from workflows.cli.target import asset_of, is_run, open_run
     from workflows.viewing.server import LOOPBACK, Server
@@ -76,7 +75,7 @@ def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, r
         folder = Path(name)
         if is_run(what):
             open_run(what)
-            site: AssetSite | RunSite = RunSite(Path(os.path.abspath(what)), stages, folder, force=force)
+            site: AssetSite | RunSite = RunSite(Path(os.path.abspath(what)), stages, folder)
         else:
             asset = asset_of(what)
             make_page(what, asset, folder / NAME)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import threading
@@ -10,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
-from stages.viewer.page import NAME
-from workflows.viewing.page import make_page, present_page
+from stages.viewer.page import NAME, policy
+from workflows.viewing.page import make_page
 from workflows.viewing.progress import PREVIEW, Progress, asset_identity
 from workflows.viewing.server import Answer, open_inside
 
@@ -24,7 +25,6 @@ LIVE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; frame-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-VIEWER_POLICY = "frame-ancestors 'self'"  # the page has a policy of its own, of the hashes of its scripts
 LARGEST_PAGE, LARGEST_PREVIEW = 2**31, 2**24  # bytes
 _PREVIEW = re.compile(rf"/previews/([a-z]+)/({PREVIEW.pattern})")
 
@@ -42,12 +42,11 @@ class AssetSite:
 class RunSite:
     """A run that may still be made. Nothing is written into it.
 
-    folder  takes the viewer page where the run has none of its present asset
-    force   take it even where the run has one
+    folder  takes the viewer page: what the run holds under its name may be anybody's
     """
 
-    def __init__(self, run: Path, stages: Sequence[Stage], folder: Path, *, force: bool = False) -> None:
-        self.run, self.folder, self.force = run, folder, force
+    def __init__(self, run: Path, stages: Sequence[Stage], folder: Path) -> None:
+        self.run, self.folder = run, folder
         self.progress = Progress(run, stages)
         self._making = threading.Lock()
         self._made: str | None = None  # of which asset the page in the folder is
@@ -80,9 +79,6 @@ class RunSite:
         with self._making:
             try:
                 asset = asset_of(self.run)
-                there = None if self.force else present_page(self.run, asset)
-                if there is not None:
-                    return _page(there)
                 identity, page = asset_identity(self.run), self.folder / NAME
                 if identity is None:
                     return None
@@ -96,4 +92,10 @@ class RunSite:
 
 def _page(path: Path) -> Answer | None:
     file = open_inside(path.parent, path.name, LARGEST_PAGE)
-    return None if file is None else Answer(HTML, file=file, policy=VIEWER_POLICY)
+    return None if file is None else Answer(HTML, file=file, policy=viewer_policy())
+
+
+@functools.cache
+def viewer_policy() -> str:
+    """The page's own policy once more, and a sandbox: its origin is none, so that nothing in it reaches the rest of what is served."""
+    return f"{policy()}; sandbox allow-scripts allow-downloads; frame-ancestors 'self'"

@@ -12,6 +12,7 @@ from PIL import Image
 
 from pipeline.fleet.state import FleetState, SceneState, StageState, Totals, Verdict
 from stages.artifacts import TurntableOutputs
+from workflows.report.signature import write_page
 
 NASTY = '</script><script>alert("x")</script> & <b>\x1b[2J'
 STAGES = ("poses", "train", "bake", "turntable")
@@ -72,7 +73,7 @@ def with_pictures(folder: Path, state: FleetState) -> None:
             made.folder.mkdir(parents=True)
             Image.new("RGB", (320, 200), (200, 120, 40)).save(made.poster)
             made.video.write_bytes(video)
-            (folder / scene.name / "report.html").write_text("the report")
+            write_page(folder / scene.name / "report.html", b"the report")
 
 
 def facts(page: str) -> dict[str, Any]:

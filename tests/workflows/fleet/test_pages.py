@@ -166,7 +166,21 @@ def test_a_report_is_linked_wherever_it_is(tmp_path: Path) -> None:
     (tmp_path / "b" / "report.html").unlink()
     state.scenes[2].state, state.scenes[2].stages["turntable"].state = "failed", "failed"
     Pages(tmp_path)(state)
-    assert [scene["report"] for scene in facts((tmp_path / "index.html").read_text("utf-8"))["scenes"]] == ["a/report.html", None, "c/report.html"]
+    assert linked(tmp_path) == ["a/report.html", None, "c/report.html"]
+
+
+def linked(fleet: Path) -> list[str | None]:
+    return [scene["report"] for scene in facts((fleet / "index.html").read_text("utf-8"))["scenes"]]
+
+
+def test_a_page_that_another_wrote_is_not_linked(tmp_path: Path) -> None:
+    state = sweep()
+    with_pictures(tmp_path, state)
+    name = state.scenes[0].name
+    (tmp_path / name / "report.html").write_text("<script>alert(1)</script>", "utf-8")
+    Pages(tmp_path)(state)
+    assert [link is None for link in linked(tmp_path)] == [True] + [False] * 7
+    assert f"{name}/report.html" not in (tmp_path / "comparison.html").read_text("utf-8")
 
 
 def test_a_folder_that_cannot_be_written_is_told_not_raised(tmp_path: Path) -> None:
@@ -233,7 +247,7 @@ def test_means_are_over_scenes_that_are_whole() -> None:
 
 def test_a_page_of_a_sweep(tmp_path: Path) -> None:
     state = sweep()
-    assert write_comparison(tmp_path, state)
+    assert write_comparison(tmp_path, state, {scene.name for scene in state.scenes})
     page = (tmp_path / "comparison.html").read_text("utf-8")
     assert "train.iterations, bake.max_mib. 8 of 8 runs are done." in page
     assert page.count('<a href="a--iterations-1--max_mib-8/report.html">report</a>') == 1

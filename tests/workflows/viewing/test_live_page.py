@@ -19,7 +19,7 @@ from tests.efficientnerf.trees import random_tree
 from tests.stages.viewer.browser import Page, chromium, missing, opened
 from tests.workflows.viewing.growing import TRAIN, put, scratch
 from workflows.viewing.server import LOOPBACK, Server
-from workflows.viewing.sites import RunSite
+from workflows.viewing.sites import AssetSite, RunSite
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
@@ -114,9 +114,38 @@ def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(browser: An
         live.page.wait_for_selector("#again", state="visible", timeout=60_000)
         assert shown.locator("#facts-line").inner_text() == said, "nothing is taken away from whoever looks at it"
         live.page.click("#again")
-        said = f"{len(other.density_values):,} voxels"
-        until(live, f"document.getElementById('viewer').contentDocument.getElementById('facts-line')?.textContent.startsWith('{said}')")
+        shown.locator("#facts-line", has_text=f"{len(other.density_values):,} voxels").wait_for(timeout=60_000)
         assert live.console == []
+
+
+def test_the_viewer_works_without_an_origin_and_reads_nothing_else(browser: Any, run: Run, server: Server, tmp_path: Path) -> None:
+    asset = BakeOutputs.of_run(run.path).asset
+    asset.parent.mkdir()
+    save(random_tree(1), asset)
+    with opened(browser, server.url, viewport={"width": 900, "height": 900}) as live:
+        live.page.frame_locator("#viewer").locator("body.ready").wait_for(timeout=60_000)
+        frame = next(each for each in live.page.frames if each.url.endswith("/viewer.html"))
+        assert frame.evaluate("self.origin") == "null"
+        assert frame.evaluate("fetch('/status.json').then(() => 'read', () => 'refused')") == "refused"
+        assert frame.evaluate("(() => { try { return parent.document.title } catch (error) { return error.name } })()") == "SecurityError"
+        with live.page.expect_download() as download:
+            frame.locator("#save").click()
+        assert Path(download.value.path()).read_bytes().startswith(b"\x89PNG")
+    with opened(browser, f"{server.url}viewer.html", viewport={"width": 900, "height": 900}) as alone:
+        alone.ready()
+        assert alone.page.evaluate("self.origin") == "null"
+        assert alone.console == []
+
+
+def test_a_page_that_another_put_in_its_place_runs_nothing(browser: Any, tmp_path: Path) -> None:
+    page = tmp_path / "viewer.html"
+    page.write_text("<!doctype html><title>mine</title><body><script>document.title = 'run'</script><img src=x onerror='document.title = 2'>", encoding="utf-8")
+    with Server(AssetSite(page), LOOPBACK, 0) as made:
+        threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        with opened(browser, made.url) as shown:
+            shown.page.wait_for_timeout(200)
+            assert shown.page.title() == "mine"
+        made.shutdown()
 
 
 def test_it_says_so_when_nobody_answers_any_more(browser: Any, run: Run, server: Server) -> None:

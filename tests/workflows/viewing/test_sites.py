@@ -16,8 +16,10 @@ from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs
+from stages.viewer.page import policy_hash, script_text
 from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
 from workflows.cli.main import main
+from workflows.report.signature import write_page
 from workflows.viewing import progress, sites
 from workflows.viewing.page import present_page
 from workflows.viewing.progress import MOST_POINTS, MOST_PREVIEWS, Progress
@@ -219,10 +221,13 @@ def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path:
     assert made == ["run", "run"]
     assert not (run.path / "viewer.html").exists()
     (run.path / "viewer.html").write_text("of the run", encoding="utf-8")
+    assert body(site("/viewer.html")) == b"page 2", "what the run holds may be anybody's"
+    assert present_page(run.path, file) is None
+    write_page(run.path / "viewer.html", b"our own")
     os.utime(run.path / "viewer.html", ns=(1, file.stat().st_mtime_ns))
-    assert body(site("/viewer.html")) == b"of the run"
+    assert present_page(run.path, file) is not None
     os.utime(run.path / "viewer.html", ns=(1, file.stat().st_mtime_ns - 1))
-    assert body(site("/viewer.html")) == b"page 2", "one that is older than the asset is of another"
+    assert present_page(run.path, file) is None, "one that is older than the asset is of another"
     (run.path / "viewer.html").unlink()
     (run.path / "viewer.html").symlink_to(run.path / "run.json")
     assert present_page(run.path, file) is None
@@ -233,3 +238,17 @@ def test_of_an_asset_there_is_its_page_alone(tmp_path: Path) -> None:
     site = AssetSite(tmp_path / "viewer.html")
     assert body(site("/")) == body(site("/viewer.html")) == b"page"
     assert [site(path) for path in ("/status.json", "/live.js", "/..", "/viewer.html/")] == [None] * 4
+
+
+def test_the_viewer_is_served_with_its_own_scripts_alone_and_without_an_origin(tmp_path: Path) -> None:
+    """Whatever was written to its place: another script is not run, and nothing of this server is read."""
+    (tmp_path / "viewer.html").write_text("page", encoding="utf-8")
+    answer = AssetSite(tmp_path / "viewer.html")("/")
+    assert answer is not None
+    body(answer)
+    directives = {words[0]: words[1:] for words in (part.split() for part in answer.policy.split(";"))}
+    assert directives["default-src"] == ["'none'"]
+    assert directives["script-src"] == [f"'sha256-{policy_hash(script_text())}'"]
+    assert set(directives["sandbox"]) == {"allow-scripts", "allow-downloads"}
+    assert directives["frame-ancestors"] == ["'self'"]
+    assert not any("unsafe" in word for words in directives.values() for word in words)

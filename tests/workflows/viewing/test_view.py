@@ -23,6 +23,7 @@ from efficientnerf.asset.tree import tree_from_voxels
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs
 from tests.workflows.command import Enerf
+from workflows.report.signature import write_page
 from workflows.viewing import serving, sites
 
 
@@ -36,7 +37,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
 
     def make(what: Path, asset: Path, target: Path) -> None:
-        target.write_text(f"{what.name} of {asset.stat().st_size} bytes", encoding="utf-8")
+        write_page(target, f"{what.name} of {asset.stat().st_size} bytes".encode())
 
     for module in (serving, sites):
         monkeypatch.setattr(module, "make_page", make)
@@ -59,13 +60,35 @@ def test_the_page_of_a_run_is_made_once_and_again_of_another_asset(enerf: Enerf,
     for made in (True, False):
         assert enerf("view", run, "--json").object == {"event": "summary", "ok": True, "page": str(page), "made": made, "opened": True, "exit_code": 0}
     assert opened == [page.as_uri()] * 2
-    assert page.read_text(encoding="utf-8") == f"run of {asset.stat().st_size} bytes"
+    assert page.read_text(encoding="utf-8").startswith(f"run of {asset.stat().st_size} bytes")
     assert enerf("view", run, "--force", "--no-browser", "--json").object["made"]
     os.utime(asset, ns=(1, page.stat().st_mtime_ns + 1))
     assert enerf("view", run, "--no-browser", "--json").object["made"]
     assert len(opened) == 2
     assert enerf("view", run, "--no-browser").out == f"{page}\n"
     assert enerf("view", run, "--no-browser", "--quiet").out == ""
+
+
+def test_a_page_that_another_wrote_is_never_opened(enerf: Enerf, run: Path, opened: list[str]) -> None:
+    """Of a stranger's run: newer than its asset, and of the size of the page that this program wrote."""
+    page = run / "viewer.html"
+    assert enerf("view", run, "--no-browser", "--quiet").code == 0
+    size = page.stat().st_size
+    page.write_bytes(b"<script>alert(1)</script>".ljust(size))
+    os.utime(page, (2**31, 2**31))
+    assert enerf("view", run, "--json").object["made"]
+    assert opened == [page.as_uri()]
+    assert b"<script>" not in page.read_bytes()
+
+
+def test_of_a_run_that_cannot_be_written_the_page_lies_elsewhere(
+    enerf: Enerf, run: Path, opened: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serving.os, "access", lambda path, mode, **_: mode != os.W_OK)
+    found = enerf("view", run, "--json").object
+    assert found["made"]
+    assert Path(found["page"]).parent.parent == tmp_path / "temporary"
+    assert not (run / "viewer.html").exists()
 
 
 def test_of_an_asset_file_the_page_lies_elsewhere(enerf: Enerf, run: Path, opened: list[str], tmp_path: Path) -> None:
@@ -154,7 +177,7 @@ def test_a_run_is_served_until_a_signal(enerf: Enerf, run: Path, opened: list[st
     assert enerf("view", run, "--serve", 0, "--json", *more).code == 0
     assert b"/live.js" in answers[""]  # type: ignore[operator]
     assert json.loads(answers["status.json"])["name"] == "run"
-    assert answers["viewer.html"] == f"run of {BakeOutputs.of_run(run).asset.stat().st_size} bytes".encode()
+    assert answers["viewer.html"].startswith(f"run of {BakeOutputs.of_run(run).asset.stat().st_size} bytes".encode())  # type: ignore[union-attr]
     assert answers["run.json"] == 404
     assert urls[0].startswith("http://127.0.0.1:")
     assert opened == ([] if more else urls)

@@ -5,7 +5,7 @@ Seconds are those that a scene takes by itself: a stage that another scene made 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -36,6 +36,7 @@ class Result:
 
     scene   its name without the values; "" for means
     values  of the settings that the sweep changed
+    run     whose report is linked
     """
 
     scene: str
@@ -48,12 +49,12 @@ class Result:
     run: str | None = None
 
 
-def write_comparison(fleet: Path, state: FleetState, *, plots: bool = True) -> bool:
-    """Write the page, and the plots anew if `plots`; returns whether the fleet is a sweep. Raises OSError."""
+def write_comparison(fleet: Path, state: FleetState, reports: Container[str] = (), *, plots: bool = True) -> bool:
+    """Write the page, and the plots anew if `plots`; returns whether the fleet is a sweep. `reports`: scenes whose report is linked. Raises OSError."""
     settings = settings_of(state)
     if not settings:
         return False
-    found = results(state, settings)
+    found = results(state, settings, reports)
     means = mean_results(found)
     if plots:
         (fleet / FOLDER).mkdir(exist_ok=True)
@@ -69,13 +70,13 @@ def settings_of(state: FleetState) -> list[str]:
     return list(dict.fromkeys(setting for scene in state.scenes for setting in scene.sweep or {}))
 
 
-def results(state: FleetState, settings: Sequence[str]) -> list[Result]:
+def results(state: FleetState, settings: Sequence[str], reports: Container[str] = ()) -> list[Result]:
     """One for each scene of the sweep."""
     known = {scene.name: scene for scene in state.scenes}
-    return [_result(scene, known, settings) for scene in state.scenes if scene.sweep]
+    return [_result(scene, known, settings, reports) for scene in state.scenes if scene.sweep]
 
 
-def _result(scene: SceneState, known: dict[str, SceneState], settings: Sequence[str]) -> Result:
+def _result(scene: SceneState, known: dict[str, SceneState], settings: Sequence[str], reports: Container[str]) -> Result:
     name, values = unswept(scene.name, scene.sweep or {}), tuple((scene.sweep or {}).get(setting) for setting in settings)
     if scene.state != "done":
         return Result(name, values, state=scene.state)
@@ -84,7 +85,8 @@ def _result(scene: SceneState, known: dict[str, SceneState], settings: Sequence[
         donor = known.get(scene.shares.get(stage, ""))
         seconds += donor.stages[stage].seconds if donor is not None and stage in donor.stages else found.seconds
     quality = quality_of(scene)
-    return Result(name, values, quality["psnr"], quality["ssim"], seconds, scene.bytes / 1e6 if scene.bytes else None, scene.state, scene.run)
+    run = scene.run if scene.name in reports else None
+    return Result(name, values, quality["psnr"], quality["ssim"], seconds, scene.bytes / 1e6 if scene.bytes else None, scene.state, run)
 
 
 def mean_results(found: Sequence[Result]) -> list[Result]:

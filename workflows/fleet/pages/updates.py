@@ -13,6 +13,7 @@ from pipeline.fleet.state import FleetState, SceneState
 from stages.artifacts import PosesOutputs, TurntableOutputs
 from workflows.fleet.pages import comparison, index, spreadsheet
 from workflows.report.page import NAME as REPORT
+from workflows.report.signature import is_own
 
 FILES = (index.NAME, index.THUMBNAILS, spreadsheet.NAME, comparison.NAME, comparison.FOLDER)  # what pages consist of
 SECONDS = 5.0  # between two writings, and TIMES as long as one takes
@@ -59,18 +60,19 @@ class Pages:
     def _write(self, state: FleetState) -> None:
         self._make_thumbnails(state)
         ended = state.state != "running"
-        compared = comparison.write_comparison(self.fleet, state, plots=ended)
+        reports = self._reports_of(state)
+        compared = comparison.write_comparison(self.fleet, state, reports, plots=ended)
         pictures = {name: made for name, (_, made) in self._pictures.items() if made}
         title, compared_in = self.fleet.absolute().name, comparison.NAME if compared else None
-        throughput, reports = self._throughput(state), self._reports_of(state)
+        throughput = self._throughput(state)
         page = index.index_page(state, title=title, pictures=pictures, reports=reports, throughput=throughput, comparison=compared_in)
         write_atomically(self.fleet / index.NAME, page.encode("utf-8"), durable=ended)
         write_atomically(self.fleet / spreadsheet.NAME, spreadsheet.fleet_csv(state).encode("utf-8"), durable=ended)
 
     def _reports_of(self, state: FleetState) -> set[str]:
-        """Scenes with a report, of whatever state: what was made before a scene failed is still there to read. One without a stage has none."""
+        """Scenes with a report of our own, of whatever state: what was made before a scene failed is still there to read. One without a stage has none."""
         begun = (scene for scene in state.scenes if scene.name not in self._reports and any(stage.state == "done" for stage in scene.stages.values()))
-        self._reports |= {scene.name for scene in begun if os.path.isfile(self.fleet / scene.run / REPORT)}
+        self._reports |= {scene.name for scene in begun if is_own(self.fleet / scene.run / REPORT)}
         return self._reports
 
     def _throughput(self, state: FleetState) -> float | None:

@@ -1,0 +1,85 @@
+"""Whether a page of a run is one that this program wrote, and wrote here: a page is a program that a browser runs, and a run may come from anybody.
+
+A page's last line is a comment with the SHA-256 of all before it, and with an HMAC of that by a key which the user alone can read. By the first `verify`
+knows a page that was altered; by the second it is known before it is opened whether who wrote it has the key. One that does not is made again.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import hmac
+import os
+import re
+import secrets
+from pathlib import Path
+
+from pipeline import files
+from pipeline.hashes import CHUNK
+
+PAGES = ("report.html", "viewer.html")  # of a run
+KEY = 32  # bytes, as many as a SHA-256 has
+_LINE = re.compile(rb"<!-- enerf ([0-9a-f]{64}) ([0-9a-f]{64}) -->\n")
+_LENGTH = len("<!-- enerf   -->\n") + 2 * 64
+
+
+def write_page(path: Path, page: bytes) -> None:
+    """Write a page atomically, with its signature. Raises OSError."""
+    digest = hashlib.sha256(page).hexdigest()
+    with files.atomic(path) as temporary, open(temporary, "wb") as file:
+        file.write(page)
+        file.write(f"<!-- enerf {digest} {_signature(digest)} -->\n".encode("ascii"))
+
+
+def is_as_written(path: Path) -> bool:
+    """Whether a page is as this program, or one that does as it does, wrote it. False for what is no plain file."""
+    return _read(path) is not None
+
+
+def is_own(path: Path) -> bool:
+    """Whether this program wrote the page, for this user."""
+    found = _read(path)
+    return found is not None and hmac.compare_digest(_signature(found[0]), found[1])
+
+
+def altered_pages(run: Path) -> list[str]:
+    """The names of those pages of a run that are not as they were written."""
+    return [name for name in PAGES if os.path.lexists(run / name) and not is_as_written(run / name)]
+
+
+def _read(path: Path) -> tuple[str, str] | None:
+    """The digest of a page and its signature; None where it has no such line, or another digest."""
+    digest = hashlib.sha256()
+    try:
+        with open(files.open_plain(path, follow=False), "rb", buffering=0) as file:
+            left = os.fstat(file.fileno()).st_size - _LENGTH
+            while left > 0 and (chunk := file.read(min(CHUNK, left))):
+                digest.update(chunk)
+                left -= len(chunk)
+            found = _LINE.fullmatch(file.read(_LENGTH + 1)) if left == 0 else None
+    except OSError:
+        return None
+    if found is None or found[1].decode("ascii") != digest.hexdigest():
+        return None
+    return digest.hexdigest(), found[2].decode("ascii")
+
+
+def _signature(digest: str) -> str:
+    return hmac.new(_key(), digest.encode("ascii"), hashlib.sha256).hexdigest()
+
+
+@functools.cache
+def _key() -> bytes:
+    """32 random bytes, the same ones for all that a user does on a machine; where they cannot be kept, for all that this process does."""
+    from efficientnerf.backends.kernel_cache import cache_folder, first_private
+
+    try:
+        folder = first_private([cache_folder() / "pages"], "key")[0]
+        if folder is None:
+            return secrets.token_bytes(KEY)
+        path = folder / "key"
+        if not path.is_file() or path.stat().st_size != KEY:
+            files.write_atomically(path, secrets.token_bytes(KEY))
+        return path.read_bytes()
+    except (OSError, RuntimeError):  # no home, no room
+        return secrets.token_bytes(KEY)
