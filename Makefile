@@ -63,7 +63,7 @@ gpu:
 gpu-packages:
 	rm -rf $(GPU_PACKAGES)
 	$(PYTHON) -m pip download --quiet --dest $(GPU_PACKAGES) --no-deps --only-binary=:all: --python-version $(GPU_PYTHON) --implementation cp \
-		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt msgspec platformdirs trimesh OpenEXR av fast_simplification
+		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt filelock msgspec platformdirs trimesh OpenEXR av fast_simplification
 
 viewer-page: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/page --set bake.resolution=112 --until bake
