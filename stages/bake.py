@@ -268,7 +268,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan, gains: np.ndarray | None) -> 
 
 STAGE = Stage(
     name="bake",
-    version=19,
+    version=20,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,9 +27,10 @@ from stages.compiling import clock, compiling_kernels
 from stages.cores import use_all_cores
 from stages.training.budget import UNKNOWN, Budget, training_budget
 from stages.training.checkpoints import Checkpoints
-from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, refuse_planes_out_of_order, sparse_depth_of, with_camera_refinement
+from stages.training.data import count_pixels, depth_range, pixels_of, refuse_planes_out_of_order, sparse_depth_of, with_camera_refinement
 from stages.training.log import TrainLog
 from stages.training.previews import Previews
+from stages.training.priors import Prior, mask_uncovered_cells
 
 if TYPE_CHECKING:
     from efficientnerf.training.loop import Trainer
@@ -58,7 +59,7 @@ def run(job: Job) -> None:
     pixels = pixels_of(folder, views, rows)
     near, far = depth_range(s, pixels, settings, job.warn)
     m = model(space, settings, s.background, job.device, (near, far))
-    mask_uncovered_cells(m, views, job)
+    priors = mask_uncovered_cells(m, views, job)
 
     t = loop.trainer(m, len(views), cameras=[view.camera for view in views])
     checkpoints = Checkpoints(job)
@@ -93,7 +94,7 @@ def run(job: Job) -> None:
     job.record("schedule", t.schedule.state())
     field_file.save_model(m, near, far, outputs.field, gains_of(t, views), t.schedule)
     write_cameras(outputs.cameras, t, views)
-    write_report(outputs.report, job, t, log.seconds, previews.figures)
+    write_report(outputs.report, job, t, log.seconds, previews.figures, priors)
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
     previews.publish(outputs.previews, job.warn)
@@ -150,7 +151,7 @@ def write_cameras(path: Path, t: Trainer, views: tuple[View, ...]) -> None:
         refined_cameras.write(views, t.cameras.cameras, path)
 
 
-def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview: dict[str, float]) -> None:
+def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview: dict[str, float], priors: Sequence[Prior]) -> None:
     """What was reached; the seconds differ from run to run."""
     settings = t.model.settings
     report = {
@@ -161,6 +162,7 @@ def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview: dict
         "preview_psnr": preview.get("preview_psnr"),
         "preview_ssim": preview.get("preview_ssim"),
         "cameras": camera_changes(t),
+        "priors": {prior.name: {"masked": round(prior.masked, 4), "contradicted": round(prior.contradicted, 4), "applied": prior.applied} for prior in priors},
         "occupied": t.model.voxels.occupied,
         "log2_hashmap_size": settings.log2_hashmap_size,
         "finest_resolution": settings.finest_resolution,
@@ -179,7 +181,7 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
 
 STAGE = Stage(
     name="train",
-    version=6,
+    version=7,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,

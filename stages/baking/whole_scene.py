@@ -201,19 +201,21 @@ def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], ind
 
 def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
     """The voxels that are not close to the path of the training cameras, and that are not poorly seen."""
-    from stages.framing.view_coverage import close_to_path, kept_pixels, poorly_seen
+    from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
     from stages.io import scene
+    from stages.training.priors import filled_points
 
     views = scene.views_of(s, "train")
-    masks = kept_pixels(job.inputs["poses"], views)
-    cameras = [view.camera for view in views]
+    masks, filled = kept_pixels(job.inputs["poses"], views), filled_points(job.inputs["poses"], len(views))
+    cameras, near = [view.camera for view in views], [view.near for view in views]
+    refuted = filled is not None and len(filled) > 0 and close_to_path(filled, cameras, near, BAKED_CLEARANCE, filled).mean() > MAX_CONTRADICTED
     _, voxel, low = grid
     min_views = given(m.settings.min_views) if m.space.contracted else None
     kept = []
     for at in range(0, len(indices), CENTRES_PER_BLOCK):
         job.safe_point()
         centre = (indices[at : at + CENTRES_PER_BLOCK] + 0.5) * voxel + low
-        keep = ~close_to_path(centre, cameras, [view.near for view in views], BAKED_CLEARANCE)
+        keep = np.ones(len(centre), bool) if refuted else ~close_to_path(centre, cameras, near, BAKED_CLEARANCE, filled)
         if min_views is not None:
             keep[keep] = ~poorly_seen(centre[keep], m.space.bounds, cameras, min_views, masks)
         kept.append(keep)

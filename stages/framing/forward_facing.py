@@ -14,7 +14,6 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.ndc import Ndc, ndc_distance
-from stages.io.capture import Photo
 
 SPACES = ("auto", "box", "contracted", "ndc")
 MAX_AXIS_ANGLE = 40.0  # degrees, between a view axis and the mean one
@@ -146,25 +145,3 @@ def _common_field_of_view(cameras: Sequence[Camera]) -> tuple[float, float]:
     across = min(0.5 * camera.width / camera.intrinsics["fx"] for camera in cameras)
     down = min(0.5 * camera.height / camera.intrinsics["fy"] for camera in cameras)
     return float(across), float(down)
-
-
-def content_depths(photos: Sequence[Photo], placed: Sequence[Camera], scale: float, points: np.ndarray | None, tracks: Sequence[Sequence[int]]) -> np.ndarray:
-    """(C, 2) nearest and farthest depth of the content of each photo, training frame: as the source states it, else of the sparse points it observes.
-
-    points     (N, 3) in the training frame, or None
-    tracks     for each point, the photos that observe it
-    """
-    observed: list[list[int]] = [[] for _ in placed]
-    for point, views in enumerate(tracks):
-        for view in views:
-            observed[view].append(point)
-    rows = np.full((len(placed), 2), np.nan)
-    for row, photo, camera, mine in zip(rows, photos, placed, observed, strict=True):
-        if photo.near and photo.far:
-            row[:] = photo.near * scale, photo.far * scale
-        elif points is not None and len(mine) >= 10:
-            depth = (points[mine] - camera.centre) @ camera.forward
-            depth = depth[depth > 0]
-            if len(depth):
-                row[:] = np.quantile(depth, 0.01), np.quantile(depth, 0.99)
-    return rows

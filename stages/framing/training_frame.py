@@ -15,7 +15,8 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
-from stages.framing.forward_facing import ForwardFacing, content_depths, detect_forward_facing
+from stages.framing.forward_facing import ForwardFacing, detect_forward_facing
+from stages.framing.near_planes import content_depths, near_far_planes
 from stages.io.capture import Capture
 from stages.io.scene import Orbit
 from stages.io.silhouettes import SmallPictures
@@ -97,7 +98,8 @@ def find_training_frame(
         facts["silhouettes_cut"] = list(cut)
     space, forward, facts["space_from"] = space_of(capture, placed, world, space)
     facts["space"] = space
-    return TrainingFrame(world, bounds, orbit, near_far_planes(capture, placed, world, bounds), space, forward, facts)
+    planes = near_far_planes(capture, placed, world, bounds, world.points(focus) if converging else None)
+    return TrainingFrame(world, bounds, orbit, planes, space, forward, facts)
 
 
 def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choice: str) -> tuple[str, ForwardFacing | None, str]:
@@ -105,8 +107,7 @@ def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choi
     usual = "contracted" if capture.background is None else "box"
     if choice in ("box", "contracted") or (choice == "auto" and (capture.kind != "llff" or capture.background is not None)):
         return (usual, None, "usual for this kind of source") if choice == "auto" else (choice, None, "given")
-    points, tracks = (None, ()) if capture.points is None else (world.points(capture.points.xyz), capture.points.tracks)
-    found = detect_forward_facing(placed, content_depths(capture.photos, placed, world.scale, points, tracks))
+    found = detect_forward_facing(placed, content_depths(capture, placed, world))
     if isinstance(found, ForwardFacing):
         return "ndc", found, "given" if choice == "ndc" else "the capture is forward-facing"
     if choice == "ndc":
@@ -236,41 +237,6 @@ def orbit_of(cameras: Sequence[Camera], centre: np.ndarray) -> Orbit:
         forward_facing=one_side,
         heading=heading,
     )
-
-
-def near_far_planes(capture: Capture, placed: Sequence[Camera], world: Similarity, bounds: np.ndarray) -> np.ndarray:
-    """(C, 2) depth range of each photo in the training frame.
-
-    A constant background: the depths of the box. Surroundings: from half of the nearest sparse point it sees (or the near it states) to
-    beyond everything; without either, from a twentieth of the way to the box.
-    """
-    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    observed: list[list[int]] = [[] for _ in placed]
-    if capture.points is not None:
-        for point, track in enumerate(capture.points.tracks):
-            for index in track:
-                observed[index].append(point)
-    points = None if capture.points is None else world.points(capture.points.xyz)
-    rows = []
-    for photo, camera, mine in zip(capture.photos, placed, observed, strict=True):
-        depths = (corners - camera.centre) @ camera.forward
-        box_far = max(float(depths.max()), 0.1)
-        inside = bool((np.abs(camera.centre) <= bounds[1]).all())
-        box_near = 0.02 * box_far if inside else max(float(depths.min()), 0.02 * box_far)
-        if capture.background is not None:
-            rows.append((box_near, box_far))
-            continue
-        near, far = 0.05 * max(box_near, 0.2 * box_far), box_far
-        if photo.near and photo.far:
-            near, far = 0.9 * photo.near * world.scale, max(far, 1.1 * photo.far * world.scale)
-        elif points is not None and len(mine) >= 10:
-            depths = (points[mine] - camera.centre) @ camera.forward
-            depths = depths[depths > 0]
-            if len(depths):
-                near = 0.5 * float(np.quantile(depths, 0.01))
-                far = max(far, 1.5 * float(np.quantile(depths, 0.99)))
-        rows.append((min(near, 0.5 * far), far))
-    return np.array(rows, np.float64).reshape(-1, 2)
 
 
 def _corners(box: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -8,8 +8,11 @@ A view counts only where its mask keeps the pixel: pixels that are left out tell
 density voxels are masked, too, that no view shows by a pixel that is kept, so that nothing fills them.
 
 Rays begin at their near plane: density before it costs a view nothing, yet other views put their background there, in the middle of the ring that the
-cameras stand in, and an asset, whose rays begin at the eye, would show it as fog. In contracted scenes the density voxels before the near plane of a view
-that has them in view are masked, and those close to the cameras and to the way from each to its neighbours. See docs/experiments/near-cameras.md.
+cameras stand in, and an asset, whose rays begin at the eye, would show it as fog. In contracted scenes the density voxels before the near planes of
+BEFORE_VIEWS views that have them in view are masked, and those close to the cameras and to the way from each to its neighbours.
+See docs/experiments/near-cameras.md.
+
+Reliable sparse points are evidence that space is filled: what would mask more than MAX_CONTRADICTED of them is refuted, and masks nothing. See docs/priors.md.
 """
 
 from __future__ import annotations
@@ -35,6 +38,8 @@ BLOCK = 8  # density voxels along a side of the blocks that no view shows
 COARSE = 32  # px, longest side of the masks by which such blocks are told: a pixel and its neighbours are wider than the points of a block are apart
 CLEARANCE = 0.8  # of the near plane's distance: how far from the cameras' path nothing is. docs/experiments/near-cameras.md
 NEIGHBOURS = 8  # of a camera that its path leads to, where they are within twice the near plane's distance
+BEFORE_VIEWS = 2  # that must have a voxel before their near planes, or a quarter of the cameras (rounded up) if that is less
+MAX_CONTRADICTED = 0.03  # of the reliable sparse points, that a rule may declare empty: more refute it. docs/priors.md
 NEAR_BLOCK = 2  # density voxels along a side of the blocks before the near planes
 MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is required
 NEAREST = 0.1  # share of the cameras that may be nearer to the box's centre than what counts as standing before it
@@ -155,9 +160,12 @@ def cells_without_view(space: Space, cameras: Sequence[Camera], side: int, masks
     return free[:side, :side, :side]
 
 
-def cells_before_near(space: Space, cameras: Sequence[Camera], near: Sequence[float], side: int) -> np.ndarray:
-    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those in blocks all of whose corners one view has in view before its near plane,
-    or that lie within CLEARANCE of the cameras' path."""
+def cells_before_near(space: Space, cameras: Sequence[Camera], near: Sequence[float], side: int, filled: np.ndarray | None = None) -> np.ndarray:
+    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those in blocks all of whose corners BEFORE_VIEWS views have in view before their
+    near planes, or that lie within CLEARANCE of the cameras' path.
+
+    filled  (F, 3) reliable sparse points; see `close_to_path`
+    """
     import torch
 
     count = -(-side // NEAR_BLOCK)
@@ -172,23 +180,36 @@ def cells_before_near(space: Space, cameras: Sequence[Camera], near: Sequence[fl
             whole = low & high
         return whole
 
-    found = blocks(close_to_path(world, cameras, near))
+    views = np.zeros((count,) * 3, np.int32)
     for camera, plane in zip(cameras, near, strict=True):
         depth = (world - camera.centre) @ camera.forward
         at = np.flatnonzero((depth > 0) & (depth < plane))
         corners = np.zeros(len(world), bool)
         corners[at[before_near(world[at], camera, plane)]] = True
-        found |= blocks(corners)
+        views += blocks(corners)
+    found = views >= min(BEFORE_VIEWS, -(-len(cameras) // MAX_FRACTION))
+    found |= blocks(close_to_path(world, cameras, near, filled=filled))
     for axis in range(3):
         found = np.repeat(found, NEAR_BLOCK, axis)
     return found[:side, :side, :side]
 
 
-def close_to_path(points: np.ndarray, cameras: Sequence[Camera], near: Sequence[float], clearance: float = CLEARANCE) -> np.ndarray:
-    """(N,) bool: which points (N, 3) lie within `clearance` times the near plane's distance of a camera, or of the way to one of its nearest neighbours."""
+def close_to_path(
+    points: np.ndarray, cameras: Sequence[Camera], near: Sequence[float], clearance: float = CLEARANCE, filled: np.ndarray | None = None
+) -> np.ndarray:
+    """(N,) bool: which points (N, 3) lie within `clearance` times the near plane's distance of a camera, or of the way to one of its nearest neighbours.
+
+    filled  (F, 3) reliable sparse points: a camera that has more than MAX_CONTRADICTED of them so close stands where it cannot, and keeps nothing clear
+    """
     from scipy.spatial import cKDTree
 
     centres, plane = np.array([camera.centre for camera in cameras]), np.asarray(near, np.float64)
+    if filled is not None and len(filled):
+        within = cKDTree(filled).query_ball_point(centres, clearance * plane, return_length=True)
+        stands = within <= MAX_CONTRADICTED * len(filled)
+        centres, plane = centres[stands], plane[stands]
+    if not len(centres):
+        return np.zeros(len(points), bool)
     count = min(NEIGHBOURS + 1, len(centres))
     distance, other = cKDTree(centres).query(centres, k=count)
     way, radius = [centres], [clearance * plane]
@@ -203,6 +224,17 @@ def close_to_path(points: np.ndarray, cameras: Sequence[Camera], near: Sequence[
     for at in tree.query_ball_point(places, reach):
         found[at] = True
     return found
+
+
+def contradicted(cells: np.ndarray, space: Space, filled: np.ndarray) -> float:
+    """The share of the reliable sparse points (F, 3) of the world that lie in masked density voxels (D, D, D) bool; 0 where there are none."""
+    import torch
+
+    points = torch.from_numpy(np.asarray(filled, np.float64))
+    grid = space.grid(points if space.ndc is None else space.ndc.points(points)).numpy()
+    grid = grid[((grid >= 0) & (grid <= 1)).all(axis=1)]
+    at = np.minimum((grid * len(cells)).astype(np.int64), len(cells) - 1)
+    return float(cells[tuple(at.T)].mean()) if len(at) else 0.0
 
 
 def before_near(points: np.ndarray, camera: Camera, near: float) -> np.ndarray:

@@ -54,7 +54,8 @@ def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settin
     from efficientnerf.training.pixels import Pixels
     from stages.cores import use_all_cores
     from stages.io.field_file import space_of
-    from stages.training.data import mask_cells_by, sparse_depth_of
+    from stages.training.data import sparse_depth_of
+    from stages.training.priors import filled_points, mask_cells_by
 
     use_all_cores()
     folder = job.work / "first_training"
@@ -64,7 +65,7 @@ def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settin
     near, far = np.array([(view.near, view.far) for view in scene.views]).T
     pixels = Pixels(cameras, images, [None] * len(images), near, far, 3)
     m = model(space_of(scene), settings, None, "cpu", (float(near.min()), float(far.max())))
-    mask_cells_by(m, cameras, near.tolist(), None)
+    mask_cells_by(m, cameras, near.tolist(), None, filled_points(folder, len(cameras)))
     for done in loop.train(loop.trainer(m, len(cameras)), pixels, sparse_depth_of(folder, scene, settings.seed)):
         job.reached(done.step, settings.iterations, "a first training, to find the foreground")
     return FirstField(m, float(near.min()), float(far.max()), tuple(cameras), pixels)

@@ -1,4 +1,4 @@
-"""What a scene gives training: pixels with their rays, near and far planes, sparse depth, and the voxels in which nothing is learned."""
+"""What a scene gives training: pixels with their rays, near and far planes, and sparse depth."""
 
 from __future__ import annotations
 
@@ -16,12 +16,8 @@ from stages.artifacts import PosesOutputs
 from stages.scratch import Warn
 
 if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.model import Model
     from efficientnerf.training.pixels import PixelRows, Pixels
     from efficientnerf.training.sparse_depth import SparseDepthRays
-    from pipeline.stage import Job
-    from stages.framing.view_coverage import Masks
     from stages.io.scene import Scene, View
 
 MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
@@ -175,30 +171,3 @@ def _between(point: np.ndarray, view: np.ndarray, centres: np.ndarray) -> np.nda
             share = (GOLDEN * (1 + rows) % 1)[..., None]
             origins[rows] += share * (np.take_along_axis(own, other[..., None], axis=1) - own)
     return origins
-
-
-def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> None:
-    """Mask the density voxels whose density could be at any depth: in unbounded scenes those that fewer than `train.min_views` training views have in view,
-    and those that the cameras must have looked through; and where views have masks, in any scene, those that no pixel shows which is kept."""
-    from stages.framing.view_coverage import kept_pixels
-
-    if not m.space.contracted and all(view.mask is None for view in views):
-        return
-    job.progress(0, m.settings.iterations, "computing view coverage")
-    mask_cells_by(m, [view.camera for view in views], [view.near for view in views], kept_pixels(job.inputs[PosesOutputs.stage], views))
-
-
-def mask_cells_by(m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None) -> None:
-    """The same by the views' cameras and near planes, and what their masks keep."""
-    import torch
-
-    from efficientnerf.sampling.occupancy import mask_cells
-    from stages.framing.view_coverage import cells_before_near, cells_below_min_views, cells_without_view
-
-    few, side = given(m.settings.min_views) if m.space.contracted else None, m.voxels.side
-    if few is not None:
-        mask_cells(m.voxels, torch.from_numpy(cells_below_min_views(m.space, cameras, few, side, masks)))
-    if m.space.contracted:
-        mask_cells(m.voxels, torch.from_numpy(cells_before_near(m.space, cameras, near, side)))
-    if masks is not None:
-        mask_cells(m.voxels, torch.from_numpy(cells_without_view(m.space, cameras, side, masks)))

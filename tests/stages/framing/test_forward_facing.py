@@ -11,10 +11,11 @@ import pytest
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
 from stages.framing.camera_paths import spiral_poses, turntable_cameras
-from stages.framing.forward_facing import content_depths, detect_forward_facing, mean_pose
+from stages.framing.forward_facing import detect_forward_facing, mean_pose
+from stages.framing.near_planes import content_depths
 from stages.framing.training_frame import find_training_frame
 from stages.io import importers
-from stages.io.capture import Capture, Photo
+from stages.io.capture import Capture, Photo, SparsePoints
 from tests.efficientnerf.walls import wall
 from tests.stages import captures
 from tests.stages.forward_facing import FAR, NEAR, depths, looking, row, some_rotation
@@ -112,14 +113,16 @@ def test_the_reference_camera_is_in_the_training_frame() -> None:
 def test_depths_come_from_sparse_points_where_the_source_states_none() -> None:
     cameras = row()
     points = in_pictures(cameras, NEAR, FAR)
-    photos = [Photo(camera, Path("a.png")) for camera in cameras]
-    tracks = [(k // 200,) for k in range(len(points))]
-    found = content_depths(photos, cameras, 1.0, points, tracks)
+    photos = tuple(Photo(camera, Path("a.png")) for camera in cameras)
+    sparse = SparsePoints(points, np.zeros((len(points), 3), np.uint8), np.full(len(points), 0.5), ((0, 1, 2),) * len(points))
+    shown, world = Capture("llff", photos, None, points=sparse), Similarity(1.0, np.eye(3), np.zeros(3))
+    found = content_depths(shown, cameras, world)
     assert (found[:, 0] >= NEAR).all()
     assert (found[:, 0] < 1.3 * NEAR).all()
     assert (found[:, 1] > 0.8 * FAR).all()
-    assert np.isnan(content_depths(photos, cameras, 1.0, None, [])).all()
-    assert (content_depths([replace(photo, near=2.0, far=5.0) for photo in photos], cameras, 0.5, None, []) == [1.0, 2.5]).all()
+    assert np.isnan(content_depths(replace(shown, points=None), cameras, world)).all()
+    stated = replace(shown, photos=tuple(replace(photo, near=2.0, far=5.0) for photo in photos))
+    assert (content_depths(stated, cameras, Similarity(0.5, np.eye(3), np.zeros(3))) == [1.0, 2.5]).all()
 
 
 def test_the_spiral_stays_among_the_cameras_and_looks_at_one_point() -> None:

@@ -1,0 +1,112 @@
+"""Priors: rules that mask density voxels before the first step, and the evidence that refutes them.
+
+    min_views    what fewer than `train.min_views` views show could be at any depth
+    near_planes  what lies before the near planes, and close to the cameras, is empty
+    masks        what no view shows by a pixel that its mask keeps is not asked for
+
+Reliable sparse points (`stages.framing.near_planes`) are evidence that space is filled. The first two are dropped where they contradict more than
+MAX_CONTRADICTED of them; masks are the word of the user, or of a stage that has judged them. All rules of the program: docs/priors.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.settings import given
+from stages.artifacts import PosesOutputs
+from stages.framing.view_coverage import MAX_CONTRADICTED
+
+if TYPE_CHECKING:
+    from efficientnerf.geometry.cameras import Camera
+    from efficientnerf.model import Model
+    from pipeline.stage import Job
+    from stages.framing.view_coverage import Masks
+    from stages.io.scene import View
+
+MIN_VIEWS, NEAR_PLANES, MASKS = "min_views", "near_planes", "masks"
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What a prior would mask.
+
+    masked        share of the density voxels
+    contradicted  share of the reliable sparse points that lie in them
+    applied       whether it was
+    """
+
+    name: str
+    masked: float
+    contradicted: float
+    applied: bool
+
+
+def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job, without: Collection[str] = ()) -> tuple[Prior, ...]:
+    """Mask the density voxels of a scene's model by the priors that hold, but those of these names; a warning says which the sparse points refute."""
+    from stages.framing.view_coverage import kept_pixels
+
+    if not m.space.contracted and all(view.mask is None for view in views):
+        return ()
+    job.progress(0, m.settings.iterations, "computing view coverage")
+    folder = job.inputs[PosesOutputs.stage]
+    near, cameras = [view.near for view in views], [view.camera for view in views]
+    found = mask_cells_by(m, cameras, near, kept_pixels(folder, views), filled_points(folder, len(views)), without)
+    for prior in found:
+        if prior.contradicted > MAX_CONTRADICTED:
+            job.warn(
+                f"the prior {prior.name} is not used: it would keep empty {100 * prior.masked:.0f} % of the scene, where {100 * prior.contradicted:.0f} % of the "
+                "sparse points lie that three photographs agree on. Some cameras may be wrong: look at the report's pictures of the cameras."
+            )
+    return found
+
+
+def mask_cells_by(
+    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None = None, without: Collection[str] = ()
+) -> tuple[Prior, ...]:
+    """The same by the views' cameras and near planes, what their masks keep, and the reliable sparse points (F, 3)."""
+    import torch
+
+    from efficientnerf.sampling.occupancy import mask_cells
+    from stages.framing.view_coverage import contradicted
+
+    found = []
+    for name, cells in _cells_of_priors(m, cameras, near, masks, filled, without):
+        against = 0.0 if name == MASKS or filled is None else contradicted(cells, m.space, filled)
+        found.append(Prior(name, float(cells.mean()), against, against <= MAX_CONTRADICTED))
+        if found[-1].applied:
+            mask_cells(m.voxels, torch.from_numpy(cells))
+    return tuple(found)
+
+
+def _cells_of_priors(
+    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None, without: Collection[str]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """The names of the priors that a scene calls for, and the density voxels (D, D, D) bool that each masks."""
+    from stages.framing.view_coverage import cells_before_near, cells_below_min_views, cells_without_view
+
+    few, side = given(m.settings.min_views) if m.space.contracted else None, m.voxels.side
+    if few is not None and MIN_VIEWS not in without:
+        yield MIN_VIEWS, cells_below_min_views(m.space, cameras, few, side, masks)
+    if m.space.contracted and NEAR_PLANES not in without:
+        yield NEAR_PLANES, cells_before_near(m.space, cameras, near, side, filled)
+    if masks is not None and MASKS not in without:
+        yield MASKS, cells_without_view(m.space, cameras, side, masks)
+
+
+def filled_points(folder: Path, views: int) -> np.ndarray | None:
+    """(F, 3) the reliable sparse points of a scene, training frame; None where it has no points.
+
+    views  number of photographs
+    """
+    from stages.framing.near_planes import reliable_points
+    from stages.io import scene
+
+    if not PosesOutputs(folder).points.exists():
+        return None
+    points = scene.read_points(folder)
+    return points.xyz[reliable_points(points, views)]
