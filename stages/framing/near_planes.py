@@ -16,7 +16,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from stages.framing.scene_bounds import in_view
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import Capture, SparsePoints
 
 MIN_TRACK = 3  # photographs that observe a reliable point
 MAX_ERROR = 2.0  # its reprojection error over the median

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,6 @@ import numpy as np
 
 from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
-from stages.artifacts import PosesOutputs
 from stages.scratch import Warn
 
 if TYPE_CHECKING:
