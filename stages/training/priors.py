@@ -59,8 +59,8 @@ def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job, without: C
     for prior in found:
         if prior.contradicted > MAX_CONTRADICTED:
             job.warn(
-                f"the prior {prior.name} is not used: it would keep empty {100 * prior.masked:.0f} % of the scene, where {100 * prior.contradicted:.0f} % of the "
-                "sparse points lie that three photographs agree on. Some cameras may be wrong: look at the report's pictures of the cameras."
+                f"the prior {prior.name} is not used: it would keep {100 * prior.masked:.0f} % of the scene empty, in which {100 * prior.contradicted:.0f} % "
+                "of the reliable sparse points lie. Some cameras may be wrong: look at their picture in the report."
             )
     return found
 
