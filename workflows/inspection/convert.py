@@ -10,7 +10,7 @@ from typing import Any
 def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None) -> None:
     """Write the asset of `what` (a run or an asset) to `out`, atomically; None keeps the value of the source.
 
-    Raises UsageError for a degree or a resolution above its own, BadInput and CorruptArtifact as `load_asset`.
+    Raises UsageError for a degree or a resolution above its own and for a layout that it has no place in (FORMAT.md, section 10), BadInput and CorruptArtifact as `load_asset`.
     """
     from efficientnerf.asset import conversion, format
     from efficientnerf.asset.file.metadata import layout_of
@@ -34,7 +34,10 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     made_from = {"sha256": hashlib.sha256(source.read_bytes()).hexdigest(), **{key: about[key] for key in ("layout", "resolution", "sh_degree")}}
     provenance = tree.metadata.get("provenance")
     tree = tree.with_metadata(provenance={**(provenance if isinstance(provenance, dict) else {}), "converted_from": made_from})
-    format.save(tree, out, layout)
+    try:
+        format.save(tree, out, layout)
+    except format.FormatError as error:
+        raise UsageError(f"{source}: as {layout}, {error}") from error
 
 
 def writer_of(about: dict[str, Any]) -> str:

@@ -21,6 +21,10 @@ VOXEL = 20  # its density, and its colour for a view
 NEIGHBOURS = 12  # three of them, while it is unpacked
 ENVIRONMENT = 24  # a pair of texels of an environment map as floats
 PALETTE = 28  # a coefficient of a palette as a float, in two orders of the axes, one of them padded
+_REASONS = (
+    "Its cells or bricks are nearly all empty: bake it with other bricks (bake.brick_size), or do not trust it.",
+    "Its voxels hardly differ, or its cells are nearly all empty: write it as compact, or do not trust it.",
+)
 
 
 def needed(layout: str, meta: dict[str, Any], shapes: dict[str, tuple[int, ...]], types: dict[str, np.dtype[Any]]) -> int:
@@ -47,4 +51,4 @@ def check_memory(name: str, layout: str, size: int, needed_bytes: int) -> None:
     times = PACKED_TIMES if layout == "packed" else TIMES
     if needed_bytes > times * size + BESIDES:
         found = f"{size / 1e6:.1f} MB that take {needed_bytes / 1e6:.0f} MB of memory; expected at most {times} times the size and {BESIDES / 1e6:.0f} MB"
-        raise FormatError(f"{name}: {found}. Its cells or bricks are nearly all empty: bake it with other bricks (bake.brick_size), or do not trust it.")
+        raise FormatError(f"{name}: {found}. {_REASONS[layout == 'packed']}")

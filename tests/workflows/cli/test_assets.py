@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from efficientnerf.asset.file import memory
 from efficientnerf.asset.format import WRITERS, describe, load, save
 from tests.efficientnerf.trees import random_tree
 from tests.workflows.command import Result
 from workflows.cli.assets import LAYOUTS
 
 Enerf = Callable[..., Result]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -122,6 +126,26 @@ def test_what_convert_refuses(enerf: Enerf, asset: Path, tmp_path: Path) -> None
     assert enerf("convert", tmp_path / "none.nerftree", tmp_path / "a.nerftree").code == 2
     asset.write_bytes(b"no asset")
     assert enerf("convert", asset, tmp_path / "a.nerftree").code == 4
+
+
+def test_what_a_layout_has_no_place_for_is_refused(enerf: Enerf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """20 million voxels of one value are a valid `compact` file, and no `packed` one, which is nearly nothing; here fewer voxels, and less than 200 MB."""
+    monkeypatch.setattr("efficientnerf.asset.file.memory.BESIDES", 100_000)
+    tree = random_tree(0, shape=(6, 6, 6), brick=4, degree=1, share=1.0)
+    constant = replace(tree, density_values=np.ones_like(tree.density_values), harmonics=np.ones_like(tree.harmonics))
+    save(constant, tmp_path / "a.nerftree", "compact")
+    refused = enerf("convert", tmp_path / "a.nerftree", tmp_path / "b.nerftree", "--layout", "packed", "--json")
+    assert refused.code == 2, refused.err
+    assert refused.objects[-1]["kind"] == "UsageError"
+    assert not (tmp_path / "b.nerftree").exists()
+
+
+def test_security_and_format_state_the_memory_of_an_asset_alike() -> None:
+    """In the numbers that are checked."""
+    for name in ("SECURITY.md", "efficientnerf/asset/FORMAT.md"):
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert re.search(rf"{memory.TIMES} times.*{memory.PACKED_TIMES} times", text, re.DOTALL)
+        assert f"{memory.BESIDES // 10**6} MB" in text or f"{memory.BESIDES:,}" in text
 
 
 def test_inspect_tells_what_a_coded_asset_holds(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
