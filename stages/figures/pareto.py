@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from stages.figures.drawing import new_figure
+
 Point = tuple[float, float, str]  # cost, quality, label
 
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
@@ -30,13 +32,9 @@ def pareto_plot(path: Path, series: Mapping[str, Sequence[Point]], *, x_label: s
 
     The same points are the same bytes.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     from pipeline.files import atomic
 
-    figure = Figure(figsize=(8.0, 5.0), dpi=110, layout="tight")
-    canvas = FigureCanvasAgg(figure)
+    figure, canvas = new_figure(8.0, 5.0, 110)
     axes = figure.add_subplot()
     costs = [x for points in series.values() for x, _, _ in points]
     logarithmic = bool(costs) and min(costs) > 0 and max(costs) > 10 * min(costs)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stages.figures.drawing import matplotlib, new_figure
+
 if TYPE_CHECKING:
     from PIL import Image
 
@@ -94,10 +96,8 @@ def error_map(image: np.ndarray, truth: np.ndarray, *, full: float = 0.25) -> np
     image, truth  (H, W, 3) floating point 0 to 1
     returns       (H, W, 3) uint8
     """
-    from matplotlib import colormaps
-
     error = np.abs(image - truth).mean(axis=2)
-    return np.asarray(to_uint8(colormaps["inferno"](np.clip(error / full, 0.0, 1.0))[:, :, :3]))
+    return np.asarray(to_uint8(matplotlib().colormaps["inferno"](np.clip(error / full, 0.0, 1.0))[:, :, :3]))
 
 
 def curve(
@@ -107,11 +107,7 @@ def curve(
 
     series  name -> (x, y) of equal length; values that are not finite are left out
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 4.5), dpi=100, layout="tight")
-    canvas = FigureCanvasAgg(figure)
+    figure, canvas = new_figure(8.0, 4.5, 100)
     axes = figure.add_subplot()
     for name, (x, y) in series.items():
         xs, ys = np.asarray(x, float), np.asarray(y, float)

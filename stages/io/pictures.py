@@ -31,6 +31,7 @@ import numpy as np
 from pipeline.errors import PipelineError
 from pipeline.text import printable
 from stages.io.decoders.colour_profile import AS_IT_IS, Conversion, conversion_of
+from stages.io.decoders.jpeg_scans import has_more_scans, most_scans
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "RAW")  # Pillow's names, and our own; a JPEG of several pictures (MPO) comes with JPEG
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are TIFFs of a thumbnail to other readers
@@ -41,6 +42,7 @@ FEW_PIXELS = 32_000_000  # whatever the size of the file: memory stays within a 
 PIXELS_A_BYTE = 10_000  # of a larger picture at most: deflate makes 1,032 bytes of one, which are 8,256 pixels of 1 bit
 
 _ORIENTATION = 274
+_JPEG = ("JPEG", "MPO")
 _LOWEST = 3  # rows and columns of a quantisation table that its coarseness is told by; libjpeg's at quality 50 have this mean there
 _LOWEST_MEAN = 118 / 9
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
@@ -91,6 +93,8 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
             with _raw(file) if raw else Image.open(file, formats=_possible(file, formats)) as image:
                 width, height = image.size
                 _check_size(width, height, file.size)
+                if image.format in _JPEG and has_more_scans(file, most_scans(width, height)):
+                    raise UnreadableImage(f"unreadable: a JPEG of more than {most_scans(width, height)} scans, each of which takes as long as the picture")
                 yield image
     except (UnreadableImage, MemoryError, PipelineError):
         raise

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.figures.drawing import new_figure
 from stages.video.choice import BLUR, CHOSEN
 
 SHOWN = 24  # thumbnails of a video
@@ -38,11 +39,7 @@ def write_frames_sheet(record: Sequence[Mapping[str, Any]], paths: Mapping[str, 
 
 def write_frames_plot(record: Sequence[Mapping[str, Any]], target: Path) -> None:
     """Write a PNG: sharpness of all frames over time, of the chosen and of the blurred as dots; motion below."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 3.2 * len(record)), dpi=100, layout="tight")
-    canvas = FigureCanvasAgg(figure)
+    figure, canvas = new_figure(10.0, 3.2 * len(record), 100)
     for place, video in enumerate(record):
         axes = figure.add_subplot(len(record), 1, place + 1)
         time, sharp, verdict = np.array(video["time"]), np.array(video["sharpness"]), np.array(video["verdict"])

@@ -10,7 +10,8 @@ from typing import Any
 def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None) -> None:
     """Write the asset of `what` (a run or an asset) to `out`, atomically; None keeps the value of the source.
 
-    Raises UsageError for a degree or a resolution above its own and for a layout that it has no place in (FORMAT.md, section 10), BadInput and CorruptArtifact as `load_asset`.
+    Raises UsageError for a degree or a resolution above its own and for a layout that it has no place in (FORMAT.md, section 10), BadInput and
+    CorruptArtifact as `load_asset`.
     """
     from efficientnerf.asset import conversion, format
     from efficientnerf.asset.file.metadata import layout_of

@@ -12,6 +12,8 @@ from typing import Any
 from PIL import Image, ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 
+from stages.io.decoders.jpeg_scans import MOST_SCANS, holds_more_scans
+
 _ORIENTATIONS = {0: 1, 3: 3, 5: 8, 6: 6}  # LibRaw's -> EXIF's
 _PLAIN, _EXIF = (271, 272), 34665  # make, model; the directory of
 _DETAILS = (37386, 41989, 41486, 41488, 40962, 42036)  # focal lengths, density of the sensor's pixels, name of the lens
@@ -34,6 +36,8 @@ class RawFile(ImageFile.ImageFile):
             raise NoLibRaw("a camera's raw picture, which needs: pip install 'efficientnerf[raw]'") from error
         assert self.fp is not None
         data = self.fp.read()
+        if holds_more_scans(data, MOST_SCANS):
+            raise ValueError(f"a JPEG in it has more than {MOST_SCANS} scans, each of which takes as long as the picture")
         try:
             self._raw = rawpy.imread(io.BytesIO(data))
         except rawpy.LibRawError as error:

@@ -23,7 +23,8 @@ from PIL import Image
 
 from stages.io import photo, pictures, working_images
 from stages.io.capture import Photo
-from stages.io.pictures import UnreadableImage
+from stages.io.decoders.jpeg_scans import holds_more_scans, most_scans
+from stages.io.pictures import UnreadableImage, read_header, read_quality
 from tests.stages import captures
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -326,6 +327,52 @@ def test_lengths_in_a_file_take_no_memory(tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] < 32 << 20
     finally:
         tracemalloc.stop()
+
+
+EMPTY_SCAN = b"\xff\xda\x00\x08\x01\x01\x00\x01\x3f\x00"  # of refinements of the first component: nothing follows, and all of its coefficients are gone through
+
+
+def with_scans(count: int, **options: Any) -> bytes:
+    found = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)).save(found, "JPEG", exif=Image.Exif(), **options)
+    return found.getvalue()[:-2] + count * EMPTY_SCAN + b"\xff\xd9"
+
+
+@pytest.mark.parametrize("between", [b"", b"\xff\xfe\x00\x06\xff\xd9\xff\xd8", b"\xff\xff\xd0", b"\x00\x00"])
+def test_scans_of_a_progressive_jpeg_are_counted_before_it_is_decoded(between: bytes, tmp_path: Path) -> None:
+    """Whatever stands between them; the markers of an embedded thumbnail are none of the picture's."""
+    path = tmp_path / "a.jpg"
+    data = with_scans(0, progressive=True)
+    for count in (1, 85):
+        path.write_bytes(data[:-2] + count * (between + EMPTY_SCAN) + b"\xff\xd9")
+        assert read(path)[0].shape == (48, 64, 3)
+    path.write_bytes(data[:-2] + 200 * (between + EMPTY_SCAN) + b"\xff\xd9")
+    for attempt in (read, read_header, read_quality):
+        with pytest.raises(UnreadableImage, match="more than 100 scans"):
+            attempt(path)
+    thumbnail = 300 * EMPTY_SCAN
+    path.write_bytes(data[:2] + b"\xff\xe5" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:])
+    assert read(path)[0].shape == (48, 64, 3)
+
+
+def test_scans_of_large_pictures_are_fewer_and_those_of_one_component_each_count(tmp_path: Path) -> None:
+    assert most_scans(12_000, 12_000) == 22 < most_scans(8000, 4000) == most_scans(1, 1) == 100
+    data = bytearray(with_scans(0))
+    at = data.index(b"\xff\xda")
+    scan = b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00"
+    path = tmp_path / "a.jpg"
+    path.write_bytes(bytes(data[:at]) + 200 * scan + b"\xff\xd9")
+    with pytest.raises(UnreadableImage, match="scans"):
+        read_header(path)
+
+
+def test_scans_of_any_jpeg_in_a_raw_picture_are_counted() -> None:
+    tile, endless = with_scans(0, progressive=True), with_scans(200, progressive=True)
+    assert not holds_more_scans(b"II*\0" + 300 * tile, 100)
+    assert not holds_more_scans(np.random.default_rng(0).bytes(10**6), 100)
+    assert holds_more_scans(b"II*\0" + 3 * tile + endless, 100)
+    assert holds_more_scans(b"II*\0\xff\xd8\xff\xe0" + (len(tile) + 9).to_bytes(2, "big") + endless, 100), "one that a segment of another seems to hold"
+    assert holds_more_scans(10**5 * b"\xff\xd8\xff\x00", 100), "nor does looking take the square of the size"
 
 
 @pytest.mark.parametrize("kind", ["PNG", "WEBP"])
