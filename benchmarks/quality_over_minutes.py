@@ -1,7 +1,7 @@
 """Quality over minutes on a CPU: each scene trained for 1, 5, 10 and 30 minutes, its asset as written measured on all pixels of all test views.
 
     python -m benchmarks.quality_over_minutes --runs FOLDER [--sets chair_800,fern_4,still_life,object,court,window,gloss] [--minutes 1,5,10,30]
-                                              [--options="--set bake.max_mib=40"] [--out benchmarks/results] [--readme README.md]
+                                              [--options="--set bake.max_mib=40"] [--out benchmarks/results] [--readme docs/results.md]
 
 Each row is a run of its own, from the source, with `enerf run --budget`. Cameras found from photographs are found once and copied: they are no part of the
 minutes. A row is written as soon as it is measured; with the same code and options it is not measured again, and one that was broken off begins anew.

@@ -18,7 +18,7 @@ def test_the_pages_are_up_to_date() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("page", ["README.md", "SECURITY.md", "docs/trust.md", "docs/fleet.md", "examples/fleet/README.md"])
+@pytest.mark.parametrize("page", ["README.md", "SECURITY.md", "docs/results.md", "docs/trust.md", "docs/fleet.md", "examples/fleet/README.md"])
 def test_links_lead_somewhere(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
