@@ -80,6 +80,14 @@ class PosesSettings:
     mask_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
         "off", "ONNX file of a network that tells a subject from its background (as rembg has them), by which silhouettes are made; off: none.", advanced=True
     )
+    features_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
+        "off",
+        "ONNX file of a network that detects features (ALIKED), by which photographs are matched that have no camera else; off: none.",
+        advanced=True,
+    )
+    matcher_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
+        "off", "ONNX file of a network that matches these features (LightGlue); off: none.", advanced=True
+    )
     mask_polarity: Literal["auto", "white", "black"] = setting(
         "auto",
         "What is kept of given masks: what is not black in them (white), or what is (black); auto: white, unless black shows one compact object in nearly all.",
@@ -190,9 +198,9 @@ def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
 
 
 def files(source: Path, settings: PosesSettings) -> list[Path]:
-    """What the scene depends on: files of the source, and the network that masks are made by."""
-    network = [] if settings.mask_model == "off" else [Path(settings.mask_model)]
-    return [*importers.files(source, settings), *network]
+    """What the scene depends on: files of the source, and the networks that masks are made and photographs matched by."""
+    networks = [Path(path) for path in (settings.mask_model, settings.features_model, settings.matcher_model) if path != "off"]
+    return [*importers.files(source, settings), *networks]
 
 
 STAGE = Stage(name="poses", version=12, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)

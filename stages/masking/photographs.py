@@ -117,10 +117,12 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
     from stages.io.pictures import UnreadableImage, read_header
     from stages.memory.poses import feature_threads
     from stages.sfm.ladder import features_for
+    from stages.sfm.learned.networks import given_networks
     from stages.sfm.reconstruction import find_cameras
 
     source, settings = job.source, job.settings
     assert source is not None
+    networks = given_networks(settings.features_model, settings.matcher_model)
     features, sizes = given(settings.max_features) or features_for(len(paths)), []
     for path in paths.values():
         job.safe_point()
@@ -138,6 +140,7 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
             threads=feature_threads(job, sizes, settings.feature_image_size, features, count_cores()),
             masks=masks,
             lens="perspective" if settings.lens == "equirectangular" else settings.lens,
+            networks=networks,
             work=job.work / name,
             progress=job.progress,
             safe_point=job.safe_point,

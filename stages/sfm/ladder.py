@@ -7,10 +7,11 @@
     4  photographs without a camera are matched again, with more of the others, and along the geometry of the first matches
     5  more features are detected in them, of less contrast
     6  the mapper begins anew as in 3, with the matches of 4 and 5
-    7  each photograph gets a focal length of its own, where matches disagree with the cameras, or where single photographs would have another
-    8  else each gets a principal point of its own, where single photographs would have another, as where they were cropped
+    7  photographs without a camera are matched by networks, where the user has given them (`stages.sfm.learned.matches`)
+    8  each photograph gets a focal length of its own, where matches disagree with the cameras, or where single photographs would have another
+    9  else each gets a principal point of its own, where single photographs would have another, as where they were cropped
 
-The rungs 4, 5, 7 and 8 work in scratch folders of their own that are made anew: what a killed call has left there would change the rungs before.
+The rungs 4, 5, 7, 8 and 9 work in scratch folders of their own that are made anew: what a killed call has left there would change the rungs before.
 docs/experiments/sfm.md
 """
 
@@ -21,10 +22,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from efficientnerf.geometry.cameras import Similarity
 from pipeline.files import remove
 from stages.sfm import lenses, mapping, matches, merging, pairs
 from stages.sfm.database import FEATURES, PAIRS, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, pair_id_of
 from stages.sfm.images import Progress, SafePoint, WorkImage
+from stages.sfm.learned.matches import add_matches, pairs_of
 from stages.verdict.verdict import DOUBTFUL
 
 MAX_EXHAUSTIVE = 60  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
@@ -37,6 +40,7 @@ AGREEING = 0.8  # of the verified matches, that agree with the cameras
 BETTER = 1.005  # times the score, from which a later rung is better than an earlier one
 MORE_FEATURES, LESS_CONTRAST = 2, 0.35
 EACH, CROPPED, MERGED = "a focal length each", "a principal point each", "merged sub-models"
+NETWORK, NETWORK_ANEW = "matches by a network", "another beginning with matches by a network"
 KEPT = 0.02  # of the matches, that fewer may agree when sub-models are merged: a false place contradicts the matches between them
 SPREAD = 1.08  # between the focal lengths of single photographs, from which they may have been zoomed
 APART = 0.009  # of the longest side, between the principal points of single photographs, from which they may have been cropped
@@ -89,12 +93,22 @@ class _Climb:
 
 
 def find_models(
-    work: Path, images: Sequence[WorkImage], how: str, *, features: int, seed: int, threads: int, progress: Progress, safe_point: SafePoint
+    work: Path,
+    images: Sequence[WorkImage],
+    how: str,
+    *,
+    features: int,
+    seed: int,
+    threads: int,
+    networks: tuple[Path, Path] | None = None,
+    progress: Progress,
+    safe_point: SafePoint,
 ) -> Found:
     """The best of what the rungs find, the features being detected.
 
-    how      pairs that are matched, as `match` takes it
-    threads  on which features are detected, and processes in which pairs are matched
+    how       pairs that are matched, as `match` takes it
+    threads   on which features are detected, and processes in which pairs are matched
+    networks  files of a detector and a matcher, for photographs that are left without a camera
     """
     quiet: dict[str, Any] = {"progress": progress, "safe_point": safe_point}
     match(work, images, how, seed=seed, workers=threads, **quiet)
@@ -127,6 +141,8 @@ def find_models(
                 others = _try_merged(climb, place, others, seed, safe_point)
     if place.is_dir() or not begun:  # where all have a camera, and matches disagree, nothing was matched again
         _begin_anew(climb, place if place.is_dir() else work, seed, **quiet)
+    if networks is not None and climb.missing():
+        _try_networks(climb, work / "networks", networks, seed=seed, threads=threads, **quiet)
     if climb.found.models:
         _try_own_cameras(climb, work / "own_cameras", seed, **quiet)
     return climb.found
@@ -171,6 +187,29 @@ def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> Non
         models[0] = lenses.with_principal_points(models[0], quiet["safe_point"])
         closer = models[0].compute_mean_reprojection_error() < CLOSER * best.compute_mean_reprojection_error()
         climb.tried(CROPPED, place, models, better=SAME if closer else BETTER)
+
+
+def _try_networks(climb: _Climb, place: Path, networks: tuple[Path, Path], *, seed: int, threads: int, **quiet: Any) -> None:
+    """Match photographs without a camera by networks: the model goes on from points that these matches give it, too; where it has not half of the photographs,
+    the mapper begins anew."""
+    remove(place)
+    place.mkdir()
+    copy_database(climb.found.work, place)
+    weak, count = climb.missing(), len(climb.images)
+    near = neighbours(place, count)
+    if count <= MAX_EXHAUSTIVE:
+        partners = {pairs.ordered(i, j) for i in weak for j in range(count) if i != j}
+    else:
+        partners = pairs.wider_pairs(matches.likeness(climb.found.work, seed, quiet["safe_point"]), weak, near, WIDER)
+    wanted = pairs_of(weak, sorted(partners), inlier_counts(database_path(place)))
+    add_matches(place, climb.images, wanted, networks, seed=seed, threads=threads, **quiet)
+    if climb.found.models:
+        best = merging.triangulated(place, climb.images, climb.found.models[:1], {0: Similarity.identity()}, seed, quiet["safe_point"])
+        climb.tried(NETWORK, place, mapping.continued(place, climb.images, best, seed, mapping.RELAXED, **quiet))
+    if len(climb.missing()) > count / 2:
+        for options in (mapping.DEFAULTS, mapping.RELAXED):
+            if not climb.is_enough():
+                climb.tried(NETWORK_ANEW, place, mapping.sub_models(place, climb.images, seed, options, **quiet))
 
 
 def _of_one_lens(images: Sequence[WorkImage]) -> bool:

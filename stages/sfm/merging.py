@@ -72,7 +72,7 @@ def merged(work: Path, images: Sequence[WorkImage], models: Sequence[Any], seed:
         left.remove(found[0])
     if len(placed) == 1:
         return []
-    return [_triangulated(work, images, models, placed, seed, safe_point), *(models[number] for number in left)]
+    return [triangulated(work, images, models, placed, seed, safe_point), *(models[number] for number in left)]
 
 
 def _placed(work: Path, parts: Sequence[Mapping[int, Any]], placed: Mapping[int, Similarity], number: int, seed: int) -> Similarity | None:
@@ -165,7 +165,7 @@ def _joined(parts: Sequence[Sights]) -> Sights:
 # ----------------------------------------------------------------------------------------------------------- one model
 
 
-def _triangulated(
+def triangulated(
     work: Path, images: Sequence[WorkImage], models: Sequence[Any], placed: Mapping[int, Similarity], seed: int, safe_point: SafePoint
 ) -> Any:
     """A model of the photographs of all that are placed; one that is in several has its pose of the first."""

@@ -50,6 +50,7 @@ def find_cameras(
     threads: int | None = None,
     masks: Masks | None = None,
     lens: str = "auto",
+    networks: tuple[Path, Path] | None = None,
     work: Path,
     **callables: Unpack[Callables],
 ) -> Capture:
@@ -62,6 +63,7 @@ def find_cameras(
     matching        "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
     masks           of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
     lens            "fisheye", "perspective", or "auto": fisheye where EXIF data say so
+    networks        files of a detector and a matcher (`stages.sfm.learned.networks`), for photographs that SIFT leaves without a camera
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
 
@@ -73,6 +75,7 @@ def find_cameras(
     arguments: dict[str, Any] = {"folder": os.path.abspath(folder), "names": {name: os.path.abspath(path) for name, path in paths.items()}}
     features = features or ladder.features_for(len(paths))
     arguments |= {"max_side": max_side, "features": features, "matching": matching, "seed": seed, "threads": threads, "lens": lens}
+    arguments |= {"networks": networks and [os.path.abspath(path) for path in networks]}
     arguments |= {"masks": {name: mask and os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
     resumed = database_path(work).exists()
     try:
@@ -92,6 +95,8 @@ def capture_for(arguments: Mapping[str, Any], **callables: Callable[..., None]) 
     """`reconstruct` for arguments that have come through JSON; the capture as JSON can hold it."""
     paths: dict[str, Any] = {"folder": Path(arguments["folder"]), "work": Path(arguments["work"])}
     paths |= {of: {name: path and Path(path) for name, path in arguments[of].items()} for of in ("names", "masks")}
+    networks = arguments["networks"]
+    paths["networks"] = networks and (Path(networks[0]), Path(networks[1]))
     with _alone(Path(arguments["work"]), callables["safe_point"]):
         return _plain(reconstruct(**{**arguments, **paths}, **callables))  # type: ignore[arg-type]
 
@@ -127,6 +132,7 @@ def reconstruct(
     threads: int | None = None,
     masks: Masks,
     lens: str = "auto",
+    networks: tuple[Path, Path] | None = None,
     work: Path,
     **callables: Unpack[Callables],
 ) -> Capture:
@@ -156,9 +162,8 @@ def reconstruct(
     with _full_disk_named(work):
         open_database(work, images, callables["warn"])
         matches.extract_features(work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
-        found = ladder.find_models(
-            work, images, matching, features=features, seed=seed, threads=threads or count_cores(), progress=progress, safe_point=safe_point
-        )
+        how: dict[str, Any] = {"features": features, "seed": seed, "threads": threads or count_cores(), "networks": networks}
+        found = ladder.find_models(work, images, matching, **how, progress=progress, safe_point=safe_point)
     models, place = found.models, found.work
     rejected = [*unreadable, *_unregistered(place, images, models)]
     if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):

@@ -40,6 +40,7 @@ class Options:
     lens: str | None = None
     mask_from: str | None = None
     mask_model: str | None = None
+    features_model: tuple[str, str] | None = None
     device: str | None = None
     memory: str | None = None
     strict: bool = False
@@ -159,6 +160,10 @@ def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:
         ("format", options.format, f"--as {options.format}"),
         ("mask_from", options.mask_from, f"--mask {options.mask_from}"),
         ("mask_model", options.mask_model and os.path.abspath(options.mask_model), f"--mask-model {options.mask_model}"),
+        *(
+            (name, os.path.abspath(path), f"--features-model {' '.join(options.features_model or ())}")
+            for name, path in zip(("features_model", "matcher_model"), options.features_model or (), strict=False)
+        ),
         ("strict", options.strict or None, "--strict"),
         ("frames", options.frames, f"--frames {options.frames}"),
         ("lens", options.lens, f"--lens {options.lens}"),

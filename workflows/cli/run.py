@@ -36,6 +36,9 @@ if TYPE_CHECKING:
               help="Make silhouettes: foreground (the subject, found by a first quick training), static (the object turns before it) or a screen's colour:"
               " green, white or #rrggbb; sets poses.mask_from.")  # fmt: skip
 @click.option("--mask-model", metavar="FILE", help="Make silhouettes by this network, an ONNX file as rembg has them; sets poses.mask_model.")
+@click.option("--features-model", nargs=2, metavar="FILE FILE",
+              help="Match photographs that have no camera else by these networks, ONNX files of ALIKED and of LightGlue; sets poses.features_model and"
+              " poses.matcher_model.")  # fmt: skip
 @click.option("--lens", metavar="LENS", help="fisheye, or equirectangular (360 degrees); sets poses.lens. By default photographs that say so are taken so.")
 @click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")

@@ -22,7 +22,8 @@ Table = dict[str, dict[str, Any]]
 DEFAULT_PRESET = "preview"  # where none is stated, and which settings are chosen by the device makes no difference
 MOST_SHOWN = 50  # mistakes
 OPTIONS = ("preset", "as", "seed", "budget")  # what a manifest says beside settings, by the names of the options of `enerf run`
-GIVEN_BY_HAND = ("poses.allow_outside", "poses.mask_model")  # settings that no manifest decides, for they lead out of its folder: the operator does
+# Settings that no manifest decides, for they lead out of its folder: the operator does.
+GIVEN_BY_HAND = ("poses.allow_outside", "poses.mask_model", "poses.features_model", "poses.matcher_model")
 
 
 class Text(str):

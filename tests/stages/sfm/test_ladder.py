@@ -13,7 +13,7 @@ from PIL import Image, ImageFilter
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.sfm import ladder, lenses, mapping, matches, pairs
+from stages.sfm import ladder, lenses, mapping, matches, merging, pairs
 from stages.sfm.images import WorkImage
 from stages.sfm.reconstruction import find_cameras
 
@@ -55,6 +55,8 @@ class Rig:
             name = ladder.CROPPED if how == "adjust" else ladder.EACH
         elif work.name == "rungs" and how == "begin" and self._rung == "beyond":
             name = "small angles" if options is mapping.FORWARD else "another beginning"
+        elif work.name == "networks":
+            name = ladder.NETWORK if how == "continue" else ladder.NETWORK_ANEW
         elif how == "continue" and work.name != "rungs":
             name = "fewer matches"
         elif how == "begin" and options is not mapping.DEFAULTS and self._rung in ("exhaustive", "more features"):
@@ -163,6 +165,29 @@ def test_cropped_photographs_of_several_lenses_stay_as_they_are(monkeypatch: pyt
     for other in (replace(IMAGES[0], focal=50.0), replace(IMAGES[0], fisheye=True), replace(IMAGES[0], work_width=32, work_height=24)):
         found = ladder.find_models(tmp_path, [other, *IMAGES[1:]], "exhaustive", features=100, seed=0, threads=1, **QUIET)
         assert [rung["rung"] for rung in found.rungs] == ["exhaustive"]
+
+
+@pytest.mark.parametrize(
+    ("registered", "tried"), [(20, []), (12, [ladder.NETWORK]), (6, [ladder.NETWORK, *2 * [ladder.NETWORK_ANEW]]), (0, 2 * [ladder.NETWORK_ANEW])]
+)
+def test_networks_come_last_and_for_photographs_without_a_camera_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, registered: int, tried: list[str]
+) -> None:
+    outcomes = {"exhaustive": (registered, 0.95)}
+    without = climbed(Rig(monkeypatch, outcomes), tmp_path)
+    Rig(monkeypatch, outcomes)
+    compared: list[list[pairs.Pair]] = []
+    monkeypatch.setattr(ladder, "neighbours", lambda work, count: {i: set() for i in range(count)})
+    monkeypatch.setattr(ladder, "inlier_counts", lambda path: {})
+    monkeypatch.setattr(ladder, "add_matches", lambda place, images, wanted, networks, **k: compared.append(wanted))
+    monkeypatch.setattr(merging, "triangulated", lambda place, images, models, *a, **k: models[0])
+    found = ladder.find_models(tmp_path, IMAGES, "exhaustive", features=100, seed=0, threads=1, networks=(tmp_path / "a", tmp_path / "b"), **QUIET)
+    rungs = [rung["rung"] for rung in found.rungs]
+    assert [rung for rung in rungs if "network" in str(rung)] == tried
+    assert [rung for rung in found.rungs if rung["rung"] not in tried] == without.rungs
+    assert (tmp_path / "networks").exists() == bool(tried)
+    weak = set(range(registered, 20))
+    assert compared == ([[(i, j) for i, j in sorted(pairs.all_pairs(20)) if {i, j} & weak]] if tried else [])
 
 
 def test_nothing_at_all_is_no_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

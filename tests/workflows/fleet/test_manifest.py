@@ -237,7 +237,7 @@ def test_sources_stay_in_the_manifests_folder(place: Path) -> None:
     assert len(read("shoots/a", place.parent / "elsewhere")) == 2, "the operator named both"
 
 
-@pytest.mark.parametrize("setting", ["allow_outside = true", "mask_model = '/net.onnx'"])
+@pytest.mark.parametrize("setting", ["allow_outside = true", *(f"{name} = '/net.onnx'" for name in ("mask_model", "features_model", "matcher_model"))])
 def test_a_manifest_leads_nowhere_else(place: Path, setting: str) -> None:
     (found,) = details(f"[scenes.a]\nsource = 'shoots/a'\nposes.{setting}\n")
     assert f"on the command line alone (--set poses.{setting.split()[0]}=VALUE)" in found

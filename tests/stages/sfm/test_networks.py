@@ -1,0 +1,236 @@
+"""Features and matches by networks that the user has: tiny ones, made here, in the layouts of public exports; and cameras that SIFT alone does not find."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.poses import aligned_errors, true_centres
+from pipeline.errors import BadInput, UsageError
+from pipeline.stage import Job
+from stages.masking.photographs import cameras_of_photographs
+from stages.poses import STAGE, PosesSettings
+from stages.sfm import ladder, matches
+from stages.sfm.database import FEATURES, forget
+from stages.sfm.learned.matches import NEIGHBOURS, pairs_of
+from stages.sfm.reconstruction import find_cameras, reconstruct
+
+pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
+pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
+
+from stages.sfm.learned.networks import Detector, Features, Matcher, given_networks
+from tests.stages.sfm.made_networks import WIDE, _Graph, detector, echo, matcher, value
+
+ROOT = Path(__file__).resolve().parents[3]
+STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
+QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
+LAYOUTS = ("LightGlue-ONNX", "TensorRT", "COLMAP")
+WIDTH, HEIGHT = 330, 250
+
+
+def squares() -> tuple[np.ndarray, np.ndarray]:
+    """(HEIGHT, WIDTH, 3) squares of different greys, and their corners (N, 2), px from the corner of the picture."""
+    rng = np.random.default_rng(0)
+    picture, corners = np.full((HEIGHT, WIDTH), 20, np.uint8), []
+    for y in range(20, HEIGHT - 40, 45):
+        for x in range(20, WIDTH - 60, 45):
+            side = int(rng.integers(18, 28))
+            picture[y : y + side, x : x + side] = rng.integers(90, 250)
+            corners += [(x + a, y + b) for a in (0, side) for b in (0, side)]
+    return np.repeat(picture[..., None], 3, 2), np.array(corners, np.float64)
+
+
+def strongest(path: Path, mask: np.ndarray | None = None) -> Features:
+    return Detector(path).features(squares()[0], mask, 100)
+
+
+def textured(shift: int) -> np.ndarray:
+    """A picture in which no place looks like another, moved to the right."""
+    coarse = np.random.default_rng(0).integers(0, 255, (HEIGHT // 5, WIDTH // 5, 3), np.uint8)
+    return np.roll(cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), shift, axis=1)
+
+
+def distance(found: np.ndarray, to: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(found[:, None] - to[None], axis=2).min(1))
+
+
+def test_layouts_of_detectors_say_the_same_and_where_corners_are(tmp_path: Path) -> None:
+    found = {layout: strongest(detector(tmp_path / f"{layout}.onnx", layout)) for layout in LAYOUTS}
+    for layout in LAYOUTS:
+        np.testing.assert_allclose(found[layout].xy, found["LightGlue-ONNX"].xy, atol=1e-3)
+        np.testing.assert_allclose(found[layout].descriptors, found["LightGlue-ONNX"].descriptors, atol=1e-5)
+        assert found[layout].size == (WIDTH, HEIGHT)
+    xy, corners = found["COLMAP"].xy, squares()[1]
+    assert len(xy) == 100
+    assert np.median(distance(xy, corners)) < 2.5, "the smoothed response lies a little within"
+    assert np.median(distance(corners, xy)) < 2.5
+    assert abs(np.mean(xy - corners[np.linalg.norm(xy[:, None] - corners[None], axis=2).argmin(1)])) < 0.5, "of no half pixel more to one side"
+
+
+@pytest.mark.parametrize("size", [(160, 192), (512, 704)])
+def test_a_network_of_one_size_gets_the_picture_at_its_size(tmp_path: Path, size: tuple[int, int]) -> None:
+    for layout in LAYOUTS:
+        found = strongest(detector(tmp_path / f"{layout}.onnx", layout, size))
+        assert max(found.size[0] / size[1], found.size[1] / size[0]) == pytest.approx(1.0, abs=0.01)
+        assert np.median(distance(found.xy, squares()[1])) < 5.0
+
+
+def test_a_large_picture_is_reduced_and_masks_and_strength_choose(tmp_path: Path) -> None:
+    path = detector(tmp_path / "d.onnx")
+    picture, corners = squares()
+    large = cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_AREA)
+    found = Detector(path).features(large, None, 100)
+    assert max(found.size) == 1024
+    assert np.median(distance(found.xy, 4 * corners)) < 10.0
+    mask = np.zeros(picture.shape[:2], np.uint8)
+    mask[:, : WIDTH // 2] = 255
+    left = strongest(path, mask=mask)
+    assert len(left.xy)
+    assert left.xy[:, 0].max() < WIDTH // 2
+    every = strongest(path)
+    np.testing.assert_array_equal(Detector(path).features(picture, None, 10).xy, every.xy[:10])
+
+
+def test_layouts_of_matchers_find_the_same_shift(tmp_path: Path) -> None:
+    one, other = (Detector(detector(tmp_path / "d.onnx")).features(textured(shift), None, 300) for shift in (0, 6))
+    pairs = [Matcher(matcher(tmp_path / f"{layout}.onnx", layout)).matches(one, other) for layout in ("LightGlue-ONNX", "COLMAP")]
+    np.testing.assert_array_equal(*pairs)
+    assert pairs[0].dtype == np.uint32
+    moved = other.xy[pairs[0][:, 1]] - one.xy[pairs[0][:, 0]]
+    assert len(moved) > 30
+    np.testing.assert_allclose(np.median(moved, axis=0), (6, 0), atol=0.01)
+
+
+def test_matchers_get_key_points_as_they_were_exported_to(tmp_path: Path) -> None:
+    """Only matches that are sure enough count: what this network says of a feature is its first coordinate."""
+    found = strongest(detector(tmp_path / "d.onnx"))
+    for layout, expected in (("COLMAP", found.seen[:, 0] >= 0.1), ("LightGlue-ONNX", (found.seen[:, 0] - WIDTH / 2) / (WIDTH / 2) >= 0.1)):
+        pairs = Matcher(echo(tmp_path / f"{layout}.onnx", layout)).matches(found, found)
+        np.testing.assert_array_equal(pairs[:, 0], np.flatnonzero(expected))
+    few = Features(found.xy[:5], found.seen[:5], found.size, found.descriptors[:5])
+    assert Matcher(tmp_path / "COLMAP.onnx").matches(few, found).shape == (0, 2)
+
+
+def refused_networks(folder: Path) -> dict[str, Path]:
+    (folder / "text.onnx").write_text("no network")
+    wrong = {"text": folder / "text.onnx"}
+    for name, inputs, outputs in (
+        ("pipeline", {"images": (2, 3, 64, 64)}, ("keypoints", "matches", "mscores")),
+        ("grey", {"image": (1, 1, 64, 64)}, ("keypoints", "descriptors", "scores")),
+        ("mask", {"image": (1, 3, 64, 64)}, ("mask",)),
+        ("two images", {"image0": (1, 3, 64, 64), "image1": (1, 3, 64, 64)}, ("keypoints", "descriptors", "scores")),
+        ("dense", {"image": (1, 3, 64, 64)}, ("keypoints", "descriptors", "scores")),
+    ):
+        g = _Graph()
+        for output in outputs:
+            g.add("Identity", next(iter(inputs)), out=output)
+        wrong[name] = g.save(folder / f"{name}.onnx", [value(key, shape) for key, shape in inputs.items()], [value(each, None) for each in outputs])
+    return wrong
+
+
+def test_what_is_no_such_network_is_refused_in_one_line(tmp_path: Path) -> None:
+    for path in refused_networks(tmp_path).values():
+        for kind in (Detector, Matcher):
+            with pytest.raises(BadInput) as caught:
+                kind(path) if kind is Matcher else kind(path).features(squares()[0], None, 10)
+            assert "\n" not in str(caught.value)
+            assert str(path) in str(caught.value)
+    with pytest.raises(BadInput):
+        Detector(matcher(tmp_path / "m.onnx"))
+    with pytest.raises(BadInput):
+        Matcher(detector(tmp_path / "d.onnx"))
+    found = strongest(tmp_path / "d.onnx")
+    with pytest.raises(BadInput):  # of another detector
+        Matcher(tmp_path / "m.onnx").matches(found, Features(found.xy, found.seen, found.size, np.zeros((len(found.xy), WIDE + 1), np.float32)))
+
+
+def test_a_missing_file_or_package_and_one_of_two_networks_are_mistakes_of_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, other = str(detector(tmp_path / "d.onnx")), str(matcher(tmp_path / "m.onnx"))
+    assert given_networks("off", "off") is None
+    assert given_networks(path, other) == (Path(path), Path(other))
+    for given in ((path, "off"), ("off", other), (path, str(tmp_path / "absent.onnx")), (str(tmp_path), other)):
+        with pytest.raises(UsageError):
+            given_networks(*given)
+    with pytest.raises(BadInput):
+        given_networks(other, path)
+    job = Job(settings=PosesSettings(features_model=path), out=tmp_path / "out", work=tmp_path / "work", source=STILL_LIFE)
+    with pytest.raises(UsageError):  # before cameras are looked for
+        cameras_of_photographs(job, lambda *_, **__: None)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[rembg\]'"):
+        given_networks(path, other)
+
+
+def test_the_networks_count_as_sources(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), squares()[0])
+    settings = PosesSettings(features_model=str(tmp_path / "d.onnx"), matcher_model=str(tmp_path / "m.onnx"))
+    assert STAGE.source_files is not None
+    assert set(STAGE.source_files(tmp_path, settings)) - set(STAGE.source_files(tmp_path, PosesSettings())) == {tmp_path / "d.onnx", tmp_path / "m.onnx"}
+
+
+def test_photographs_without_cameras_are_compared_with_others_and_those_with_what_they_overlap_with_most() -> None:
+    overlaps = {(i, j): 100 - 10 * (j - i) for i in range(1, 9) for j in range(i + 1, 9)} | {(2, 9): 0}
+    pairs = pairs_of([0], [(0, 8), (7, 0), (0, 6)], overlaps)
+    assert pairs == [(0, 6), (0, 7), (0, 8), (6, 7)]
+    assert pairs_of([0, 1, 2], [(0, 1), (2, 0), (1, 2)], {}) == [(0, 1), (0, 2), (1, 2)]
+    every = pairs_of([0], [(0, j) for j in range(1, 9)], overlaps)
+    assert all(sum(i in pair for pair in every) >= 1 + NEIGHBOURS for i in range(1, 8))
+
+
+def some(count: int) -> tuple[list[str], dict[str, Any]]:
+    truth = true_centres(TRUTH)
+    names = sorted(sorted((path.name for path in STILL_LIFE.glob("*.jpg")), key=lambda name: -truth[name][0])[:count])
+    if len(names) < count:
+        pytest.skip("examples/still_life is not there")
+    return names, truth
+
+
+def errors_of(capture: Any, truth: dict[str, Any]) -> np.ndarray:
+    photos = capture.photos
+    return np.asarray(aligned_errors(np.array([photo.camera.centre for photo in photos]), np.array([truth[photo.camera.name] for photo in photos])))
+
+
+def test_cameras_are_found_where_sift_finds_none(tmp_path: Path) -> None:
+    """Two dozen features of a photograph are too few."""
+    names, truth = some(6)
+    asked: dict[str, Any] = {"max_side": 480, "features": 24, **QUIET}
+    networks = detector(tmp_path / "d.onnx"), matcher(tmp_path / "m.onnx")
+    capture = find_cameras(STILL_LIFE, names, work=tmp_path / "work", networks=networks, **asked)
+    rungs: list[dict[str, Any]] = capture.facts["rungs"]  # type: ignore[assignment]
+    first = next(number for number, rung in enumerate(rungs) if rung["rung"] in (ladder.NETWORK, ladder.NETWORK_ANEW))
+    assert max(rung["registered"] for rung in rungs[:first]) < 3
+    assert len(capture.photos) == 6
+    assert errors_of(capture, truth).max() < 0.05
+
+
+def test_a_photograph_without_features_of_sift_gets_its_camera_among_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names, truth = some(6)
+    detect = matches.extract_features
+
+    def without_the_third(work: Path, images: Any, **how: Any) -> None:
+        detect(work, images, **how)
+        if any(image.file == "00002.png" for image in images):
+            forget(work, FEATURES, [3])
+            with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
+                database.write_keypoints(3, np.zeros((0, 6), np.float32))
+                database.write_descriptors(3, pycolmap.FeatureDescriptors(data=np.zeros((0, 128), np.uint8), type=pycolmap.FeatureExtractorType.SIFT))
+
+    monkeypatch.setattr(matches, "extract_features", without_the_third)
+    networks = detector(tmp_path / "d.onnx", "COLMAP"), matcher(tmp_path / "m.onnx", "COLMAP")
+    asked: dict[str, Any] = {"max_side": 360, "features": 4096, "matching": "auto", "seed": 0, "masks": {}, **QUIET}
+    usual = reconstruct(STILL_LIFE, names, work=tmp_path / "without", threads=1, **asked)
+    found = [reconstruct(STILL_LIFE, names, work=tmp_path / f"with {threads}", threads=threads, networks=networks, **asked) for threads in (1, 2)]
+    assert [name for name, _ in usual.rejected] == [names[2]]
+    before, after = (list(capture.facts["rungs"]) for capture in (usual, found[0]))  # type: ignore[call-overload]
+    assert after[: len(before)] == before, "what is tried before it is the same"
+    assert found[0].rejected == ()
+    assert errors_of(found[0], truth).max() < 0.02
+    for one, other in zip(*(capture.photos for capture in found), strict=True):
+        assert (one.camera.name, one.camera.params) == (other.camera.name, other.camera.params)
+        np.testing.assert_array_equal(one.camera.world_from_camera, other.camera.world_from_camera)
+    np.testing.assert_array_equal(found[0].points.xyz, found[1].points.xyz)  # type: ignore[union-attr]
