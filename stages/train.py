@@ -2,6 +2,7 @@
 
 field.safetensors  both fields, the density voxels, what they mean; the schedule; each photograph's gains where exposure was learned
 cameras.json       the training cameras, where they were refined
+choices.json       what training did otherwise than the scene and the settings state, where it learned nothing with them
 report.json        steps and seconds
 log.jsonl          a line every few steps
 curve.png          PSNR over steps
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,8 +33,11 @@ from stages.training.data import count_pixels, depth_range, pixels_of, refuse_pl
 from stages.training.log import TrainLog
 from stages.training.previews import Previews
 from stages.training.priors import Prior, mask_uncovered_cells
+from stages.training.watch import Watch
 
 if TYPE_CHECKING:
+    from efficientnerf.geometry.cameras import Camera
+    from efficientnerf.rendering.field_renderer import FieldRenderer
     from efficientnerf.training.loop import Trainer
     from efficientnerf.training.sparse_depth import SparseDepthRays
     from stages.io.scene import Scene, View
@@ -40,6 +45,12 @@ if TYPE_CHECKING:
 
 @compiling_kernels
 def run(job: Job) -> None:
+    while not trained(job):
+        pass
+
+
+def trained(job: Job) -> bool:
+    """Train and write the outputs; False where training has to begin again, with what `stages.training.watch` has chosen."""
     began = clock()
     from efficientnerf.model import model
     from efficientnerf.rendering.field_renderer import FieldRenderer
@@ -51,12 +62,12 @@ def run(job: Job) -> None:
 
     use_all_cores()
     folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
-    s = scene.load(folder)
+    watch = Watch(job, scene.load(folder), folder)
+    s = watch.scene
     views = scene.views_of(s, "train")
-    settings, space = with_camera_refinement(with_auto_sizes(job.settings, s, count_pixels(views)), s), field_file.space_of(s)
-    rows = rows_for_training(job, folder, views, settings, space)
+    settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views)), s), field_file.space_of(s)
     job.progress(0, settings.iterations, "reading images")
-    pixels = pixels_of(folder, views, rows)
+    pixels = pixels_of(folder, views, rows_for_training(job, folder, views, settings, space))
     near, far = depth_range(s, pixels, settings, job.warn)
     m = model(space, settings, s.background, job.device, (near, far))
     priors = mask_uncovered_cells(m, views, job)
@@ -65,9 +76,13 @@ def run(job: Job) -> None:
     checkpoints = Checkpoints(job)
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
-    previews = Previews(lambda camera: FieldRenderer(m, near, far).render(camera).colour, m.background, folder, s, job.work, given(settings.preview_every))
+    render = partial(colours_seen, FieldRenderer(m, near, far))
+    previews = Previews(render, m.background, folder, s, job.work, given(settings.preview_every))
     previews.draw_when_due(t.step)
-    budget = begin_budget(job, t, spent + clock() - began)
+    budget = begin_budget(job, t, watch.seconds + spent + clock() - began)
+    fails = partial(watch.begins_again, render, pixels, partial(checkpoints.save, t, log))
+    if fails(t.step, t.schedule.iterations, log.seconds):
+        return False
 
     log.begin_step()
     for done in loop.train(t, pixels, sparse_depth(job, folder, s, settings)):
@@ -81,23 +96,19 @@ def run(job: Job) -> None:
         job.progress(min(done.step, goal), goal, "training", **shown)
         if psnr is not None:
             log.draw_curve(job.work / TrainOutputs.curve)
-        if done.step % settings.checkpoint_every == 0 and not last:
-            checkpoints.save(t, log)
-        try:
-            job.safe_point()
-        except BaseException:
-            if not last:
-                checkpoints.save(t, log)
-            raise
+        if not last and fails(done.step, t.schedule.iterations, log.seconds):
+            return False
+        checkpoints.reach(t, log, every=settings.checkpoint_every, last=last)
         log.begin_step()
     log.flush()
-    job.record("schedule", t.schedule.state())
     field_file.save_model(m, near, far, outputs.field, gains_of(t, views), t.schedule)
     write_cameras(outputs.cameras, t, views)
-    write_report(outputs.report, job, t, log.seconds, previews.figures, priors)
+    watch.write_choices(outputs.choices)
+    write_report(outputs.report, job, t, log.seconds, previews.figures | watch.report(), priors)
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
     previews.publish(outputs.previews, job.warn)
+    return True
 
 
 def check(settings: Mapping[str, Any]) -> None:
@@ -106,6 +117,11 @@ def check(settings: Mapping[str, Any]) -> None:
     refuse_planes_out_of_order(own)
     if own.far_plane != "auto" and poses is not None and poses.space == "contracted":
         raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
+
+
+def colours_seen(renderer: FieldRenderer, camera: Camera) -> np.ndarray:
+    """Colours (H, W, 3) that a camera sees."""
+    return renderer.render(camera).colour
 
 
 def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> SparseDepthRays | None:
@@ -151,16 +167,21 @@ def write_cameras(path: Path, t: Trainer, views: tuple[View, ...]) -> None:
         refined_cameras.write(views, t.cameras.cameras, path)
 
 
-def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview: dict[str, float], priors: Sequence[Prior]) -> None:
-    """What was reached; the seconds differ from run to run."""
+def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[str, Any], priors: Sequence[Prior]) -> None:
+    """What was reached; the seconds differ from run to run.
+
+    found  figures of the last preview, and the early check's report
+    """
     settings = t.model.settings
+    job.record("schedule", t.schedule.state())
     report = {
         "iterations": t.schedule.iterations,
         "schedule": t.schedule.state(),
         "time_budget": job.settings.time_budget,
         "seconds": round(seconds, 1),
-        "preview_psnr": preview.get("preview_psnr"),
-        "preview_ssim": preview.get("preview_ssim"),
+        "preview_psnr": None,
+        "preview_ssim": None,
+        **found,
         "cameras": camera_changes(t),
         "priors": {prior.name: {"masked": round(prior.masked, 4), "contradicted": round(prior.contradicted, 4), "applied": prior.applied} for prior in priors},
         "occupied": t.model.voxels.occupied,
@@ -181,7 +202,7 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
 
 STAGE = Stage(
     name="train",
-    version=7,
+    version=8,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,

@@ -35,6 +35,8 @@ def refine_cameras(m: Model, pixels: Pixels, source: Pixels | DevicePixels, c: C
     """
     count = int(np.clip(PIXELS // len(c.given), MIN_PIXELS, MAX_PIXELS))
     chosen = [_choose(pixels, view, count, rng) for view in range(len(c.given))]
+    if not any(len(index) for index in chosen):
+        return 0.0
     colour, points = _rendered(m, source, np.concatenate(chosen), gains)
     ends = np.cumsum([len(index) for index in chosen])[:-1]
     seen = [

@@ -137,5 +137,10 @@ class TrainSettings:
     background_color: Literal["random", "scene"] = setting(
         "random", "Background of images with alpha in training: a random colour for each ray, or the scene's own.", advanced=True
     )
+    on_failure: Literal["retry", "continue", "stop"] = setting(
+        "retry",
+        "What follows where a tenth of the steps have taught nothing by the held-out views: short trainings without near planes, masks or min_views, or with"
+        " exposure or camera_refinement, the best of which training begins again with (retry); a warning alone (continue); or an error (stop).",
+    )
     checkpoint_every: PositiveInt = setting(250, "Steps between checkpoints.", advanced=True)
     preview_every: PositiveInt | Off = setting(500, "Steps between preview renders of a validation view; off: none.", advanced=True)

@@ -37,6 +37,17 @@ class Checkpoints:
         """From the oldest to the newest."""
         return sorted(self.job.work.glob("checkpoint_*.safetensors"))
 
+    def reach(self, t: Trainer, log: TrainLog, *, every: int, last: bool) -> None:
+        """A safe point after a step: saved where that is due, and where the run is interrupted here; after the last step there is nothing to go on to."""
+        if t.step % every == 0 and not last:
+            self.save(t, log)
+        try:
+            self.job.safe_point()
+        except BaseException:
+            if not last:
+                self.save(t, log)
+            raise
+
     def save(self, t: Trainer, log: TrainLog) -> None:
         """The trainer after its step, and the log up to it."""
         from efficientnerf.training.loop import state_of

@@ -1,0 +1,81 @@
+"""choices.json of the train stage: what training did otherwise than the scene and the settings state, where it learned nothing with them.
+
+What comes after reads the settings among them from the field, and the scene as training used it by `stages.io.refined_cameras.load_scene`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import msgspec
+import numpy as np
+
+from pipeline.files import write_json
+from stages.artifacts import TrainOutputs
+from stages.io.json_file import read_json
+from stages.io.scene_schema import decoded
+
+if TYPE_CHECKING:
+    from efficientnerf.training.settings import TrainSettings
+    from stages.io.scene import Scene
+
+FORMAT = 1
+AGAIN = "Train again."
+NEAR_SHARE = 0.1  # of the cameras' distance from the subject: a near plane that leaves out nothing that could be part of it
+
+
+@dataclass(frozen=True)
+class TrainingChoices:
+    """
+    near               near planes as the scene states them; none farther than their median; or none farther than NEAR_SHARE of the way to the subject
+    masks              whether the views' masks are used
+    min_views          whether `train.min_views` is
+    exposure           whether gains of the photographs are learned although the settings do not say so
+    camera_refinement  whether cameras are corrected, likewise
+    """
+
+    near: Literal["stated", "median", "off"] = "stated"
+    masks: bool = True
+    min_views: bool = True
+    exposure: bool = False
+    camera_refinement: bool = False
+
+    def settings(self, given: TrainSettings) -> TrainSettings:
+        """The settings with these choices."""
+        changes: dict[str, str] = {} if self.min_views else {"min_views": "off"}
+        changes |= {"exposure": "gain"} if self.exposure else {}
+        changes |= {"camera_refinement": "on"} if self.camera_refinement else {}
+        return replace(given, **changes)  # type: ignore[arg-type]
+
+    def scene(self, given: Scene) -> Scene:
+        """The scene with these choices: its near planes and masks."""
+        most = self._farthest_near(given)
+        if self.masks and most is None:
+            return given
+        views = (replace(view, near=view.near if most is None else min(view.near, most), mask=view.mask if self.masks else None) for view in given.views)
+        return replace(given, views=tuple(views))
+
+    def _farthest_near(self, s: Scene) -> float | None:
+        if self.near == "stated":
+            return None
+        return float(np.median([view.near for view in s.views])) if self.near == "median" else NEAR_SHARE * s.orbit.radius
+
+
+class _Document(msgspec.Struct):
+    format: Literal[1]
+    choices: TrainingChoices
+
+
+def write(choices: TrainingChoices, path: Path) -> None:
+    """Write choices.json."""
+    write_json(path, {"format": FORMAT, "choices": asdict(choices)})
+
+
+def load(train: Path) -> TrainingChoices:
+    """The choices of the train stage in a folder; where it made none, those that change nothing. Raises CorruptArtifact."""
+    path = TrainOutputs(train).choices
+    if not path.is_file():
+        return TrainingChoices()
+    return decoded(read_json(path, AGAIN), _Document, path, AGAIN).choices
