@@ -1,6 +1,8 @@
 """The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field, the baked asset, the mesh and the 3D Gaussians on the test views, and what parts
 the first two.
 
+    verdict.json       a grade, and for each finding its cause, what to do and the picture that shows it (stages.verdict.result)
+    sparse_points.png  where the asset's depth agrees with the sparse points, of the view where it does least (stages.evaluation.sparse_points)
     metrics.json       "network" (the field), "asset", "mesh" and, where there are Gaussians, "splats": means over the views; "gap", "holes", "floaters": the
                        asset against the network; "views": the metrics of each (stages.evaluation.summary, .comparison, .mesh, .splats)
     contact_sheet.png  ground truth, field and asset, with their errors
@@ -35,14 +37,16 @@ from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, Trai
 from stages.compiling import compiling_kernels
 from stages.evaluation.asset import EvaluatedAsset, evaluated
 from stages.evaluation.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view
-from stages.evaluation.findings import findings
+from stages.evaluation.judging import judge, training_figures
 from stages.evaluation.lpips_weights import find_weights, load_lpips
 from stages.evaluation.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
 from stages.evaluation.refinement import refinement_of
+from stages.evaluation.sparse_points import COUNTS, sure_points
 from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
 from stages.evaluation.splats import EvaluatedSplats, load_splats
 from stages.evaluation.strips import STRIP_RAYS, strip_views, write_strips
 from stages.evaluation.summary import in_words, quality, summary
+from stages.evaluation.trivial import BLURS
 from stages.evaluation.video import write_captured_path
 from stages.evaluation.views import constant_background, evaluation_views, evenly_spaced, stride_for
 from stages.io.scene import View
@@ -97,7 +101,7 @@ def check(settings: Mapping[str, Any]) -> None:
         find_weights(network, given(own.lpips_weights))
 
 
-Measured = str | float | dict[str, int | float | None] | None  # the name of a view, or its metrics
+Measured = str | float | dict[str, int | float | list[float] | None] | None  # the name of a view, or its metrics
 
 
 @compiling_kernels
@@ -158,34 +162,34 @@ def evaluate(
     rest = None if surrounded else stride_for([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
     composited = surrounded and constant_background(scene) is None
     perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in networks_of(settings)}
-    figures = []
+    points = sure_points(job.inputs[PosesOutputs.stage], scene, asset.reach)
+    figures, others = [], [name for name, known in (("splats", splats), ("sparse_points", points)) if known is not None]
     for k, view in enumerate(views):
         job.safe_point()
         job.progress(k, len(views), f"view {view.name}")
         done, with_field = job.work / f"view_{k:05d}.json", k in drawn
-        check = partial(_check, job.work, k, view, with_field=with_field, composited=composited, perceptual=[*perceptual], splats=splats is not None)
+        check = partial(_check, job.work, k, view, with_field=with_field, composited=composited, perceptual=[*perceptual], others=others)
         measured = noted(done, dict[str, Measured], warn, check)
         if measured is None:
             field = load_field() if with_field or not surrounded else None
             measured, images = evaluate_view(
                 asset, mesh, field, scene, view, job, with_field=with_field, stride=stride if with_field or rest is None else rest, perceptual=perceptual,
-                splats=splats,
+                splats=splats, points=points,
             )  # fmt: skip
             note(done, measured, _save_thumbnails(images, job.work, k) if with_field else ())
         figures.append(measured)
     job.progress(len(views), len(views))
     strips = write_strips(asset, mesh, load_field, scene, views, strip_views(figures), job, warn) if settings.strips == "on" else []
+    train = None if split == "train" else training_figures(asset, scene, job)
     metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips, mesh=mesh.facts,
-                      splats=None if splats is None else splats.facts, refinement=refinement)  # fmt: skip
+                      splats=None if splats is None else splats.facts, refinement=refinement, train=train)  # fmt: skip
     write_json(EvaluateOutputs(job.out).metrics, metrics)
     _write_sheet(metrics, drawn, job)
     frames = given(settings.captured_path_frames)
     if frames is not None:
         write_captured_path(asset, tree, scene, frames, job)
     job.say(in_words(metrics))
-    against = [metrics[name] for name in AGAINST_NETWORK]
-    for text in findings(metrics["gap"]["psnr"], *against, network_floaters=metrics["network"]["floaters"], **(refinement or {})):
-        job.warn(text)
+    judge(asset, scene, views, points, metrics, job)
 
 
 def _field_stride(views: Sequence[View], scale: float | None) -> int:
@@ -198,11 +202,12 @@ def _field_stride(views: Sequence[View], scale: float | None) -> int:
 
 def _check(
     folder: Path, k: int, view: View, measured: Mapping[str, Any], outputs: Collection[str], *, with_field: bool, composited: bool, perceptual: Sequence[str],
-    splats: bool,
+    others: Collection[str],
 ) -> None:
     """Raises where these are not the metrics of the k-th view as `evaluate_view` returns them, or a thumbnail is missing or can't be read.
 
     composited  whether there are metrics of the asset over the field's surroundings, too
+    others      of "splats" and "sparse_points" those that there are
     """
     from stages.io.png import read_png
 
@@ -212,9 +217,14 @@ def _check(
         raise ValueError("no metrics of this view")
     if with_field and not ({*names, *SAMPLE_SHARES, "floaters"} <= network.keys() and {*GAP} <= measured["gap"].keys()):
         raise ValueError("no metrics of the field")
+    flat = measured["trivial"]
+    if flat is not None and (not isinstance(flat["mean_colour"], float) or [type(each) for each in flat["blurred"]] != [float] * len(BLURS)):
+        raise ValueError("no figures of trivial pictures")
+    if "sparse_points" in others and not all(isinstance(measured["sparse_points"][name], int) for name in COUNTS):
+        raise ValueError("no comparison with sparse points")
     if not {*FIGURES} <= measured["mesh"].keys():
         raise ValueError("no metrics of the mesh")
-    if splats and not {*SPLATS_FIGURES} <= measured["splats"].keys():
+    if "splats" in others and not {*SPLATS_FIGURES} <= measured["splats"].keys():
         raise ValueError("no metrics of the Gaussians")
     if not all(isinstance(measured[name], int | float | None) for name in AGAINST_NETWORK):
         raise ValueError("no metrics of the asset against the field")
@@ -254,4 +264,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=7, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True, check=check)
+STAGE = Stage(name="evaluate", version=8, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True, check=check)

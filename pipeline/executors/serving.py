@@ -39,7 +39,7 @@ class Program(Protocol):
         """Make the run of a scene, or bring its settings up to date; returns warnings. Raises PipelineError."""
 
     def describe(self, run: Path) -> dict[str, Any]:
-        """What fleet.json shows of a run as it is now: "metrics", "bytes", "verdict"."""
+        """What fleet.json shows of a run as it is now: "metrics", "bytes", "verdict", "result"."""
 
     def space(self, run: Path, stage: str, memory: int | None) -> int:
         """Bytes that a stage which runs next writes at its peak, in this much memory."""

@@ -81,5 +81,8 @@ class Progress:
         if "metrics" in result:
             self.state.metrics = dict(result["metrics"] or {})
             self.state.bytes = int(result.get("bytes") or 0)
-            verdict = result.get("verdict")
-            self.state.verdict = None if verdict is None else Verdict(printable(verdict["grade"], 200), printable(verdict["summary"], 4 * LONGEST_LINE))
+            self.state.verdict, self.state.result = (_verdict(result.get(name)) for name in ("verdict", "result"))
+
+
+def _verdict(found: Mapping[str, Any] | None) -> Verdict | None:
+    return None if found is None else Verdict(printable(found["grade"], 200), printable(found["summary"], 4 * LONGEST_LINE))

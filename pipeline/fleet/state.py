@@ -89,7 +89,7 @@ class StageState:
 
 @dataclass
 class Verdict:
-    """What is to be thought of a scene's cameras."""
+    """What is to be thought of a scene's cameras, or of what was made of them."""
 
     grade: _Name
     summary: _Text
@@ -104,6 +104,7 @@ class SceneState:
     metrics     what its evaluation measured, as the workflow has it
     seconds     wall clock of its stages together
     bytes       of its asset
+    verdict     on its cameras; result: on what was made of them
     stage       that runs now
     last_lines  of a failed or quarantined scene: the last that its stage said
     attempts    failures so far of the stage that it is at
@@ -119,6 +120,7 @@ class SceneState:
     stage: _Name | None = None
     stages: dict[_Name, StageState] = field(default_factory=dict)
     verdict: Verdict | None = None
+    result: Verdict | None = None
     warnings: Annotated[list[_Text], msgspec.Meta(max_length=MOST_LINES)] = field(default_factory=list)
     last_lines: Annotated[list[_Text], msgspec.Meta(max_length=MOST_LINES)] = field(default_factory=list)
     attempts: Annotated[int, msgspec.Meta(ge=0, le=10**6)] = 0

@@ -55,8 +55,8 @@ def evaluated(tree: NerfTree) -> EvaluatedAsset:
     return EvaluatedAsset(whole, limits, nearer, inner=partial(render, cascade_tree(tree, 0)), box=bounds[0], reach=bounds[-1], behind=behind)
 
 
-def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """The asset's image of a view (H, W, 3), and the opacity of its voxels (H, W).
+def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The asset's image of a view (H, W, 3), and the opacity and the depth of its voxels (H, W).
 
     seen    the field's rendering on every stride-th pixel: the surroundings of an asset that shows none in an unbounded scene; else it is not looked at
     """
@@ -64,11 +64,11 @@ def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, str
     if background is None and asset.inner is None:
         return over_field(asset.render, view, seen, stride)
     output = asset.render(view.camera, background=background or asset.behind, normals=False)
-    return output.colour, output.opacity
+    return output.colour, output.opacity, output.depth
 
 
-def over_field(render_tree: RenderTree, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """What lies in the field's box rendered from a tree, between what the field shows before and behind it: (H, W, 3), and the tree's opacity (H, W).
+def over_field(render_tree: RenderTree, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What lies in the field's box rendered from a tree, between what the field shows before and behind it: (H, W, 3), and the tree's opacity and depth (H, W).
 
     before + (1 - before's alpha) (asset + (1 - asset's alpha) behind)
     """
@@ -76,4 +76,4 @@ def over_field(render_tree: RenderTree, view: View, seen: Any, stride: int) -> t
     size = (stride, view.camera.width, view.camera.height)
     before, behind = upsample(seen.before, *size), upsample(seen.behind, *size)
     middle = output.colour + (1.0 - output.opacity[..., None]) * behind
-    return before[..., :3] + (1.0 - before[..., 3:]) * middle, output.opacity
+    return before[..., :3] + (1.0 - before[..., 3:]) * middle, output.opacity, output.depth

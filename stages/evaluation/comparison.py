@@ -23,7 +23,9 @@ from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.evaluation.asset import EvaluatedAsset, over_field, render_asset
 from stages.evaluation.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
+from stages.evaluation.sparse_points import SurePoints, counts_of, judged
 from stages.evaluation.splats import EvaluatedSplats, splats_image, splats_metrics
+from stages.evaluation.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluation.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.io.scene import Scene, View
 
@@ -40,13 +42,14 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 def evaluate_view(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
-    perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None,
+    perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: SurePoints | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
     with_field  whether the field is measured; else it renders the surroundings of an asset without any, and nothing where these are constant
     stride      of the pixels that the field renders
     perceptual  LPIPS networks by the name of their metric
+    points      that the asset's depth is compared with
     """
     from stages.figures.plots import error_map, to_uint8
 
@@ -59,8 +62,9 @@ def evaluate_view(
         small_camera = subsample_camera(view.camera, stride)
         limits = asset.limits if with_field else None
         seen = field.render(small_camera, progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach, limits=limits)
-    image, opacity = render_asset(asset, scene, view, seen, stride)
+    image, opacity, depth = render_asset(asset, scene, view, seen, stride)
     image = clipped(image, job, f"{view.name}: the asset")
+    metrics |= {"trivial": trivial(truth), "sparse_points": None if points is None else against_points(points, scene, view, depth, truth)}
     size = {"width": view.camera.width, "height": view.camera.height}
     inside = upsample(seen.inside_opacity, stride, **size) >= 0.5 if unbounded and seen is not None else truth.inside
     metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(perceptual or {}, image, truth)}
@@ -105,6 +109,25 @@ def differences(
     holes, of_holes = (float(open_[used].mean()), float((open_ * excess)[used].mean())) if used.any() else (None, None)
     floaters, of_floaters, network["floaters"] = floating(asset, camera, opacity, seen, used, excess)
     return {"gap": gap, "holes": holes, "floaters": floaters, "holes_excess_error": of_holes, "floaters_excess_error": of_floaters}
+
+
+def trivial(truth: GroundTruth) -> dict[str, Any] | None:
+    """What pictures of its mean colour and of its blurs would score; None where no pixel counts."""
+    if truth.mask is not None and not truth.mask.any():
+        return None
+    return {"mean_colour": mean_colour_psnr(truth.colour, truth.mask), "blurred": blurred_psnrs(truth.colour, truth.mask)}
+
+
+def counting(truth: GroundTruth) -> np.ndarray:
+    """(H, W) bool: pixels of the photograph in which there is something to be hit."""
+    used = np.ones(truth.colour.shape[:2], bool) if truth.mask is None else truth.mask
+    return used if truth.inside is None else used & truth.inside
+
+
+def against_points(points: SurePoints, scene: Scene, view: View, depth: np.ndarray, truth: GroundTruth) -> dict[str, int]:
+    """COUNTS of the view's sparse points."""
+    _, kinds, subject = judged(points, scene.views.index(view), view.camera, depth, counting(truth))
+    return counts_of(kinds, subject)
 
 
 def squared_error(image: np.ndarray, truth: GroundTruth) -> np.ndarray:

@@ -6,6 +6,9 @@ asset_with_network_background  cascade 0 of a whole scene's asset between what t
 mesh            means over the views of what `stages.evaluation.mesh` measures, and how many faces and texels the mesh has
 splats          the same of the 3D Gaussians (`stages.evaluation.splats`); null where there are none
 gap, holes, floaters and the excess error of both  means over the views that the network was rendered for (`stages.evaluation.comparison`)
+train           the asset on some views that training saw (`stages.evaluation.judging`); null where that was not measured
+trivial         means of what pictures of one colour and blurred photographs would score on the views (`stages.evaluation.trivial`)
+sparse_points   how the asset's depth agrees with the sparse points (`stages.evaluation.sparse_points`); null where there are too few
 refinement      of the asset: its steps, and how many are usual; null where that is not known
 strips          the views whose pictures stand beside, with the figures of these
 views           the metrics of each view
@@ -19,7 +22,9 @@ from typing import Any
 
 from stages.evaluation.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES
 from stages.evaluation.mesh import FIGURES
+from stages.evaluation.sparse_points import agreement
 from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
+from stages.evaluation.trivial import BLURS
 
 FORMAT = 1
 
@@ -27,7 +32,7 @@ FORMAT = 1
 def summary(
     figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, mesh: Mapping[str, Any], perceptual: Sequence[str] = (),
     strips: Sequence[dict[str, Any]] = (), splats: Mapping[str, Any] | None = None,
-    refinement: Mapping[str, int] | None = None,
+    refinement: Mapping[str, int] | None = None, train: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The document of metrics.json.
 
@@ -38,6 +43,7 @@ def summary(
     splats      facts about the Gaussians, if there are any
     perceptual  names of LPIPS metrics
     refinement  the asset's, see `stages.evaluation.refinement`
+    train       figures of the asset on views that training saw
     """
     drawn = [view for view in figures if view["network"] is not None]
     networks, assets = [view["network"] for view in drawn], [view["asset"] for view in figures]
@@ -46,6 +52,7 @@ def summary(
     asset["on_network_views"] = means([view["asset"] for view in drawn])
     if background is not None:
         asset["background_scale"] = {"network_views": 1.0 / stride, "other_views": 1.0 / background}
+    plain = [view["trivial"] for view in figures if view["trivial"] is not None]
     composited = [view["asset_with_network_background"] for view in drawn if view["asset_with_network_background"] is not None]
     return {
         "format": FORMAT,
@@ -57,10 +64,18 @@ def summary(
         "asset_with_network_background": {**means(composited), "views": len(composited), "background_scale": 1.0 / stride} if composited else None,
         "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
         **means(drawn, AGAINST_NETWORK),
+        "train": None if train is None else dict(train),
+        "trivial": {"mean_colour": means(plain, ("mean_colour",))["mean_colour"], "blurs": list(BLURS), "blurred": _columns(plain)},
+        "sparse_points": agreement([view["sparse_points"] for view in figures]),
         "refinement": None if refinement is None else dict(refinement),
         "strips": list(strips),
         "views": list(figures),
     }
+
+
+def _columns(plain: Sequence[Mapping[str, Any]]) -> list[float]:
+    """The mean of each of `blurred`."""
+    return [math.fsum(column) / len(plain) for column in zip(*(view["blurred"] for view in plain), strict=True)]
 
 
 def means(figures: Sequence[Mapping[str, Any]], names: Sequence[str] = QUALITY) -> dict[str, float | None]:

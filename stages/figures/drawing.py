@@ -11,7 +11,7 @@ import tempfile
 from importlib.metadata import version
 from typing import Any
 
-from efficientnerf.backends.kernel_cache import first_private, cache_folder
+from efficientnerf.backends.kernel_cache import cache_folder, first_private
 
 
 @functools.cache

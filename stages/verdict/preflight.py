@@ -27,7 +27,8 @@ from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
 from stages.masking.turning import masks_of_turning_subject
 from stages.sfm import ladder, pairs
 from stages.verdict import looks, run_forecast
-from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, worded, zooms
+from stages.verdict.grades import GRADES
+from stages.verdict.verdict import FEW, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, worded, zooms
 
 SIDE = 560  # px, longest side of the pictures that overlap is told on
 FEATURES = 800  # of a picture

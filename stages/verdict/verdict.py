@@ -18,6 +18,7 @@ from efficientnerf.geometry.cameras import Camera
 from stages.io.capture import BACKGROUND, LEFT_OUT, Capture
 from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.verdict import looks as looks_of
+from stages.verdict.grades import GRADES
 from stages.verdict.looks import Look
 from stages.verdict.parallax import Parallax, parallax
 
@@ -25,7 +26,6 @@ LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose p
 MOVING = "moving_parts"  # fact: name of a photograph -> share of it that moves
 # Facts of a capture that stand among the figures.
 FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, "gps", "stated_cameras", BACKGROUND)
-GRADES = ("good", "usable", "poor", "failed")
 NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
 FEW = 12  # views all round a subject
 FEW_POINTS = 60  # sparse points of a photograph, below which its pose is doubtful

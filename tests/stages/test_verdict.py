@@ -14,8 +14,9 @@ from PIL import Image, ImageFilter
 from efficientnerf.geometry.cameras import Camera
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.verdict import looks, pictures
+from stages.verdict.grades import GRADES
 from stages.verdict.looks import Look, look
-from stages.verdict.verdict import GRADES, Verdict, failed, verdict_on
+from stages.verdict.verdict import Verdict, failed, verdict_on
 
 RNG = np.random.default_rng(0)
 PICTURE = cv2.resize(RNG.integers(40, 216, (120, 160), np.uint8), (640, 480), interpolation=cv2.INTER_LANCZOS4)

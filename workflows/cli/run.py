@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from workflows.cli.request import Plan
 
 
+GRADED = 6  # exit code of a run whose result is graded as --fail-on says
+
+
 @click.command(short_help="Run all stages on photographs or a data set, or resume a run.")
 @click.argument("sources", nargs=-1, type=folder_type, metavar="[SOURCE]...")
 @click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="The folder of the run.")
@@ -42,22 +45,29 @@ if TYPE_CHECKING:
 @click.option("--lens", metavar="LENS", help="fisheye, or equirectangular (360 degrees); sets poses.lens. By default photographs that say so are taken so.")
 @click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
+@click.option("--fail-on", type=click.Choice(["poor", "failed"]), help="Exit with code 6 where the result is graded so, or worse; all files are written.")
 @click.option("--dry-run", is_flag=True, help="Show what would be done and why; do nothing.")
 @json_option
 @quiet_option
 @common_options
-def run(sources: tuple[Path, ...], run_folder: Path, until: str | None, start: str | None, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+def run(
+    sources: tuple[Path, ...], run_folder: Path, until: str | None, start: str | None, fail_on: str | None, dry_run: bool, as_json: bool, quiet: bool,
+    **options: Any,
+) -> int:  # fmt: skip
     """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or resume RUN.
 
     SOURCE is a folder of photographs, a video, or the folder of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Several folders and
     videos of one scene may be given at once. Without any, RUN is resumed with the settings that it recorded; options change them. Stages that are
     up to date are skipped.
+
+    The result is graded good, usable, poor or failed, in the first line and in RUN/evaluate/verdict.json with what to do; the exit code is 0 all the same,
+    unless --fail-on says otherwise.
     """
     from workflows.cli.request import Options, plan_run
 
     options |= {"format": options.pop("format_name"), "source": sources[0] if sources else None, "also": sources[1:]}
     plan = plan_run(run_folder, workflow(), Options(**options))
-    _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run)
+    return _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run, fail_on=fail_on)
 
 
 @click.command(short_help="Run one stage on the artifacts of a run.")
@@ -89,8 +99,8 @@ def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool
     _work(plan, as_json=as_json, quiet=quiet, only=name, force=force, dry_run=dry_run)
 
 
-def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection: Any) -> None:
-    """Run a plan, display its progress, and print the summary."""
+def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str | None = None, **selection: Any) -> int:
+    """Run a plan, display its progress, and print the summary; returns the exit code."""
     import time
 
     from pipeline.executors.local import execute_alone
@@ -99,7 +109,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
     from workflows.cli.output import closing, write_json
     from workflows.cli.progress import display
     from workflows.report.pages import has_pages, write_pages
-    from workflows.report.summary import in_words, summary
+    from workflows.report.summary import graded, in_words, summary
 
     device = resolve_device(plan.device)
     _check_stages(selection)
@@ -117,10 +127,13 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
     except (Exception, KeyboardInterrupt) as error:
         raise Reported(error, summary(run.path, ())) from error
     facts = summary(run.path, outcomes)
+    found = None if dry_run or fail_on is None else graded(run.path, outcomes)
+    code = GRADED if found is not None and found.is_as_bad_as(str(fail_on)) else 0
     if as_json:
-        write_json({"event": "summary", "ok": True, **facts, "elapsed": time.monotonic() - started, "device": device, "exit_code": 0})
+        write_json({"event": "summary", "ok": code == 0, **facts, "elapsed": time.monotonic() - started, "device": device, "exit_code": code})
     elif not quiet and not dry_run:
         closing(*in_words(run.path, outcomes))
+    return code
 
 
 def _check_stages(selection: dict[str, Any]) -> None:

@@ -70,8 +70,9 @@ def status(run_folder: Path, as_json: bool) -> None:
         listing(line.rstrip())
         if entry["extra"]:
             listing(f"{'':<10} not written by it: {', '.join(entry['extra'][:5])}{' ...' if len(entry['extra']) > 5 else ''}")
-    if found["verdict"] is not None:
-        listing(printable(found["verdict"]["summary"], 300))
+    for name in ("verdict", "result"):
+        if found[name] is not None:
+            listing(printable(found[name]["summary"], 300))
     if found["written_by"] is not None:
         listing(f"It is being written by {found['written_by']}.")
 

@@ -202,7 +202,7 @@ def _run(folder: Path, scenes: Any, *, as_json: bool, quiet: bool, retry: Any, *
     if as_json:
         write_json({"event": "summary", "ok": found.exit_code == 0, "fleet": str(folder), "totals": asdict(found.totals), "exit_code": found.exit_code})
     elif not quiet:
-        closing(*_overview(folder, found), *(_line(scene) for scene in read_fleet(folder).scenes if scene.state in ("failed", "quarantined")))
+        closing(*_overview(folder, found), *(_line(scene) for scene in read_fleet(folder).scenes if _is_bad(scene)))
     return found.exit_code
 
 
@@ -215,9 +215,18 @@ def _overview(folder: Path, found: FleetState) -> list[str]:
     return lines
 
 
+def _is_bad(scene: SceneState) -> bool:
+    from workflows.fleet.table import BAD_GRADES
+
+    return scene.state in ("failed", "quarantined") or (scene.result is not None and scene.result.grade in BAD_GRADES)
+
+
 def _line(scene: SceneState) -> str:
+    from pipeline.text import printable
     from workflows.cli.progress import duration, size
 
     psnr = scene.metrics.get("asset", {}).get("psnr") if isinstance(scene.metrics.get("asset"), dict) else None
-    parts = [duration(scene.seconds) if scene.seconds else "", size(scene.bytes) if scene.bytes else "", f"{psnr:.2f} dB" if isinstance(psnr, float) else ""]
+    grade = "" if scene.result is None else f"{printable(scene.result.grade, 10)} result"
+    measures = [size(scene.bytes) if scene.bytes else "", f"{psnr:.2f} dB" if isinstance(psnr, float) else ""]
+    parts = [grade, duration(scene.seconds) if scene.seconds else "", *measures]
     return f"{scene.name:<24} {scene.state:<11} {'  '.join(part for part in (*parts, scene.stage or '', scene.reason or '') if part)}".rstrip()

@@ -38,8 +38,8 @@ class WorkflowProgram:
             return plan.warnings
 
     def describe(self, run: Path) -> dict[str, Any]:
-        """The verdict on its cameras, PSNR and SSIM of what was made, and the size of its asset."""
-        from workflows.inspection.status import camera_verdict
+        """The verdicts on its cameras and on what was made, PSNR and SSIM of that, and the size of its asset."""
+        from workflows.inspection.status import camera_verdict, result_verdict
         from workflows.report.summary import metrics
 
         found = metrics(run) or {}
@@ -48,7 +48,7 @@ class WorkflowProgram:
             size = BakeOutputs.of_run(run).asset.stat().st_size
         except OSError:
             size = 0
-        return {"metrics": shown, "bytes": size, "verdict": camera_verdict(run)}
+        return {"metrics": shown, "bytes": size, "verdict": camera_verdict(run), "result": result_verdict(run)}
 
     def space(self, run: Path, stage: str, memory: int | None) -> int:
         opened, settings = self._opened(run)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 BAR = 10  # characters
+BAD_GRADES = ("poor", "failed")  # of a result, that a fleet points out
 _ORDER = ("running", "failed", "quarantined", "done", "waiting")
 _STYLES = {"running": "cyan", "failed": "red", "quarantined": "red", "done": "green", "waiting": "dim"}
 _BELOW_AND_ABOVE = 5  # lines of the terminal that rows do not take
@@ -64,8 +65,8 @@ class LiveTable:
         from rich.text import Text
 
         made = Table(expand=True, box=None, pad_edge=False, caption=Text(overview(self.state)), caption_justify="left")
-        for title, align in (("scene", "left"), ("state", "left"), ("stage", "left"), ("time", "right"), ("PSNR", "right"), ("size", "right")):
-            made.add_column(title, justify=align, no_wrap=True, overflow="ellipsis")  # type: ignore[arg-type]
+        for title in ("scene", "state", "stage", "time", "result", "PSNR", "size"):
+            made.add_column(title, justify="right" if title in ("time", "PSNR", "size") else "left", no_wrap=True, overflow="ellipsis")
         made.add_column("", ratio=1, no_wrap=True, overflow="ellipsis")
         shown = self.chosen(max(3, self.console.height - _BELOW_AND_ABOVE))
         for scene in shown:
@@ -90,16 +91,19 @@ class LiveTable:
         if scene.state == "running" and total > 0:
             filled = round(BAR * min(1.0, max(0.0, done / total)))
             note = f"{'━' * filled}{'╌' * (BAR - filled)} {min(1.0, done / total):4.0%} {text}"
+        grade = "" if scene.result is None else printable(scene.result.grade, 10)
         return (
-            printable(scene.name, 60), scene.state, printable(scene.stage or "", 20), duration(scene.seconds) if scene.seconds else "",
+            printable(scene.name, 60), scene.state, printable(scene.stage or "", 20), duration(scene.seconds) if scene.seconds else "", grade,
             f"{psnr:.2f}" if psnr is not None else "", size(scene.bytes) if scene.bytes else "", printable(note, 300),
         )  # fmt: skip
 
 
 def overview(state: FleetState) -> str:
-    """A line: scenes by state, and the forecast."""
+    """A line: scenes by state, how many of their results are poor or failed, and the forecast."""
     totals = Totals.of(state.scenes)
     counts = ((word, getattr(totals, word)) for word in ("done", "running", "waiting", "failed", "quarantined"))
     parts = [f"{count} {word}" for word, count in counts if count]
+    grades = [scene.result.grade for scene in state.scenes if scene.result is not None]
+    parts += [f"{grades.count(grade)} with a {grade} result" for grade in BAD_GRADES if grade in grades]
     ahead = "" if not state.forecast_seconds else f"; about {duration(state.forecast_seconds)} to go"
     return (", ".join(parts) or "no scenes") + ahead + (f"; {printable(state.note, 300)}" if state.note else "")

@@ -15,17 +15,29 @@ def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
     """A run, who is writing it, and its stages."""
     holder = run.holder()
     facts: dict[str, Any] = {"run": str(run.path), "source": run.source, "also": run.also, "preset": run.preset, "seed": run.seed, "device": run.device}
-    facts |= {"verdict": camera_verdict(run.path), "written_by": None if holder is None else holder.text()}
+    facts |= {"verdict": camera_verdict(run.path), "result": result_verdict(run.path), "written_by": None if holder is None else holder.text()}
     return {**facts, "stages": [_stage(each) for each in decisions]}
 
 
 def camera_verdict(run: Path) -> dict[str, Any] | None:
     """The grade of the cameras and a sentence; None where there are none yet, or they say nothing that can be read."""
-    from pipeline import files
     from stages.artifacts import PosesOutputs
 
+    return _verdict(PosesOutputs.of_run(run).verdict)
+
+
+def result_verdict(run: Path) -> dict[str, Any] | None:
+    """The same of what was made."""
+    from stages.artifacts import EvaluateOutputs
+
+    return _verdict(EvaluateOutputs.of_run(run).verdict)
+
+
+def _verdict(path: Path) -> dict[str, Any] | None:
+    from pipeline import files
+
     try:
-        found = files.read_json(PosesOutputs.of_run(run).verdict)
+        found = files.read_json(path)
     except (OSError, files.Unreadable):
         return None
     if not isinstance(found, dict) or not all(isinstance(found.get(key), str) for key in ("grade", "summary")):

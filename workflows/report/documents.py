@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from pipeline import files
+from stages.verdict.grades import GRADES
 
 T = TypeVar("T")
 
@@ -66,13 +67,6 @@ class Strip(msgspec.Struct):
     mesh: Quality | None = None
 
 
-class Refinement(msgspec.Struct):
-    """Steps that an asset was refined in, and how many are usual."""
-
-    steps: int | None = None
-    usual_steps: int | None = None
-
-
 class Metrics(msgspec.Struct):
     """metrics.json, as far as it is shown; see `stages.evaluation.summary`."""
 
@@ -85,9 +79,6 @@ class Metrics(msgspec.Struct):
     gap: Quality | None = None
     holes: float | None = None
     floaters: float | None = None
-    holes_excess_error: float | None = None
-    floaters_excess_error: float | None = None
-    refinement: Refinement | None = None
     strips: list[Strip] = []
     views: list[ViewQuality] = []
 
@@ -106,6 +97,28 @@ class PosesReport(msgspec.Struct):
     reprojection_error: float | None = None
     rejected: list[Rejected] | None = None
     warnings: list[str] | None = None
+
+
+class ResultFinding(msgspec.Struct):
+    """Something that stands against a result: what it comes from, what to do, and the picture in the run that shows it."""
+
+    grade: str = ""
+    sentence: str = ""
+    cause: str = ""
+    remedy: str = ""
+    picture: str = ""
+
+
+class ResultVerdict(msgspec.Struct):
+    """The verdict on a result, as far as it is shown."""
+
+    grade: str = ""
+    summary: str = ""
+    findings: list[ResultFinding] = []
+
+    def is_as_bad_as(self, grade: str) -> bool:
+        """Whether the grade is this one, or worse."""
+        return self.grade in GRADES[GRADES.index(grade) :]
 
 
 class CameraProblem(msgspec.Struct):

@@ -23,8 +23,8 @@ from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOu
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents
-from workflows.report.documents import CameraVerdict, Damaged, Metrics, PosesReport, Quality
-from workflows.report.summary import against_network, findings_of, quality_in_words, split_of
+from workflows.report.documents import CameraVerdict, Damaged, Metrics, PosesReport, Quality, ResultVerdict
+from workflows.report.summary import against_network, quality_in_words, split_of
 
 if TYPE_CHECKING:
     from pipeline.decide import Decision
@@ -51,8 +51,11 @@ DOWNLOADS = (
     (POSES.scene, "cameras and splits"),
     (EVALUATE.captured_path, "the asset along the captured cameras, H.264"),
     (EVALUATE.metrics, "all figures"),
+    (EVALUATE.verdict, "the verdict on the result"),
 )
 TEMPLATE = "report.html.j2"
+# The pictures that a verdict on a result refers to: no other path of a file that may come from anybody is a link.
+SHOWN = (EVALUATE.strip_worst, EVALUATE.strip_median, EVALUATE.contact_sheet, EVALUATE.sparse_points, MESH.check, SPLATS.preview, POSES.cameras)
 ATTEMPTS = 5  # to find no stage replaced while the page was made
 LONGEST = 1000  # characters of a text that is shown
 
@@ -120,7 +123,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         preset=run.preset,
         quality=quality_in_words(found),
         against=against_network(found),
-        findings=findings_of(found),
+        result=_result(folder, damaged),
         means=_means(found),
         strips=_strips(found),
         split=split_of(found),
@@ -198,6 +201,16 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
     if report.reprojection_error is not None:
         text += f", mean reprojection error {report.reprojection_error:.2f} px"
     return {"text": text, "rejected": [(each.name, each.reason) for each in report.rejected or []], "warnings": report.warnings or []}
+
+
+def _result(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
+    """The verdict on the result: its grade, a sentence, and a row for each finding with the picture that shows it."""
+    found: ResultVerdict | None = _read(folder / EVALUATE.verdict, ResultVerdict, damaged)
+    if found is None:
+        return None
+    pictures = {name.as_posix(): name for name in SHOWN}
+    rows = [(each.grade, each.sentence, f"{each.cause} {each.remedy}", pictures.get(each.picture)) for each in found.findings]
+    return {"grade": found.grade, "summary": found.summary, "findings": rows}
 
 
 def _verdict(folder: Path, damaged: list[str]) -> dict[str, Any] | None:

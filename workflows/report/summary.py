@@ -10,10 +10,11 @@ from typing import Any
 import msgspec
 
 from pipeline.runner import Outcome
+from pipeline.text import printable
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.progress import duration, size
 from workflows.report import documents
-from workflows.report.documents import Metrics
+from workflows.report.documents import Metrics, ResultFinding, ResultVerdict
 
 RUN = Path()
 # The files of a run that a user wants.
@@ -22,6 +23,7 @@ ARTIFACTS = {
     "field": TrainOutputs.of_run(RUN).field,
     "asset": BakeOutputs.of_run(RUN).asset,
     "metrics": EvaluateOutputs.of_run(RUN).metrics,
+    "verdict": EvaluateOutputs.of_run(RUN).verdict,
     "captured_path": EvaluateOutputs.of_run(RUN).captured_path,
     "strip_worst": EvaluateOutputs.of_run(RUN).strip_worst,
     "strip_median": EvaluateOutputs.of_run(RUN).strip_median,
@@ -49,8 +51,23 @@ def artifacts(run: Path) -> dict[str, str]:
 
 def metrics(run: Path) -> dict[str, Any] | None:
     """RUN/evaluate/metrics.json, or None where it is missing or damaged."""
+    return _document(EvaluateOutputs.of_run(run).metrics, Metrics)
+
+
+def result(run: Path) -> dict[str, Any] | None:
+    """RUN/evaluate/verdict.json, or None where it is missing or damaged."""
+    return _document(EvaluateOutputs.of_run(run).verdict, ResultVerdict)
+
+
+def graded(run: Path, outcomes: Sequence[Outcome]) -> ResultVerdict | None:
+    """The verdict on the result that these outcomes of stages made; None where they did not come so far. Of no outcomes: the one that is there."""
+    document = result(run) if not outcomes or any(outcome.stage == EvaluateOutputs.stage for outcome in outcomes) else None
+    return None if document is None else msgspec.convert(document, ResultVerdict)
+
+
+def _document(path: Path, kind: type[Any]) -> dict[str, Any] | None:
     try:
-        found = documents.read(EvaluateOutputs.of_run(run).metrics, Metrics)
+        found = documents.read(path, kind)
     except documents.Damaged:
         return None
     return None if found is None else found[1]
@@ -61,6 +78,7 @@ def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     return {
         "run": str(run),
         "artifacts": artifacts(run),
+        "result": result(run),
         "metrics": metrics(run),
         "seconds": {outcome.stage: outcome.seconds for outcome in outcomes},
         "stages": [
@@ -71,7 +89,8 @@ def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
-    """The summary as lines."""
+    """The summary as lines: the grade of the result first, where it was evaluated."""
+    verdict = graded(run, outcomes)
     ran = [outcome for outcome in outcomes if outcome.action == "ran"]
     spent = sum(outcome.seconds for outcome in ran)
     if ran:
@@ -79,6 +98,9 @@ def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
         lines = [f"{run}: done in {duration(spent)} ({parts})" if len(ran) > 1 else f"{run}: {ran[0].stage} done in {duration(spent)}"]
     else:
         lines = [f"{run}: everything is up to date"]
+    if verdict is not None:
+        what = lines[0].removeprefix(f"{run}: ")
+        lines = [f"{run}: good; {what}"] if verdict.grade == "good" else [f"{run}: {printable(verdict.summary, 400)}", f"  {what}"]
     for name, path in artifacts(run).items():
         if name in TITLES:
             shown = os.path.relpath(path) if not os.path.relpath(path).startswith("..") else path
@@ -87,7 +109,13 @@ def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
     found = None if document is None else msgspec.convert(document, Metrics)
     if (quality := quality_in_words(found)) is not None:
         lines.append(f"  {'quality':<10} {quality}")
-    return lines + [f"  {'':<10} {text}" for text in (against_network(found), *findings_of(found)) if text]
+    findings = [] if verdict is None else [finding_in_words(each) for each in verdict.findings]
+    return lines + [f"  {'':<10} {text}" for text in (against_network(found), *findings) if text]
+
+
+def finding_in_words(found: ResultFinding) -> str:
+    """What stands against the result, what it comes from, what to do, and where to look."""
+    return printable(f"{found.grade}: {found.sentence} {found.cause} {found.remedy} ({found.picture})", 1000)
 
 
 def quality_in_words(found: Metrics | None) -> str | None:
@@ -111,18 +139,6 @@ def against_network(found: Metrics | None) -> str | None:
         parts.append(f"gap {found.gap.psnr:+.2f} dB" + ("" if found.gap.ssim is None else f", {found.gap.ssim:+.3f} SSIM"))
     parts += [f"{name} {share:.2%}".replace("%", " %") for name, share in (("holes", found.holes), ("floaters", found.floaters)) if share is not None]
     return "; ".join(parts) or None
-
-
-def findings_of(found: Metrics | None) -> list[str]:
-    """What is poor, what it means and what to do about it."""
-    from stages.evaluation.findings import findings
-
-    if found is None:
-        return []
-    gap = None if found.gap is None else found.gap.psnr
-    floaters = None if found.network is None else found.network.floaters
-    steps = {} if found.refinement is None else msgspec.structs.asdict(found.refinement)
-    return findings(gap, found.holes, found.floaters, found.holes_excess_error, found.floaters_excess_error, network_floaters=floaters, **steps)
 
 
 def split_of(found: Metrics | None) -> str:

@@ -81,3 +81,12 @@ def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, splats: Eva
 
 def figures_of(job: Job) -> dict[str, Any]:
     return json.loads((job.out / "metrics.json").read_text())
+
+
+def verdict_of(job: Job) -> dict[str, Any]:
+    return json.loads((job.out / "verdict.json").read_text())
+
+
+def findings_of(job: Job) -> set[str]:
+    """What stands against a result."""
+    return {each["what"] for each in verdict_of(job)["findings"]}

@@ -66,7 +66,7 @@ def test_the_captured_path_is_a_video_of_the_asset(tmp_path: Path) -> None:
     assert frames[0].shape == (352, 480, 3)
     first = TREE.render(replace(load(tmp_path / "poses").views[0].camera, width=480, height=352, params=(560.0, 240.0, 176.0)), background=WHITE).colour
     assert np.abs(frames[0] / 255.0 - first).mean() < 0.02, "it begins at the first photograph"
-    assert sorted(path.name for path in job.out.iterdir()) == ["captured_path.mp4", "contact_sheet.png", "metrics.json"]
+    assert sorted(path.name for path in job.out.iterdir()) == ["captured_path.mp4", "contact_sheet.png", "metrics.json", "verdict.json"]
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +89,6 @@ def test_damaged_strips_and_frames_are_made_again(whole: tuple[Path, Job], tmp_p
     job = job_in(tmp_path, poses, undisturbed.settings)
     measure(TREE, lambda: BallField(TREE, background=WHITE), job)
     names = [path.name for path in sorted(undisturbed.out.iterdir())]
-    assert len(names) == 5
+    assert len(names) == 6
     for name in names:
         assert (job.out / name).read_bytes() == (undisturbed.out / name).read_bytes()

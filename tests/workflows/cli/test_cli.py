@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.workflows.command import Enerf, Result
+from workflows.report import summary
+from workflows.report.documents import ResultVerdict
 
 
 def recorded(run: Path) -> dict[str, dict[str, object]]:
@@ -337,3 +339,19 @@ def test_another_ctrl_c_while_an_interrupted_process_ends_prints_no_traceback(tm
     assert done.returncode == -signal.SIGINT  # the process ended at once
     assert "Traceback" not in done.stderr
     assert "interrupted" in done.stderr.lower()
+
+
+@pytest.mark.parametrize(("grade", "fail_on", "code"), [
+    ("failed", None, 0), ("failed", "failed", 6), ("failed", "poor", 6), ("poor", "failed", 0), ("poor", "poor", 6), ("usable", "poor", 0), (None, "poor", 0),
+])  # fmt: skip
+def test_a_bad_result_is_an_exit_code_where_it_is_asked_for(
+    enerf: Enerf, toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grade: str | None, fail_on: str | None, code: int
+) -> None:
+    monkeypatch.setattr(summary, "graded", lambda run, outcomes: None if grade is None else ResultVerdict(grade, f"Result: {grade}."))
+    found = enerf("run", toys, "--out", tmp_path / "run", "--json", *([] if fail_on is None else ["--fail-on", fail_on]))
+    assert (found.code, found.objects[-1]["exit_code"], found.objects[-1]["ok"]) == (code, code, code == 0)
+    assert (tmp_path / "run/points/points.ply").is_file()
+
+
+def test_a_grade_to_fail_on_is_one_that_is_bad(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+    assert enerf("run", toys, "--out", tmp_path / "run", "--fail-on", "good").code == 2

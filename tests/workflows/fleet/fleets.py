@@ -22,7 +22,8 @@ def done(name: str, psnr: float = 30.0, seconds: float = 8.0, size: int = 2_000_
     """A scene that is done; its stages took equally long."""
     stages = {stage: StageState("done", seconds / len(STAGES)) for stage in STAGES}
     metrics = {"asset": {"psnr": psnr, "ssim": 0.9}, "network": {"psnr": psnr + 1, "ssim": 0.95}}
-    return SceneState(name, "done", metrics=metrics, seconds=seconds, bytes=size, stages=stages, run=name, verdict=Verdict("good", "All is well."), **more)  # type: ignore[arg-type]
+    verdicts = {"verdict": Verdict("good", "All is well."), "result": Verdict("poor", f"All is fog {NASTY}.")}
+    return SceneState(name, "done", metrics=metrics, seconds=seconds, bytes=size, stages=stages, run=name, **verdicts, **more)  # type: ignore[arg-type]
 
 
 def fleet(*scenes: SceneState, state: str = "running") -> FleetState:

@@ -34,6 +34,8 @@ def test_the_page_has_what_the_state_has() -> None:
     assert [scene["name"] for scene in found["scenes"]] == [scene.name for scene in state.scenes]
     first, broken = found["scenes"][0], found["scenes"][3]
     assert (first["psnr"], first["ssim"], first["seconds"], first["bytes"], first["grade"]) == (20, 0.9, 10, 1_000_000, "good")
+    assert (first["result"], first["result_summary"]) == ("poor", printable(f"All is fog {NASTY}."))
+    assert (broken["result"], broken["result_summary"]) == (None, None)
     assert first["report"] == "scene-000/report.html"
     assert first["picture"] == "thumbnails/scene-000.webp?7"
     assert first["video"] == "scene-000/turntable/turntable.mp4"

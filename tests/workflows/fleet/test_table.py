@@ -26,7 +26,7 @@ def test_what_runs_stands_first_and_the_rest_is_counted() -> None:
     lines = printed(table).splitlines()
     assert [line.split()[1] for line in lines[1:8]] == ["running"] * 4 + ["quarantined"] * 3
     assert "and 33 more" in lines[8]
-    assert lines[-1].strip() == "28 done, 4 running, 4 waiting, 4 quarantined; about 1 min 30 s to go"
+    assert lines[-1].strip() == "28 done, 4 running, 4 waiting, 4 quarantined, 28 with a poor result; about 1 min 30 s to go"
     assert len(lines) <= 12
 
 

@@ -13,9 +13,10 @@ from urllib.parse import unquote
 import pytest
 
 from pipeline.run import Run
+from pipeline.runner import Outcome
 from tests.workflows.command import Enerf, Result
 from workflows.report.page import page
-from workflows.report.summary import in_words
+from workflows.report.summary import in_words, summary
 
 
 class Links(HTMLParser):
@@ -42,11 +43,14 @@ def links(text: str) -> list[str]:
     return parser.found
 
 
-def a_run(folder: Path, metrics: Any = None) -> Run:
+def a_run(folder: Path, metrics: Any = None, verdict: Any = None) -> Run:
     run = Run.create(folder, Path("/photos/<b>chairs</b>"), {"train": {"iterations": 3}})
     if metrics is not None:
         (folder / "evaluate").mkdir()
         (folder / "evaluate/metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
+    if verdict is not None:
+        (folder / "evaluate").mkdir(exist_ok=True)
+        (folder / "evaluate/verdict.json").write_text(json.dumps(verdict), encoding="utf-8")
     return run
 
 
@@ -136,8 +140,12 @@ POOR = {
 }
 
 
-def test_the_page_shows_the_asset_against_its_network_and_what_is_poor(tmp_path: Path) -> None:
-    run = a_run(tmp_path / "run", POOR)
+FINDING = {"grade": "poor", "sentence": "It has <b>.", "cause": "Few rays.", "remedy": "Raise bake.max_mib.", "picture": "evaluate/strip_worst.png"}
+VERDICT = {"grade": "poor", "summary": "Result: poor. It has <b>.", "blur": 0.03, "findings": [FINDING]}
+
+
+def test_the_page_shows_the_asset_against_its_network_and_the_verdict(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run", POOR, VERDICT)
     for name in ("strip_worst.png", "strip_best.png", "captured_path.mp4"):
         (run.path / "evaluate" / name).write_bytes(b"x")
     text = page(run, [])
@@ -145,38 +153,39 @@ def test_the_page_shows_the_asset_against_its_network_and_what_is_poor(tmp_path:
     assert {"evaluate/strip_worst.png", "evaluate/strip_best.png", "evaluate/captured_path.mp4"} <= set(found)
     assert "evaluate/strip_median.png" not in found
     for shown in ("gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %", "28.75", "-2.25", "&lt;b&gt;.jpg: photograph | network 25.00 dB, 0.800 SSIM |",
-                  "1.89 dB behind its network", "The asset has holes: 3.4 %", "The asset has floaters: 5.1 %"):  # fmt: skip
+                  "Result: poor. It has &lt;b&gt;.", "<td>Few rays. Raise bake.max_mib.</td>"):  # fmt: skip
         assert shown in text, shown
+    assert found.count("evaluate/strip_worst.png") == 3, "of the finding, of the strip and its link"
 
 
-def test_the_closing_summary_says_so_too(tmp_path: Path) -> None:
-    run = a_run(tmp_path / "run", POOR)
+@pytest.mark.parametrize("picture", ["../../etc/passwd", "/etc/passwd", "javascript:alert(1)", "poses/images/a.png", "evaluate/strip_worst.png/..", ""])
+def test_a_finding_links_to_no_other_picture(tmp_path: Path, picture: str) -> None:
+    run = a_run(tmp_path / "run", POOR, VERDICT | {"findings": [FINDING | {"picture": picture}]})
+    (run.path / "evaluate/strip_worst.png").write_bytes(b"x")
+    assert set(links(page(run, []))) == {"evaluate/metrics.json", "evaluate/verdict.json", "evaluate/strip_worst.png"}
+
+
+def test_the_closing_summary_begins_with_the_grade(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run", POOR, VERDICT)
     (run.path / "evaluate/strip_worst.png").write_bytes(b"x")
     lines = in_words(run.path, [])
+    assert "poor" in lines[0]
     assert any("network 29.84 dB PSNR, 0.910 SSIM; asset 27.95 dB PSNR" in line for line in lines)
     assert any("gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %" in line for line in lines)
-    assert any("bake.max_mib" in line for line in lines)
-    assert any("strip_worst.png" in line for line in lines)
-    better = in_words(a_run(tmp_path / "better", POOR | {"holes_excess_error": -1e-4, "floaters_excess_error": 0.0}).path, [])
-    assert any("dB behind its network" in line for line in better)
-    assert not any("the asset has" in line for line in better), "the photographs side with the asset there"
-    good = a_run(tmp_path / "good", POOR | {"gap": {"psnr": -0.1, "ssim": None}, "holes": 0.0, "floaters": 0.012})
+    assert any("bake.max_mib" in line and "Few rays." in line and "evaluate/strip_worst.png" in line for line in lines)
+    good = a_run(tmp_path / "good", POOR, {"grade": "good", "summary": "Result: good.", "findings": []})
     lines = in_words(good.path, [])
-    assert lines[-1].strip() == "gap -0.10 dB; holes 0.00 %; floaters 1.20 %"
+    assert "good" in lines[0]
+    assert lines[-1].strip() == "gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %"
+    assert summary(good.path, [])["result"]["grade"] == "good"
+    assert summary(a_run(tmp_path / "none", POOR).path, [])["result"] is None
 
 
-def test_where_the_refinement_was_short_that_is_the_advice(tmp_path: Path) -> None:
-    short = "refinement had 2 steps, where 827 are usual"
-    lines = in_words(a_run(tmp_path / "short", POOR | {"refinement": {"steps": 2, "usual_steps": 827}}).path, [])
-    assert sum(short in line for line in lines) == 1
-    assert any("the asset has holes: 3.4 %" in line for line in lines)
-    assert any("the asset has floaters: 5.1 %" in line for line in lines)
-    assert not any(setting in line for line in lines for setting in ("bake.weight_threshold", "bake.min_component"))
-    usual = in_words(a_run(tmp_path / "usual", POOR | {"refinement": {"steps": 800, "usual_steps": 827}}).path, [])
-    assert not any("are usual" in line for line in usual)
-    assert any("bake.min_component" in line for line in usual)
-    good = in_words(a_run(tmp_path / "good", {"gap": {"psnr": -0.1}, "refinement": {"steps": 2, "usual_steps": 827}}).path, [])
-    assert not any(short in line for line in good)
+def test_the_grade_is_of_a_result_that_was_evaluated_now(tmp_path: Path) -> None:
+    """Not of one that an earlier command left."""
+    run = a_run(tmp_path / "run", POOR, VERDICT)
+    assert not any("poor" in line for line in in_words(run.path, [Outcome("train", "ran", "never run", 1.0, 1, "x")]))
+    assert "poor" in in_words(run.path, [Outcome("evaluate", "ran", "never run", 1.0, 1, "x")])[0]
 
 
 def write(run: Run, name: str, text: str) -> None:
@@ -191,6 +200,7 @@ ODD = {
         '{"views": 7}', '{"views": [3]}', '{"views": [{"name": ["x"]}]}', '{"network": []}', '{"split": {}}', "[1]", "3", "[" * 100_000,
         '{"network": {"psnr": NaN}}', '{"gap": 3}', '{"holes": "many"}', '{"holes": 1e999}', '{"strips": {"which": "worst"}}', '{"strips": [{"which": 1}]}',
     ],
+    "evaluate/verdict.json": ["[1]", '{"grade": 3}', '{"findings": {}}', '{"findings": [{"picture": []}]}', '"\\ud800"', "[" * 100_000],
     "poses/report.json": ['{"registered": 5}', '{"rejected": {"a": 1}}', '{"rejected": [{"name": 3}]}', '{"warnings": 4}', '"\\ud800"',
         '{"\\ud800": 1}', '{"reprojection_error": "far"}'],
     "bake/report.json": ["[]", '"text"', '{"voxels": ' + "9" * 5000 + "}", "\0"],
@@ -201,12 +211,13 @@ ODD = {
 def test_odd_documents_are_left_out_with_a_word(enerf: Enerf, tmp_path: Path) -> None:
     for name, texts in ODD.items():
         for k, text in enumerate(texts):
-            run = a_run(tmp_path / f"{name.partition('/')[0]} {k}")
+            run = a_run(tmp_path / f"{name.replace('/', ' ')} {k}")
             write(run, name, text)
             shown = page(run, [])
             links(shown)
             assert f"{name}: damaged (" in shown, text[:80]
-    for command in (["report", run.path], ["status", run.path], ["inspect", tmp_path / "evaluate 0"], ["inspect", tmp_path / "evaluate 0", "--json"]):
+    odd = tmp_path / "evaluate metrics.json 0"
+    for command in (["report", run.path], ["status", run.path], ["inspect", odd], ["inspect", odd, "--json"]):
         result = enerf(*command)
         assert result.code == 0, result.err
     assert result.object["damaged"][0].startswith("evaluate/metrics.json: damaged (")

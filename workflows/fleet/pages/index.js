@@ -29,11 +29,12 @@ const columns = [
   { key: "name", title: "scene", of: (s) => s.name },
   { key: "state", title: "state", of: (s) => rank(STATES)(s.state), text: (s) => s.state },
   ...fleet.sweep.map((setting) => ({ key: setting, title: setting, of: (s) => (s.sweep ? s.sweep[setting] : null), text: (s) => (s.sweep && setting in s.sweep ? shown(s.sweep[setting]) : ""), kind: "n" })),
+  { key: "result", title: "result", of: (s) => rank(GRADES)(s.result), text: (s) => s.result || "", kind: "word", why: (s) => s.result_summary },
   { key: "psnr", title: "PSNR / dB", of: (s) => s.psnr, text: (s) => fixed(2)(s.psnr), kind: "n", down: true },
   { key: "ssim", title: "SSIM", of: (s) => s.ssim, text: (s) => fixed(3)(s.ssim), kind: "n", down: true },
   { key: "seconds", title: "time", of: (s) => s.seconds || null, text: (s) => (s.seconds ? duration(s.seconds) : ""), kind: "n", down: true },
   { key: "bytes", title: "MB", of: (s) => s.bytes || null, text: (s) => megabytes(s.bytes), kind: "n", down: true },
-  { key: "cameras", title: "cameras", of: (s) => rank(GRADES)(s.grade), text: (s) => s.grade || "", kind: "word" },
+  { key: "cameras", title: "cameras", of: (s) => rank(GRADES)(s.grade), text: (s) => s.grade || "", kind: "word", why: (s) => s.summary },
   { key: "warnings", title: "warnings", of: (s) => s.warnings.length || null, text: (s) => s.warnings.length || "", kind: "n", down: true },
 ];
 
@@ -100,9 +101,9 @@ function row(scene) {
   made.append(thumbnail(scene), nameCell(scene));
   for (const column of columns.slice(1)) {
     const cell = element("td", column.key === "state" ? null : column.text(scene), column.kind || "word");
-    cell.dataset.label = column.key === "state" || column.key === "cameras" ? "" : column.title;
+    cell.dataset.label = column.key === "state" || column.why ? "" : column.title;
     if (column.key === "state") cell.append(element("span", scene.state, `state ${scene.state}`));
-    if (column.key === "cameras" && scene.grade) { cell.classList.add(GRADES.includes(scene.grade) ? scene.grade : "bad"); cell.title = scene.summary; }
+    if (column.why && column.text(scene)) { cell.classList.add(GRADES.includes(column.text(scene)) ? column.text(scene) : "bad"); cell.title = column.why(scene); }
     made.append(cell);
   }
   const cell = element("td"), button = element("button", "…", "more");
@@ -132,6 +133,7 @@ function detailsRow(scene) {
   cell.colSpan = columns.length + 2;
   entry(list, "reason", scene.reason);
   if (scene.lines.length) entry(list, "last lines", element("pre", scene.lines.join("\n")));
+  entry(list, "result", scene.result_summary);
   entry(list, "cameras", scene.summary);
   for (const text of scene.warnings) entry(list, "warning", text);
   entry(list, "sources", scene.sources.join(", "));
@@ -157,7 +159,7 @@ function toggle(scene, open = !scene.details) {
   writeAddress();
 }
 
-const words = (scene) => [scene.name, scene.state, scene.stage, scene.reason, scene.grade, scene.summary, scene.settings, scene.worker, ...scene.warnings].filter(Boolean).join("\n").toLowerCase();
+const words = (scene) => [scene.name, scene.state, scene.stage, scene.reason, scene.grade, scene.summary, scene.result, scene.result_summary, scene.settings, scene.worker, ...scene.warnings].filter(Boolean).join("\n").toLowerCase();
 let visible = fleet.scenes;
 function apply() {
   const terms = wanted.filter.toLowerCase().split(/\s+/).filter(Boolean);

@@ -95,6 +95,8 @@ def _scene(scene: SceneState, picture: int | None, *, reported: bool) -> dict[st
         "bytes": scene.bytes,
         "grade": scene.verdict and printable(scene.verdict.grade, 20),
         "summary": scene.verdict and printable(scene.verdict.summary),
+        "result": scene.result and printable(scene.result.grade, 20),
+        "result_summary": scene.result and printable(scene.result.summary),
         "sources": [printable(source, LONGEST) for source in scene.sources],
         "settings": _settings(scene),
         "stages": [(name, stage.state, stage.seconds) for name, stage in scene.stages.items()],

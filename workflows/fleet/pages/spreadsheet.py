@@ -21,6 +21,7 @@ COLUMNS = (
     "seconds",
     "bytes",
     "cameras",
+    "result",
     "warnings",
     "attempts",
     "reason",
@@ -49,10 +50,10 @@ def fleet_csv(state: FleetState) -> str:
 
 def _row(scene: SceneState) -> list[Any]:
     quality = quality_of(scene)
-    grade = None if scene.verdict is None else scene.verdict.grade
+    cameras, result = (None if each is None else each.grade for each in (scene.verdict, scene.result))
     return [
-        scene.name, scene.state, scene.stage, quality["psnr"], quality["ssim"], scene.seconds, scene.bytes, grade, len(scene.warnings), scene.attempts,
-        scene.reason, scene.worker, scene.run, " ".join(scene.sources), scene.preset, scene.seed,
+        scene.name, scene.state, scene.stage, quality["psnr"], quality["ssim"], scene.seconds, scene.bytes, cameras, result, len(scene.warnings),
+        scene.attempts, scene.reason, scene.worker, scene.run, " ".join(scene.sources), scene.preset, scene.seed,
     ]  # fmt: skip
 
 

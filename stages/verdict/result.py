@@ -1,0 +1,360 @@
+"""What is to be thought of a result: a grade, and for each finding its likely cause, what to do, and the picture that shows it.
+
+    good    nothing stands against it
+    usable  it shows the scene; parts are worse than they need be, or nobody can say
+    poor    its pictures show less than strongly blurred photographs, or the asset is not where the scene is
+    failed  its pictures show hardly more than one colour would
+
+The figures are those of metrics.json (`stages.evaluation.summary`) and the verdict on the cameras; nothing else is looked at, so that worse figures never
+give a better grade. Each threshold and its reason: docs/experiments/verdict.md.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
+from stages.evaluation.trivial import equivalent_blur
+from stages.io.importers.source import abbreviated
+from stages.verdict.grades import GRADES
+
+USABLE_BLUR, POOR_BLUR, FAILED_BLUR = 0.0125, 0.0225, 0.04  # of the longest side: the blur that costs as much, beyond which a result is no better
+FAILED_GAIN = 3.0  # dB over one colour, below which less than half of what a photograph shows is there
+COLOURS_OFF = 2.0  # dB that fitted colours gain, from which exposure or white balance differ
+POOR_VIEWS = 0.25  # of the views
+GAP, LARGE_GAP = -0.5, -1.5  # dB of the asset behind its network: said; parts are worse than they need be
+HOLES, MANY_HOLES = 0.01, 0.1  # share of the pixels
+FLOATERS, MANY_FLOATERS = 0.02, 0.15  # share of the asset's opacity, more than the network's own
+SHORT = 0.5  # of the steps that are usual: a refinement with fewer comes before other causes
+AGREEING, LEAST_AGREEING = 0.6, 0.3  # share of the sparse points that the asset's depth agrees with
+MISSING, MOST_MISSING = 0.3, 0.6  # share of the subject's sparse points that the asset lies behind
+LEARNED_BY_HEART = 5.0  # dB of views that training saw over those it did not
+
+RUN = EvaluateOutputs.stage
+SHEET = f"{RUN}/{EvaluateOutputs.contact_sheet}"
+DEPTH = f"{RUN}/{EvaluateOutputs.sparse_points}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """
+    what      a word for it
+    grade     the best that a result with it can have
+    sentence  it, in words
+    cause     what it is likely to come from
+    remedy    what to do
+    picture   that shows it: its path in the run
+    images    names of the views that show it
+    """
+
+    what: str
+    grade: str
+    sentence: str
+    cause: str
+    remedy: str
+    picture: str
+    images: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """All of it in a line."""
+        return f"{self.sentence} {self.cause} {self.remedy} ({self.picture})"
+
+
+@dataclass(frozen=True)
+class CameraVerdict:
+    """Of the verdict on the cameras its grade, and the sentence and the remedy of the worst problem, where it has one."""
+
+    grade: str
+    sentence: str = ""
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class ResultVerdict:
+    """
+    grade     one of GRADES
+    findings  worst first
+    figures   that it was made from
+    """
+
+    grade: str
+    findings: tuple[Finding, ...]
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {"grade": self.grade, "summary": self.summary(), **self.figures, "findings": [asdict(each) for each in self.findings]}
+
+    def summary(self) -> str:
+        """A sentence: the grade, and why."""
+        worst = next((each for each in self.findings if each.grade == self.grade != "good"), None)
+        if worst is not None:
+            return f"Result: {self.grade}. {worst.sentence}"
+        psnr, blur = self.figures["psnr"], self.figures["blur"]
+        if psnr is None or blur is None:
+            return f"Result: {self.grade}."
+        return f"Result: {self.grade}; {psnr:.2f} dB on {self.figures['views']}, {blur_in_words(blur)}."
+
+
+def blur_in_words(blur: float) -> str:
+    """What a PSNR amounts to."""
+    return f"as near to the photographs as these are after a blur of {100 * blur:.1f} % of their longest side"
+
+
+def verdict_on_result(metrics: Mapping[str, Any], cameras: CameraVerdict | None = None) -> ResultVerdict:
+    """
+    metrics  the document of metrics.json
+    cameras  the verdict on the cameras, where there is one
+    """
+    figures = _figures(metrics, cameras)
+    strip = _strip(metrics)
+    found = [
+        *_of_held_out(metrics, figures, cameras, strip),
+        *_of_single_views(metrics, figures, strip),
+        *_of_gap(metrics, strip),
+        *_of_holes(metrics, strip),
+        *_of_floaters(metrics, strip),
+        *_of_sparse_points(metrics),
+        *_of_mesh(metrics, figures),
+        *_of_splats(metrics, figures),
+        *_of_cameras(cameras),
+    ]
+    ordered = tuple(sorted(found, key=lambda each: -GRADES.index(each.grade)))
+    return ResultVerdict(ordered[0].grade if ordered else "good", ordered, figures)
+
+
+def _figures(metrics: Mapping[str, Any], cameras: CameraVerdict | None) -> dict[str, Any]:
+    """What grades are made from: PSNR with fitted colours, for exposure that nobody can know of a photograph that was held out is no fault of the asset's.
+
+    blur ..._blur  `equivalent_blur`: medians over the views; of mesh and Gaussians with as many decibels more as fitting its colours gives the asset
+    gain           PSNR with fitted colours over that of pictures of one colour, means over the views
+    """
+    views = [view for view in metrics["views"] if view["trivial"] is not None and view["asset"]["psnr_colour_fitted"] is not None]
+    train, split = metrics.get("train"), metrics["split"]
+    fitted = [view["asset"]["psnr_colour_fitted"] for view in views]
+    flat = [view["trivial"]["mean_colour"] for view in views]
+    drawn = [view for view in views if view["network"] is not None and view["network"]["psnr_colour_fitted"] is not None]
+    return {
+        "views": f"{len(views)} {'view' if len(views) == 1 else 'views'} that training {'saw' if split == 'train' else 'did not see'}",
+        "psnr": metrics["asset"]["psnr"],
+        "ssim": metrics["asset"]["ssim"],
+        "psnr_colour_fitted": math.fsum(fitted) / len(fitted) if fitted else None,
+        "mean_colour": math.fsum(flat) / len(flat) if flat else None,
+        "gain": math.fsum(fitted) / len(fitted) - math.fsum(flat) / len(flat) if fitted else None,
+        "blur": _median(view_blur(view) for view in views),
+        "network_blur": _median(equivalent_blur(view["network"]["psnr_colour_fitted"], view["trivial"]["blurred"]) for view in drawn),
+        "mesh_blur": _median(_other_blur(view, "mesh") for view in views),
+        "splats_blur": None if metrics["splats"] is None else _median(_other_blur(view, "splats") for view in views),
+        "train_psnr": None if train is None else train["psnr"],
+        "train_blur": None if train is None else train["blur"],
+        "cameras": None if cameras is None else cameras.grade,
+    }
+
+
+def view_blur(view: Mapping[str, Any]) -> float:
+    """`equivalent_blur` of the asset in a view, as metrics.json has it."""
+    return equivalent_blur(view["asset"]["psnr_colour_fitted"], view["trivial"]["blurred"])
+
+
+def _other_blur(view: Mapping[str, Any], what: str) -> float:
+    credit = view["asset"]["psnr_colour_fitted"] - view["asset"]["psnr"]
+    return equivalent_blur(view[what]["psnr"] + credit, view["trivial"]["blurred"])
+
+
+def _median(values: Iterable[float]) -> float | None:
+    known = list(values)
+    return statistics.median(known) if known else None
+
+
+def grade_of(blur: float, gain: float) -> str:
+    """Of the pictures of a result.
+
+    blur  `equivalent_blur`
+    gain  decibels over pictures of one colour
+    """
+    if gain < FAILED_GAIN and blur > FAILED_BLUR:
+        return "failed"
+    return "poor" if blur > POOR_BLUR else "usable" if blur > USABLE_BLUR else "good"
+
+
+def _strip(metrics: Mapping[str, Any]) -> str:
+    """The picture of the worst view; without strips the contact sheet."""
+    files = {each["which"]: each["file"] for each in metrics["strips"]}
+    name = files.get("worst") or files.get("median")
+    return f"{RUN}/{name}" if name else SHEET
+
+
+def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: CameraVerdict | None, strip: str) -> list[Finding]:
+    """Of the asset's pictures against photographs that training did not see."""
+    blur, gain = figures["blur"], figures["gain"]
+    if blur is None:
+        sentence = "No view was measured: its masks leave no pixel."
+        return [Finding("not measured", "usable", sentence, "The masks cover what the photographs show.", "Look at the masks (poses.masks).", SHEET)]
+    found = []
+    grade = grade_of(blur, gain)
+    if metrics["split"] == "train":
+        sentence = "All views were trained on: how others would look was not measured."
+        found.append(Finding("nothing held out", "usable", sentence, "No photograph was held out.", "Hold some out (poses.test_every).", strip))
+    if grade != "good":
+        if grade == "failed":
+            sentence = f"The asset shows hardly more than one colour: {figures['psnr']:.1f} dB on {figures['views']}, a picture of the mean colour has"
+            sentence += f" {figures['mean_colour']:.1f} dB."
+        else:
+            sentence = f"The asset's pictures are {'strongly ' if grade == 'poor' else ''}blurred: {figures['psnr']:.1f} dB on {figures['views']},"
+            sentence += f" {blur_in_words(blur)}."
+        found.append(Finding("pictures", grade, sentence, *_cause(metrics, figures, cameras, strip)))
+    off = figures["psnr_colour_fitted"] - figures["psnr"]
+    if grade in ("good", "usable") and off > COLOURS_OFF:
+        sentence = f"The colours of views are off by as much as costs {off:.1f} dB; what they show is right."
+        remedy = "Lock exposure and white balance, or learn them (train.exposure)."
+        flat = figures["psnr"] < figures["mean_colour"] + 1.0
+        found.append(Finding("colours", "usable" if flat else "good", sentence, "Exposure or white balance differ between photographs.", remedy, strip))
+    return found
+
+
+def _cause(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: CameraVerdict | None, strip: str) -> tuple[str, str, str]:
+    """The likeliest cause of pictures that are not good, what to do, and the picture to look at: what is known to come first."""
+    gap, points, short = metrics["gap"]["psnr"], metrics["sparse_points"], _short(metrics)
+    if points is not None and (points["subject_farther"] or 0.0) > MOST_MISSING:
+        return (*_missing(points["subject_farther"]), DEPTH)
+    if short is not None:
+        return (*short, strip)
+    if gap is not None and gap < LARGE_GAP:
+        return "The network had more: it was lost in baking.", "Give the asset more voxels (bake.max_mib) or more steps (bake.refine_steps).", strip
+    if cameras is not None and cameras.grade in ("poor", "failed"):
+        return f"The cameras are {cameras.grade}: {cameras.sentence}", cameras.remedy, f"{PosesOutputs.stage}/{PosesOutputs.cameras}"
+    train = figures["train_psnr"]
+    if train is not None and train - figures["psnr"] > LEARNED_BY_HEART:
+        cause = f"Views that training saw are right ({train:.1f} dB), and others not: too few photographs, cameras that are off, or something that moved."
+        return cause, "Take more photographs between those that are there; try train.camera_refinement=on.", SHEET
+    if points is not None and points["farther"] > MISSING:
+        return (*_missing(points["farther"]), DEPTH)
+    if points is not None and points["nearer"] > MISSING:
+        return f"Fog hangs before {100 * points['nearer']:.0f} % of the sparse points.", "Try train.camera_refinement=on and a longer training.", DEPTH
+    return "The network has learned too little.", "Give it more time (--budget, train.iterations) or --preset standard.", strip
+
+
+def _missing(share: float) -> tuple[str, str]:
+    cause = f"The asset is empty where {100 * share:.0f} % of the sparse points are: something kept density from being learned there."
+    return cause, "Try train.min_views=off, and without masks (poses.masks=ignore)."
+
+
+def _short(metrics: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Cause and remedy where the asset's refinement was short."""
+    done = metrics["refinement"]
+    if done is None or done["steps"] >= SHORT * done["usual_steps"]:
+        return None
+    steps, usual = done["steps"], done["usual_steps"]
+    cause = f"The asset's refinement had {steps:,} step{'' if steps == 1 else 's'}, where {usual:,} are usual."
+    return cause, "Give it more time (--budget, bake.time_budget) or steps (bake.refine_steps), fewer voxels (bake.max_mib), or a machine without other work."
+
+
+def _of_single_views(metrics: Mapping[str, Any], figures: Mapping[str, Any], strip: str) -> list[Finding]:
+    """Of views that are much worse than the others."""
+    views = [view for view in metrics["views"] if view["trivial"] is not None and view["asset"]["psnr_colour_fitted"] is not None]
+    bad = tuple(view["name"] for view in views if view_blur(view) > POOR_BLUR)
+    if not bad or figures["blur"] > POOR_BLUR:
+        return []
+    sentence = f"{len(bad)} of {len(views)} views {'is' if len(bad) == 1 else 'are'} much worse than the others: {abbreviated(bad)}."
+    cause = "Their cameras are off, they show what few others show, or something moved."
+    remedy = "Look at these photographs; take more from about there."
+    return [Finding("single views", "usable" if len(bad) > POOR_VIEWS * len(views) else "good", sentence, cause, remedy, strip, bad)]
+
+
+def _of_gap(metrics: Mapping[str, Any], strip: str) -> list[Finding]:
+    gap = metrics["gap"]["psnr"]
+    if gap is None or gap >= GAP:
+        return []
+    sentence = f"The asset is {-gap:.2f} dB behind its network on the same pixels: it has lost detail that the network had."
+    usual = ("It has too few voxels, or too few steps fitted them.", "Give it more voxels (bake.max_mib), or more steps to fit them (bake.refine_steps).")
+    return [Finding("gap", "usable" if gap < LARGE_GAP else "good", sentence, *(_short(metrics) or usual), strip)]
+
+
+def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[Finding]:
+    """Named only where the photographs side with the network."""
+    holes, excess = metrics["holes"], metrics["holes_excess_error"]
+    if holes is None or holes <= HOLES or (excess is not None and excess <= 0):
+        return []
+    sentence = f"The asset has holes: {100 * holes:.1f} % of the pixels show through where the network shows something solid."
+    remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or give them more room (bake.max_mib)."
+    usual = ("Voxels that few rays see were left out.", remedy)
+    return [Finding("holes", "poor" if holes > MANY_HOLES else "usable", sentence, *(_short(metrics) or usual), strip)]
+
+
+def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[Finding]:
+    """Named only where the photographs side with the network."""
+    floaters, own, excess = metrics["floaters"], metrics["network"]["floaters"] or 0.0, metrics["floaters_excess_error"]
+    if floaters is None or floaters - own <= FLOATERS or (excess is not None and excess <= 0):
+        return []
+    sentence = f"The asset has floaters: {100 * floaters:.1f} % of what it shows hangs before the network's surfaces (in the network itself {100 * own:.1f} %)."
+    usual = ("Faint voxels before the surfaces were kept.", "Drop faint voxels (a higher bake.weight_threshold) or small pieces (a higher bake.min_component).")
+    return [Finding("floaters", "poor" if floaters - own > MANY_FLOATERS else "usable", sentence, *(_short(metrics) or usual), strip)]
+
+
+def _of_sparse_points(metrics: Mapping[str, Any]) -> list[Finding]:
+    """Of the asset's depth where structure from motion found points."""
+    points = metrics["sparse_points"]
+    if points is None:
+        return []
+    found = []
+    missing = points["subject_farther"]
+    if missing is not None and missing > MISSING:
+        sentence = f"Parts of the subject are missing: the asset lies behind {100 * missing:.0f} % of the sparse points of it, or is empty there."
+        cause = "Something kept density from being learned there, or it was dropped in baking."
+        remedy = "Try train.min_views=off and without masks (poses.masks=ignore); a lower bake.weight_threshold."
+        found.append(Finding("missing", "poor" if missing > MOST_MISSING else "usable", sentence, cause, remedy, DEPTH))
+    if points["agreeing"] < AGREEING:
+        agreeing, nearer, farther = (f"{100 * points[name]:.0f} %" for name in ("agreeing", "nearer", "farther"))
+        sentence = f"The asset's depth agrees with {agreeing} of the sparse points: it is nearer than {nearer} of them, farther than {farther}."
+        cause = "Colours stand at a wrong depth: too few directions show the scene, or the cameras are off."
+        remedy = "Move sideways between photographs; try train.camera_refinement=on."
+        found.append(Finding("depth", "poor" if points["agreeing"] < LEAST_AGREEING else "usable", sentence, cause, remedy, DEPTH))
+    return found
+
+
+def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Finding]:
+    """Of the mesh where the asset is not strongly blurred itself; and whether there is one."""
+    picture = f"{MeshOutputs.stage}/{MeshOutputs.check}"
+    if metrics["mesh"]["faces"] == 0:
+        remedy = "Train longer, or set mesh.density_threshold by hand."
+        return [Finding("mesh", "usable", "The mesh is empty.", "The asset has no clear surface.", remedy, picture)]
+    if not _only_of_this(figures["mesh_blur"], figures):
+        return []
+    sentence = f"The mesh is far behind the asset: {metrics['mesh']['psnr']:.1f} dB, {blur_in_words(figures['mesh_blur'])}."
+    cause = "Its surface is not where the asset's is, or what it shows has none (fur, leaves, glass)."
+    return [Finding("mesh", "usable", sentence, cause, "Raise mesh.max_faces, or set mesh.density_threshold by hand; use the asset or the splats.", picture)]
+
+
+def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Finding]:
+    if not _only_of_this(figures["splats_blur"], figures):
+        return []
+    sentence = f"The 3D Gaussians are far behind the asset: {metrics['splats']['psnr']:.1f} dB, {blur_in_words(figures['splats_blur'])}."
+    picture = f"{SplatsOutputs.stage}/{SplatsOutputs.preview}"
+    return [Finding("splats", "usable", sentence, "They are too few, or too few steps fitted them.", "Raise splats.count or splats.iterations.", picture)]
+
+
+def _only_of_this(blur: float | None, figures: Mapping[str, Any]) -> bool:
+    """Whether pictures are strongly blurred, and those of the asset are not: else it has been said."""
+    return blur is not None and blur > POOR_BLUR and figures["blur"] is not None and figures["blur"] <= POOR_BLUR
+
+
+def _of_cameras(cameras: CameraVerdict | None) -> list[Finding]:
+    """What held-out photographs cannot show of cameras: that those which have none are missing, or that depth is a guess."""
+    if cameras is None or cameras.grade not in ("poor", "failed"):
+        return []
+    picture = f"{PosesOutputs.stage}/{PosesOutputs.cameras}"
+    sentence = f"The cameras are {cameras.grade}: {cameras.sentence}"
+    return [Finding("cameras", "usable", sentence, "The photographs, as the verdict on the cameras has it.", cameras.remedy, picture)]
+
+
+def camera_verdict_of(document: Any) -> CameraVerdict | None:
+    """Of the document of poses/verdict.json; None where it says nothing that can be read."""
+    if not isinstance(document, dict) or document.get("grade") not in GRADES:
+        return None
+    problems: Sequence[Any] = document.get("problems") or ()
+    worst: Mapping[str, Any] = next((each for each in problems if each.get("grade") == document["grade"]), {})
+    return CameraVerdict(document["grade"], worst.get("sentence", ""), worst.get("remedy", ""))
