@@ -14,7 +14,7 @@ from workflows.cli.output import plain
 from workflows.cli.progress import size
 from workflows.cli.target import ASSET, describe_asset, is_run, open_run
 
-MESHES = tuple(dict.fromkeys(each.extension for each in (*MESH_EXPORTERS.values(), *POINT_EXPORTERS.values()) if each.extra is None))  # trimesh reads these
+MESHES = tuple(dict.fromkeys(each.extension for each in (*MESH_EXPORTERS.values(), *POINT_EXPORTERS.values()) if each.extra is None))
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -49,7 +49,9 @@ def _describe_file(path: Path) -> dict[str, Any]:
         if splats is not None:
             return {"what": "splats", "path": str(path), "bytes": path.stat().st_size, **splats}
     if suffix in MESHES:
-        return {"what": "mesh", "path": str(path), "bytes": path.stat().st_size, **_describe_mesh(path)}
+        from stages.io.meshes.description import describe_mesh
+
+        return {"what": "mesh", "path": str(path), "bytes": path.stat().st_size, **describe_mesh(path)}
     if path.name == PosesOutputs.scene:
         from stages.io import scene
 
@@ -91,27 +93,6 @@ def _describe_run(path: Path) -> dict[str, Any]:
         found["scene"] = scene.describe(PosesOutputs.of_run(path).folder)
     if "asset" in found["artifacts"]:
         found["asset"] = describe_asset(BakeOutputs.of_run(path).asset)
-    return found
-
-
-def _describe_mesh(path: Path) -> dict[str, Any]:
-    import trimesh
-
-    try:
-        with open(path, "rb") as file:  # not by its path: trimesh would open what the file names, textures and all
-            loaded = trimesh.load(file, file_type=path.suffix[1:].lower(), process=False, skip_materials=True)
-    except Exception as error:  # trimesh raises whatever the broken file made it stumble over
-        raise BadInput(f"{path}: cannot be read as {path.suffix} ({' '.join(str(error).split())[:200] or type(error).__name__}).") from error
-    if isinstance(loaded, trimesh.Scene):
-        loaded = loaded.to_geometry()
-    vertices = getattr(loaded, "vertices", None)
-    if vertices is None or len(vertices) == 0:
-        raise BadInput(f"{path}: holds no vertices.")
-    faces = getattr(loaded, "faces", None)
-    bounds = [vertices.min(0).tolist(), vertices.max(0).tolist()]
-    found: dict[str, Any] = {"vertices": len(vertices), "faces": 0 if faces is None else len(faces), "bounds": bounds}
-    if found["faces"]:
-        found["watertight"] = bool(loaded.is_watertight)
     return found
 
 

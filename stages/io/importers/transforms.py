@@ -31,6 +31,7 @@ from stages.io.importers.masks import masks_of
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, Found, ImportSettings, Source, missing_images_warning, moved_images_warnings
 from stages.io.importers.transforms_camera import lens_of, pose_of
 from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
+from stages.io.meshes.ply import read_ply
 from stages.io.pictures import Header, UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
@@ -322,17 +323,13 @@ def _points(source: Source, document: dict[str, Any]) -> tuple[SparsePoints | No
     if path is None or source.real(path).stat().st_size > MAX_PLY:
         why = "missing" if path is None else "larger than 1 GiB"
         return None, [f"ply_file_path {printable(document['ply_file_path'], MAX_NAME)}: {why}; the points are not used."]
-    import trimesh
-
     try:
         with source.real(path).open("rb") as file:
-            cloud = trimesh.load(file, file_type="ply", process=False)
-        xyz = np.asarray(cloud.vertices, np.float64).reshape(-1, 3)
-        colours = getattr(cloud, "colors", None)
-        colours = cloud.visual.vertex_colors if colours is None else colours
-        rgb = np.asarray(colours, np.uint8)[:, :3] if len(np.asarray(colours)) == len(xyz) else np.full((len(xyz), 3), 128, np.uint8)
-    except Exception as error:  # trimesh raises whatever its parser stumbles over
-        return None, [f"{path.name}: not readable as a PLY of points ({type(error).__name__}: {str(error)[:80]}); the points are not used."]
+            cloud = read_ply(file, os.fstat(file.fileno()).st_size)
+    except (OSError, ValueError, OverflowError) as error:
+        return None, [f"{path.name}: not readable as a PLY of points ({printable(error, 80)}); the points are not used."]
+    xyz = cloud.vertices
+    rgb = np.full((len(xyz), 3), 128, np.uint8) if cloud.colours is None else cloud.colours
     usable = (np.abs(xyz) <= LARGEST_NUMBER).all(-1)  # not nan either
     if not usable.any():
         return None, [f"{path.name}: holds no points; not used."]

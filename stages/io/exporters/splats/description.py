@@ -19,28 +19,18 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from pipeline.errors import BadInput
-from pipeline.files import Unreadable, json_value, open_plain
+from pipeline.files import Unreadable, open_plain
 from pipeline.text import printable
 from stages.io.exporters.splats import gltf, spz
+from stages.io.meshes.geometry import AT_ONCE, Damaged, exactly
+from stages.io.meshes.glb import Glb
+from stages.io.meshes.ply import MAX_HEADER, TYPES
 
-AT_ONCE = 2**16  # Gaussians
-MAX_PLY_HEADER = 2**16  # bytes
-MAX_GLTF_STRIDE = 252  # bytes; glTF 2.0, bufferView.byteStride
 MAX_GLTF_JSON = 2**24  # bytes; of Gaussians it takes a few thousand
 DENSEST = 1032  # bytes that one byte of deflate, or of a zstd frame as SPZ writes them, can stand for
 SPZ_DEGREES = range(5)
 STREAMS = 6  # of SPZ 4, at least: places, opacities, colours, scales, rotations, harmonics
-_PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4",
-    "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
 _PLY_NAMES = {*"xyz", *(f"{name}_{k}" for name, count in (("f_dc", 3), ("scale", 3), ("rot", 4)) for k in range(count)), "opacity"}
-_GLTF_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_GLTF_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-
-
-class _Damaged(ValueError):
-    """What is wrong, for a message that names the file."""
 
 
 @dataclass
@@ -101,7 +91,7 @@ def describe_splats(path: Path) -> dict[str, Any] | None:
             found = readers[path.suffix.lower()](file, os.fstat(file.fileno()).st_size)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read ({error.strerror or error}).") from error
-    except (_Damaged, Unreadable, struct.error) as error:
+    except (Damaged, Unreadable, struct.error) as error:
         raise BadInput(f"{path}: {error}. Write the file again with the program that made it.") from error
     return None if found is None else found.facts()
 
@@ -110,32 +100,32 @@ def describe_splats(path: Path) -> dict[str, Any] | None:
 
 
 def _ply(file: BinaryIO, size: int) -> _Found | None:
-    head = file.read(MAX_PLY_HEADER)
+    head = file.read(MAX_HEADER)
     end = re.search(rb"\nend_header\r?\n", head)
     if not head.startswith(b"ply") or end is None:
         return None
     lines = [line.strip() for line in head[: end.start()].decode("ascii", "replace").splitlines()]
     names = {line.split()[-1] for line in lines if line.startswith("property ")}
     if {"packed_position", "packed_rotation"} <= names:
-        raise _Damaged("a PLY compressed as SuperSplat does it; expected the columns of 3DGS (convert it: splat-transform in.ply out.ply)")
+        raise Damaged("a PLY compressed as SuperSplat does it; expected the columns of 3DGS (convert it: splat-transform in.ply out.ply)")
     if _PLY_NAMES - names:
         return None
     order = {"format binary_little_endian 1.0": "<", "format binary_big_endian 1.0": ">"}.get(next((line for line in lines if line.startswith("format")), ""))
     if order is None:
-        raise _Damaged("a PLY of 3D Gaussians that is not binary; expected 'format binary_little_endian 1.0'")
+        raise Damaged("a PLY of 3D Gaussians that is not binary; expected 'format binary_little_endian 1.0'")
     count, rows, more = _ply_rows(lines, order)
     start = end.end()
     if _PLY_NAMES - {*(rows.names or ())}:
-        raise _Damaged("its vertices lack columns of Gaussians, which other elements have")
+        raise Damaged("its vertices lack columns of Gaussians, which other elements have")
     if size < start + count * rows.itemsize or (size > start + count * rows.itemsize and not more):
-        raise _Damaged(f"{size} bytes; expected {start + count * rows.itemsize} for the {count} Gaussians that its header names")
+        raise Damaged(f"{size} bytes; expected {start + count * rows.itemsize} for the {count} Gaussians that its header names")
     above = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in rows.names or ())
     if above not in (0, 9, 24, 45, 72):
-        raise _Damaged(f"{above} columns f_rest_*; expected 0, 9, 24, 45 or 72")
+        raise Damaged(f"{above} columns f_rest_*; expected 0, 9, 24, 45 or 72")
     found = _Found("PLY (3DGS)", count, round((above / 3 + 1) ** 0.5) - 1, notes=[printable(line[8:], 200) for line in lines if line.startswith("comment ")])
     file.seek(start)
     for some in _pieces(count):
-        part = np.frombuffer(_exactly(file, some * rows.itemsize), rows)
+        part = np.frombuffer(exactly(file, some * rows.itemsize), rows)
         found.places.add(np.stack([part[name] for name in "xyz"], axis=1))
         with np.errstate(over="ignore", invalid="ignore"):
             found.scales.add(np.exp(np.stack([part[f"scale_{k}"] for k in range(3)], axis=1).astype(np.float64)))
@@ -148,15 +138,15 @@ def _ply_rows(lines: list[str], order: str) -> tuple[int, np.dtype[Any], bool]:
     elements = [number for number, line in enumerate(lines) if line.startswith("element ")]
     first = lines[elements[0]].split() if elements else []
     if first[:2] != ["element", "vertex"] or len(first) != 3 or not re.fullmatch(r"\d{1,12}", first[2]):
-        raise _Damaged("its first element is not 'element vertex N'")
+        raise Damaged("its first element is not 'element vertex N'")
     columns: list[tuple[str, str]] = []
     for line in lines[elements[0] + 1 : elements[1] if len(elements) > 1 else None]:
         words = line.split()
         if words[:1] != ["property"]:
             continue
-        if len(words) != 3 or words[1] not in _PLY_TYPES or words[2] in (name for name, _ in columns):
-            raise _Damaged(f"its header has the line '{printable(line, 80)}'; expected columns of numbers, each once")
-        columns.append((words[2], order + _PLY_TYPES[words[1]]))
+        if len(words) != 3 or words[1] not in TYPES or words[2] in (name for name, _ in columns):
+            raise Damaged(f"its header has the line '{printable(line, 80)}'; expected columns of numbers, each once")
+        columns.append((words[2], order + TYPES[words[1]]))
     return int(first[2]), np.dtype(columns), len(elements) > 1
 
 
@@ -170,7 +160,7 @@ def _spz(file: BinaryIO, size: int) -> _Found:
     inflated = _Inflated(file)
     magic, version, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", inflated.take(16))
     if magic != spz.MAGIC or version not in (1, 2, 3):
-        raise _Damaged(f"no SPZ of version 1 to 4: its header begins with {magic!r} and version {version}")
+        raise Damaged(f"no SPZ of version 1 to 4: its header begins with {magic!r} and version {version}")
     found = _spz_header(version, count, degree, bits, flags, size)
     for some in _pieces(count):
         raw = inflated.take(some * (6 if version == 1 else 9))
@@ -187,27 +177,27 @@ def _spz(file: BinaryIO, size: int) -> _Found:
 
 def _spz4(file: BinaryIO, size: int) -> _Found:
     """Version 4, whose header is not compressed. Its streams are zstd's, and are not opened: there is no such decoder here."""
-    version, count, degree, bits, flags, streams, table = struct.unpack("<IIBBBBI", _exactly(file, 16))
+    version, count, degree, bits, flags, streams, table = struct.unpack("<IIBBBBI", exactly(file, 16))
     if version != 4:
-        raise _Damaged(f"no SPZ of version 1 to 4: version {version}")
+        raise Damaged(f"no SPZ of version 1 to 4: version {version}")
     if streams < STREAMS or table < 32 or table + 16 * streams > size:
-        raise _Damaged(f"a table of {streams} streams at byte {table} of {size}; expected at least {STREAMS}, within the file")
+        raise Damaged(f"a table of {streams} streams at byte {table} of {size}; expected at least {STREAMS}, within the file")
     found = _spz_header(version, count, degree, bits, flags, size)
     file.seek(table)
-    sizes = struct.unpack(f"<{2 * streams}Q", _exactly(file, 16 * streams))
+    sizes = struct.unpack(f"<{2 * streams}Q", exactly(file, 16 * streams))
     if table + 16 * streams + sum(sizes[::2]) != size:
-        raise _Damaged(f"{size} bytes; expected {table + 16 * streams + sum(sizes[::2])} for its streams")
+        raise Damaged(f"{size} bytes; expected {table + 16 * streams + sum(sizes[::2])} for its streams")
     if sizes[1] != 9 * count:
-        raise _Damaged(f"places of {sizes[1]} bytes; expected {9 * count} for {count} Gaussians")
+        raise Damaged(f"places of {sizes[1]} bytes; expected {9 * count} for {count} Gaussians")
     found.notes.append("bounds are not read: this version is compressed with zstd")
     return found
 
 
 def _spz_header(version: int, count: int, degree: int, bits: int, flags: int, size: int) -> _Found:
     if degree not in SPZ_DEGREES or bits > 24:
-        raise _Damaged(f"harmonics of degree {degree} and {bits} fractional bits; expected a degree of 0 to 4 and at most 24 bits")
+        raise Damaged(f"harmonics of degree {degree} and {bits} fractional bits; expected a degree of 0 to 4 and at most 24 bits")
     if count < 1 or 9 * count > DENSEST * size:
-        raise _Damaged(f"its header names {count} Gaussians, and {size} bytes hold none, or not as many")
+        raise Damaged(f"its header names {count} Gaussians, and {size} bytes hold none, or not as many")
     return _Found(f"SPZ {version}", count, degree, notes=["antialiased"] if flags & 1 else [])
 
 
@@ -218,14 +208,14 @@ class _Inflated:
         self.file, self.stream, self.left = file, zlib.decompressobj(16 + zlib.MAX_WBITS), b""
 
     def _part(self, most: int) -> bytes:
-        """Some bytes, at most so many. Raises _Damaged where what is stored is no gzip, or its checksum another."""
+        """Some bytes, at most so many. Raises Damaged where what is stored is no gzip, or its checksum another."""
         self.left = self.left or self.file.read(AT_ONCE)
         try:
             part = self.stream.decompress(self.left, most)
         except zlib.error as error:
-            raise _Damaged(f"no SPZ of version 1 to 4, or a damaged one: it does not unpack as gzip ({error})") from error
+            raise Damaged(f"no SPZ of version 1 to 4, or a damaged one: it does not unpack as gzip ({error})") from error
         if not part and not self.left and not self.stream.eof:
-            raise _Damaged("it is cut short")
+            raise Damaged("it is cut short")
         self.left = self.stream.unconsumed_tail
         return part
 
@@ -234,7 +224,7 @@ class _Inflated:
         found: list[bytes] = []
         while count:
             if self.stream.eof:
-                raise _Damaged("its Gaussians end before as many have come as its header names")
+                raise Damaged("its Gaussians end before as many have come as its header names")
             found.append(self._part(count))
             count -= len(found[-1])
         return b"".join(found)
@@ -249,86 +239,46 @@ class _Inflated:
         """To the end, where gzip's checksum is; only if `more` may something come before it."""
         while not self.stream.eof:
             if self._part(AT_ONCE) and not more:
-                raise _Damaged("it goes on after its last Gaussian")
+                raise Damaged("it goes on after its last Gaussian")
 
 
 # GLB
 
 
 def _glb(file: BinaryIO, size: int) -> _Found | None:
-    head = file.read(20)
-    if len(head) < 20 or head[:4] != b"glTF" or head[16:] != b"JSON":
+    if gltf.EXTENSION.encode() not in file.read(20 + MAX_GLTF_JSON):
         return None
-    length, described = struct.unpack_from("<I", head, 8)[0], struct.unpack_from("<I", head, 12)[0]
-    if described > min(size, MAX_GLTF_JSON):
-        return None
-    text = file.read(described)
-    if gltf.EXTENSION.encode() not in text:
-        return None
-    document = json_value(text)
-    if length > size:
-        raise _Damaged(f"{size} bytes; expected {length}")
-    chunk = file.read(8)
-    if len(chunk) < 8 or chunk[4:] != b"BIN\0" or 28 + described + struct.unpack_from("<I", chunk)[0] > size:
-        raise _Damaged("its binary part is missing or cut short")
+    file.seek(0)
+    glb = Glb(file, size, MAX_GLTF_JSON)
     try:
-        return _glb_primitives(document, file, 28 + described, 28 + described + struct.unpack_from("<I", chunk)[0])
+        return _glb_primitives(glb)
     except (KeyError, IndexError, TypeError, AttributeError) as error:
-        raise _Damaged(f"a glTF document that is not as it has to be ({type(error).__name__}: {printable(error, 80)})") from error
+        raise Damaged(f"a glTF document that is not as it has to be ({type(error).__name__}: {printable(error, 80)})") from error
 
 
-def _glb_primitives(document: Any, file: BinaryIO, start: int, end: int) -> _Found | None:
-    primitives = [each for mesh in document["meshes"] for each in mesh["primitives"] if gltf.EXTENSION in each.get("extensions", {})]
+def _glb_primitives(glb: Glb) -> _Found | None:
+    primitives = [each for mesh in glb.document["meshes"] for each in mesh["primitives"] if gltf.EXTENSION in each.get("extensions", {})]
     if not primitives:
         return None
     found = _Found(f"GLB ({gltf.EXTENSION})", 0, 0)
     for primitive in primitives:
         below = primitive["extensions"][gltf.EXTENSION].get("extensions", {})
         if below:
-            raise _Damaged(f"Gaussians compressed by {printable(', '.join(below), 80)}; expected attributes as they are (write it without compression)")
-        names = primitive["attributes"]
-        count = document["accessors"][names["POSITION"]]["count"]
-        columns = (("POSITION", 3, found.places), (f"{gltf.EXTENSION}:SCALE", 3, found.scales), (f"{gltf.EXTENSION}:OPACITY", 1, found.opacities))
-        for name, width, into in columns:
-            for rows in _accessor(document, names[name], count, width, file, start, end):
-                into.add(rows)
+            raise Damaged(f"Gaussians compressed by {printable(', '.join(below), 80)}; expected attributes as they are (write it without compression)")
+        names, counts = primitive["attributes"], set()
+        scales, opacities = (f"{gltf.EXTENSION}:{name}" for name in ("SCALE", "OPACITY"))
+        columns = (("POSITION", "VEC3", found.places), (scales, "VEC3", found.scales), (opacities, "SCALAR", found.opacities))
+        for name, widths, into in columns:
+            counts.add(glb.document["accessors"][names[name]]["count"])
+            for rows in glb.rows(names[name], widths):
+                into.add(rows / np.iinfo(rows.dtype).max if rows.dtype.kind in "iu" else rows)
+        if len(counts) > 1:
+            raise Damaged(f"attributes of {sorted(counts)} rows; expected as many of each")
         degrees = [int(each[1]) for name in names if (each := re.fullmatch(rf"{gltf.EXTENSION}:SH_DEGREE_(\d)_COEF_\d", name))]
-        found.count, found.degree = found.count + count, max([found.degree, *degrees])
+        found.count, found.degree = found.count + counts.pop(), max([found.degree, *degrees])
     return found
-
-
-def _accessor(document: Any, number: int, count: int, width: int, file: BinaryIO, start: int, end: int) -> Iterator[np.ndarray]:
-    """The rows of an accessor, in pieces, as numbers. Raises _Damaged where they lie beyond the binary part."""
-    entry = document["accessors"][number]
-    view = document["bufferViews"][entry["bufferView"]]
-    kind = _GLTF_TYPES.get(entry["componentType"])
-    numbers = [count, entry["count"], view.get("byteOffset", 0), entry.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 0)]
-    if not all(type(each) is int and 0 <= each < 2**53 for each in numbers) or view.get("buffer", 0) != 0 or "sparse" in entry:
-        raise _Damaged("accessors that do not lie in the file's own binary part, row by row")
-    if kind is None or _GLTF_WIDTHS.get(entry["type"]) != width or entry["count"] != count or count < 1:
-        raise _Damaged(f"an attribute of {entry['count']} {printable(entry['type'], 20)}; expected {count} rows of {width} numbers")
-    row = width * np.dtype(kind).itemsize
-    stride, first = numbers[5] or row, start + numbers[2] + numbers[3]
-    if stride > MAX_GLTF_STRIDE:
-        raise _Damaged(f"rows that lie {stride} bytes apart; expected at most {MAX_GLTF_STRIDE}")
-    if stride < row or first + stride * (count - 1) + row > min(end, start + numbers[2] + numbers[4]):
-        raise _Damaged("an attribute that goes on beyond the binary part")
-    scale = np.iinfo(kind).max if np.dtype(kind).kind in "iu" else 1
-    for done in range(0, count, AT_ONCE):
-        some = min(AT_ONCE, count - done)
-        file.seek(first + done * stride)
-        raw = _exactly(file, stride * (some - 1) + row)
-        rows = np.ndarray((some, width), kind, raw, strides=(stride, np.dtype(kind).itemsize))
-        yield rows / scale
 
 
 def _pieces(count: int) -> Iterator[int]:
     for done in range(0, count, AT_ONCE):
         yield min(AT_ONCE, count - done)
-
-
-def _exactly(file: BinaryIO, count: int) -> bytes:
-    data = file.read(count)
-    if len(data) != count:
-        raise _Damaged("it is cut short")
-    return data
