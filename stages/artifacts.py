@@ -71,7 +71,7 @@ class TrainOutputs(Outputs):
     stage = "train"
     field = Name("field.safetensors")  # stages.io.field_file
     cameras = Name("cameras.json")  # refined training cameras, where they were refined; stages.io.refined_cameras
-    choices = Name("choices.json")  # what training did otherwise than scene and settings state, where it learned nothing; stages.io.training_choices
+    choices = Name("choices.json")  # what training did otherwise than scene and settings state, where it learned nothing; stages.training.choices
     report = Name("report.json")  # steps, seconds, and the settings that give the same field again
     log = Name("log.jsonl")  # a line every few steps
     curve = Name("curve.png")  # PSNR over steps

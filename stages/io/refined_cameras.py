@@ -13,10 +13,11 @@ from pipeline.errors import CorruptArtifact
 from pipeline.files import write_json
 from pipeline.text import printable
 from stages.artifacts import TrainOutputs
-from stages.io import scene, training_choices
+from stages.io import scene
 from stages.io.json_file import read_json
 from stages.io.scene import Scene, View, camera_from, camera_to_json
 from stages.io.scene_schema import CameraDocument, decoded
+from stages.training import choices
 
 FORMAT = 1
 AGAIN = "Train again."
@@ -34,7 +35,7 @@ def write(views: Sequence[View], cameras: Sequence[Camera], path: Path) -> None:
 
 def load_scene(poses: Path, train: Path) -> Scene:
     """The scene in the artifact of the poses stage as that of the train stage used it: with its choices and its training cameras. Raises as `scene.load`."""
-    found, path = training_choices.load(train).scene(scene.load(poses)), TrainOutputs(train).cameras
+    found, path = choices.load(train).scene(scene.load(poses)), TrainOutputs(train).cameras
     if not path.is_file():
         return found
     document = decoded(read_json(path, AGAIN), RefinedDocument, path, AGAIN)

@@ -33,7 +33,8 @@ MIN_KEPT = 0.1  # of a subject, that masks have to keep to be believed
 # docs/experiments/early-check.md
 MIN_PROGRESS = 0.45
 MAX_GAIN = 2.0  # that a render is fitted by, or its inverse: one stop
-GOOD_PSNR = 25.0  # dB: what is as close as this is no failure, however well a plain colour does
+GOOD_PSNR = 25.0  # dB: from here on what is better than one colour is no failure, for photographs of plain things are hardly better themselves
+PLAIN_PSNR = 30.0  # dB: from here on nothing is
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +69,13 @@ class EarlyResult:
     @property
     def learning(self) -> bool:
         """Whether anything has been learned."""
-        return self.progress >= MIN_PROGRESS or self.psnr >= GOOD_PSNR
+        return self.progress >= MIN_PROGRESS or self.psnr >= PLAIN_PSNR or (self.psnr >= GOOD_PSNR and self.progress > 0)
 
 
 def check_step(iterations: int) -> int | None:
-    """The step after which is looked; None: the run is too short to be judged before its end."""
+    """The step after which is looked; None: the run is too short to be judged before its second half."""
     step = max(MIN_STEP, math.ceil(FRACTION * iterations))
-    return step if step < iterations else None
+    return step if 2 * step <= iterations else None
 
 
 def held_out_views(folder: Path, s: Scene) -> list[HeldOutView]:

@@ -17,8 +17,8 @@ import numpy as np
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
-from stages.io.training_choices import TrainingChoices
 from stages.scratch import note, noted
+from stages.training.choices import TrainingChoices
 from stages.training.early_check import EarlyResult, HeldOutView, judge
 
 if TYPE_CHECKING:
@@ -143,5 +143,7 @@ def _with_views(pixels: Pixels, views: Sequence[View]) -> Pixels:
     own.near = np.array([view.near for view in views], np.float32)
     if all(view.mask is None for view in views):
         own.usable, own.listed, own.usable_count = None, None, len(own)
-    own.set_cameras([view.camera for view in views])
+    cameras = [view.camera for view in views]
+    if not np.array_equal(own.centre, np.array([camera.centre for camera in cameras], np.float32)):  # they were refined
+        own.set_cameras(cameras)
     return own

@@ -16,9 +16,9 @@ import numpy as np
 from pipeline.errors import StageFailed
 from pipeline.files import remove
 from pipeline.stage import Job
-from stages.io.training_choices import TrainingChoices, write
 from stages.scratch import note, noted
 from stages.training import budget
+from stages.training.choices import TrainingChoices, write
 from stages.training.early_check import EarlyResult, check_step, held_out_views, judge
 from stages.training.second_chances import best_of, finished, try_all
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from stages.io.scene import Scene
 
 DECIDED = "second_chances.json"
-REMEDY = "Look at the cameras and the photographs in the report, try poses.masks=ignore, or set train.on_failure=continue."
+REMEDY = "Look at the cameras and the photographs in the report, and try poses.masks=ignore where there are masks."
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Watch:
         if result is None or result.learning or self.decision is not None:
             return False
         if self.job.settings.on_failure == "stop":
-            raise StageFailed(f"train: {_in_words(result)}. {REMEDY}")
+            raise StageFailed(f"train: {_in_words(result)}. {REMEDY} train.on_failure=continue goes on all the same.")
         if self.job.settings.on_failure == "continue":
             return False
         if step:

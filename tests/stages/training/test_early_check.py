@@ -17,17 +17,17 @@ from pipeline.errors import CorruptArtifact, Interrupted, StageFailed
 from stages import train
 from stages.artifacts import TrainOutputs
 from stages.io import scene as scenes
-from stages.io import training_choices
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import View
-from stages.io.training_choices import TrainingChoices
+from stages.training import choices as training_choices
 from stages.training import early_check, second_chances, watch
+from stages.training.choices import TrainingChoices
 from stages.training.early_check import HeldOutView, check_step, judge
 from tests.efficientnerf import balls
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
-LOOKED, STEPS = 40, 50
+LOOKED, STEPS = 40, 80
 QUICK = {"iterations": STEPS, "checkpoint_every": 15}
 
 
@@ -114,6 +114,16 @@ def test_a_render_close_to_a_plain_photograph_is_no_failure() -> None:
     assert judge([held_out(view.colour, np.zeros((20, 20), bool))], lambda camera: view.colour, 1) is None
 
 
+def test_black_is_not_all_there_is_to_learn_of_a_small_thing_before_black() -> None:
+    rng = np.random.default_rng(0)
+    colour = np.zeros((40, 40, 3))
+    colour[15:22, 15:22] = 0.5 * rng.random((7, 7, 3))
+    found = judge([held_out(colour)], lambda camera: np.zeros((40, 40, 3)), 1)
+    assert found is not None
+    assert found.psnr > early_check.GOOD_PSNR - 3
+    assert not found.learning
+
+
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0)])
 def test_an_empty_field_has_learned_nothing_however_much_of_the_picture_is_background(tmp_path: Path, background: tuple[float, float, float]) -> None:
     folder = poses(tmp_path / "poses", side=64, background=background)
@@ -127,7 +137,7 @@ def test_an_empty_field_has_learned_nothing_however_much_of_the_picture_is_backg
 
 
 def test_it_is_looked_after_a_tenth_and_short_runs_are_left_alone() -> None:
-    assert [check_step(steps) for steps in (1, LOOKED, LOOKED + 1, 10 * LOOKED, 1000, 30000)] == [None, None, LOOKED, LOOKED, 100, 3000]
+    assert [check_step(steps) for steps in (1, LOOKED, 2 * LOOKED - 1, 2 * LOOKED, 10 * LOOKED, 1000, 30000)] == [None] * 3 + [LOOKED] * 2 + [100, 3000]
 
 
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0)])
@@ -168,7 +178,7 @@ def test_a_training_that_is_stopped_anywhere_ends_with_the_same_bytes(tmp_path: 
     folder = ball(tmp_path / "poses", behind)
     train.run(job(tmp_path / "undisturbed", settings(**QUICK), poses=folder))
     expected = digest(tmp_path / "undisturbed")
-    # In the training that fails, in two trials, and in the one that follows; some of them again.
+    # In the training that fails, in two trials, and in the training that follows.
     stop, count = StopAt(20, LOOKED + 10, 2 * LOOKED + 5, 2 * LOOKED + 20, 4 * LOOKED + 30), 0
     trained: list[str] = []
     real = second_chances._train
@@ -183,6 +193,16 @@ def test_a_training_that_is_stopped_anywhere_ends_with_the_same_bytes(tmp_path: 
     assert digest(tmp_path / "stopped") == expected
     assert len(trained) == len(set(trained)) == len(report(tmp_path / "stopped")["second_chances"])  # none that was finished is done again
     assert report(tmp_path / "stopped")["second_chances"] == report(tmp_path / "undisturbed")["second_chances"]
+
+
+def test_a_budget_of_time_is_left_for_what_is_chosen(tmp_path: Path) -> None:
+    folder = ball(tmp_path / "poses", behind)
+    made = job(tmp_path, settings(**QUICK, time_budget=6.0), poses=folder)
+    train.run(made)
+    found = report(tmp_path)
+    # Where steps are slow the budget ends before anything is looked at.
+    assert (found["chosen"], training_choices.load(made.out).near) in ((None, "stated"), ("near planes off", "off"))
+    assert found["iterations"] > 1
 
 
 def test_a_kill_just_before_the_choice_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
