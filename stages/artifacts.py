@@ -94,7 +94,7 @@ class EvaluateOutputs(Outputs):
 
     stage = "evaluate"
     metrics = Name("metrics.json")  # PSNR, SSIM, gap, holes, floaters, LPIPS: means, and of each view
-    verdict = Name("verdict.json")  # stages.verdict.result: a grade, and findings with cause, remedy and picture
+    verdict = Name("verdict.json")  # stages.verdict.result: a grade, and problems with cause, remedy and picture
     sparse_points = Name("sparse_points.png")  # points of structure from motion that the asset's depth agrees with or not, of the worst view
     contact_sheet = Name("contact_sheet.png")
     strip_worst = Name("strip_worst.png")  # photograph, network, asset, mesh; as many of the three as there are views

@@ -1,7 +1,7 @@
 """The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field, the baked asset, the mesh and the 3D Gaussians on the test views, and what parts
 the first two.
 
-    verdict.json       a grade, and for each finding its cause, what to do and the picture that shows it (stages.verdict.result)
+    verdict.json       a grade, and for each problem its cause, what to do and the picture that shows it (stages.verdict.result)
     sparse_points.png  where the asset's depth agrees with the sparse points, of the view where it does least (stages.evaluation.sparse_points)
     metrics.json       "network" (the field), "asset", "mesh" and, where there are Gaussians, "splats": means over the views; "gap", "holes", "floaters": the
                        asset against the network; "views": the metrics of each (stages.evaluation.summary, .comparison, .mesh, .splats)

@@ -52,9 +52,9 @@ def judge(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: Su
     found = verdict_on_result(metrics, camera_verdict_of(_read(job)))
     write_json(outputs.verdict, found.document())
     job.say(found.summary(), grade=found.grade)
-    for finding in found.findings:
-        if finding.grade != "good":
-            job.warn(finding.text())
+    for problem in found.problems:
+        if problem.grade != "good":
+            job.warn(problem.text())
     return found
 
 

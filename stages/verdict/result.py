@@ -1,4 +1,4 @@
-"""What is to be thought of a result: a grade, and for each finding its likely cause, what to do, and the picture that shows it.
+"""What is to be thought of a result: a grade, and for each problem its likely cause, what to do, and the picture that shows it.
 
     good    nothing stands against it
     usable  it shows the scene; parts are worse than they need be, or nobody can say
@@ -40,7 +40,7 @@ DEPTH = f"{RUN}/{EvaluateOutputs.sparse_points}"
 
 
 @dataclass(frozen=True)
-class Finding:
+class ResultProblem:
     """
     what      a word for it
     grade     the best that a result with it can have
@@ -77,21 +77,21 @@ class CameraVerdict:
 class ResultVerdict:
     """
     grade     one of GRADES
-    findings  worst first
+    problems  worst first
     figures   that it was made from
     """
 
     grade: str
-    findings: tuple[Finding, ...]
+    problems: tuple[ResultProblem, ...]
     figures: Mapping[str, Any] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """As JSON has it."""
-        return {"grade": self.grade, "summary": self.summary(), **self.figures, "findings": [asdict(each) for each in self.findings]}
+        return {"grade": self.grade, "summary": self.summary(), **self.figures, "problems": [asdict(each) for each in self.problems]}
 
     def summary(self) -> str:
         """A sentence: the grade, and why."""
-        worst = next((each for each in self.findings if each.grade == self.grade != "good"), None)
+        worst = next((each for each in self.problems if each.grade == self.grade != "good"), None)
         if worst is not None:
             return f"Result: {self.grade}. {worst.sentence}"
         psnr, blur = self.figures["psnr"], self.figures["blur"]
@@ -188,17 +188,17 @@ def _strip(metrics: Mapping[str, Any]) -> str:
     return f"{RUN}/{name}" if name else SHEET
 
 
-def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: CameraVerdict | None, strip: str) -> list[Finding]:
+def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: CameraVerdict | None, strip: str) -> list[ResultProblem]:
     """Of the asset's pictures against photographs that training did not see."""
     blur, gain = figures["blur"], figures["gain"]
     if blur is None:
         sentence = "No view was measured: its masks leave no pixel."
-        return [Finding("not measured", "usable", sentence, "The masks cover what the photographs show.", "Look at the masks (poses.masks).", SHEET)]
+        return [ResultProblem("not measured", "usable", sentence, "The masks cover what the photographs show.", "Look at the masks (poses.masks).", SHEET)]
     found = []
     grade = grade_of(blur, gain)
     if metrics["split"] == "train":
         sentence = "All views were trained on: how others would look was not measured."
-        found.append(Finding("nothing held out", "usable", sentence, "No photograph was held out.", "Hold some out (poses.test_every).", strip))
+        found.append(ResultProblem("nothing held out", "usable", sentence, "No photograph was held out.", "Hold some out (poses.test_every).", strip))
     if grade != "good":
         if grade == "failed":
             sentence = f"The asset shows hardly more than one colour: {figures['psnr']:.1f} dB on {figures['views']}, a picture of the mean colour has"
@@ -206,13 +206,13 @@ def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras
         else:
             sentence = f"The asset's pictures are {'strongly ' if grade == 'poor' else ''}blurred: {figures['psnr']:.1f} dB on {figures['views']},"
             sentence += f" {blur_in_words(blur)}."
-        found.append(Finding("pictures", grade, sentence, *_cause(metrics, figures, cameras, strip)))
+        found.append(ResultProblem("pictures", grade, sentence, *_cause(metrics, figures, cameras, strip)))
     off = figures["psnr_colour_fitted"] - figures["psnr"]
     if grade in ("good", "usable") and off > COLOURS_OFF:
         sentence = f"The colours of views are off by as much as costs {off:.1f} dB; what they show is right."
         remedy = "Lock exposure and white balance, or learn them (train.exposure)."
         flat = figures["psnr"] < figures["mean_colour"] + 1.0
-        found.append(Finding("colours", "usable" if flat else "good", sentence, "Exposure or white balance differ between photographs.", remedy, strip))
+        found.append(ResultProblem("colours", "usable" if flat else "good", sentence, "Exposure or white balance differ between photographs.", remedy, strip))
     return found
 
 
@@ -253,7 +253,7 @@ def _short(metrics: Mapping[str, Any]) -> tuple[str, str] | None:
     return cause, "Give it more time (--budget, bake.time_budget) or steps (bake.refine_steps), fewer voxels (bake.max_mib), or a machine without other work."
 
 
-def _of_single_views(metrics: Mapping[str, Any], figures: Mapping[str, Any], strip: str) -> list[Finding]:
+def _of_single_views(metrics: Mapping[str, Any], figures: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     """Of views that are much worse than the others."""
     views = [view for view in metrics["views"] if view["trivial"] is not None and view["asset"]["psnr_colour_fitted"] is not None]
     bad = tuple(view["name"] for view in views if view_blur(view) > POOR_BLUR)
@@ -262,19 +262,19 @@ def _of_single_views(metrics: Mapping[str, Any], figures: Mapping[str, Any], str
     sentence = f"{len(bad)} of {len(views)} views {'is' if len(bad) == 1 else 'are'} much worse than the others: {abbreviated(bad)}."
     cause = "Their cameras are off, they show what few others show, or something moved."
     remedy = "Look at these photographs; take more from about there."
-    return [Finding("single views", "usable" if len(bad) > POOR_VIEWS * len(views) else "good", sentence, cause, remedy, strip, bad)]
+    return [ResultProblem("single views", "usable" if len(bad) > POOR_VIEWS * len(views) else "good", sentence, cause, remedy, strip, bad)]
 
 
-def _of_gap(metrics: Mapping[str, Any], strip: str) -> list[Finding]:
+def _of_gap(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     gap = metrics["gap"]["psnr"]
     if gap is None or gap >= GAP:
         return []
     sentence = f"The asset is {-gap:.2f} dB behind its network on the same pixels: it has lost detail that the network had."
     usual = ("It has too few voxels, or too few steps fitted them.", "Give it more voxels (bake.max_mib), or more steps to fit them (bake.refine_steps).")
-    return [Finding("gap", "usable" if gap < LARGE_GAP else "good", sentence, *(_short(metrics) or usual), strip)]
+    return [ResultProblem("gap", "usable" if gap < LARGE_GAP else "good", sentence, *(_short(metrics) or usual), strip)]
 
 
-def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[Finding]:
+def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     """Named only where the photographs side with the network."""
     holes, excess = metrics["holes"], metrics["holes_excess_error"]
     if holes is None or holes <= HOLES or (excess is not None and excess <= 0):
@@ -282,20 +282,20 @@ def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[Finding]:
     sentence = f"The asset has holes: {100 * holes:.1f} % of the pixels show through where the network shows something solid."
     remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or give them more room (bake.max_mib)."
     usual = ("Voxels that few rays see were left out.", remedy)
-    return [Finding("holes", "poor" if holes > MANY_HOLES else "usable", sentence, *(_short(metrics) or usual), strip)]
+    return [ResultProblem("holes", "poor" if holes > MANY_HOLES else "usable", sentence, *(_short(metrics) or usual), strip)]
 
 
-def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[Finding]:
+def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     """Named only where the photographs side with the network."""
     floaters, own, excess = metrics["floaters"], metrics["network"]["floaters"] or 0.0, metrics["floaters_excess_error"]
     if floaters is None or floaters - own <= FLOATERS or (excess is not None and excess <= 0):
         return []
     sentence = f"The asset has floaters: {100 * floaters:.1f} % of what it shows hangs before the network's surfaces (in the network itself {100 * own:.1f} %)."
     usual = ("Faint voxels before the surfaces were kept.", "Drop faint voxels (a higher bake.weight_threshold) or small pieces (a higher bake.min_component).")
-    return [Finding("floaters", "poor" if floaters - own > MANY_FLOATERS else "usable", sentence, *(_short(metrics) or usual), strip)]
+    return [ResultProblem("floaters", "poor" if floaters - own > MANY_FLOATERS else "usable", sentence, *(_short(metrics) or usual), strip)]
 
 
-def _of_sparse_points(metrics: Mapping[str, Any]) -> list[Finding]:
+def _of_sparse_points(metrics: Mapping[str, Any]) -> list[ResultProblem]:
     """Of the asset's depth where structure from motion found points."""
     points = metrics["sparse_points"]
     if points is None:
@@ -306,35 +306,37 @@ def _of_sparse_points(metrics: Mapping[str, Any]) -> list[Finding]:
         sentence = f"Parts of the subject are missing: the asset lies behind {100 * missing:.0f} % of the sparse points of it, or is empty there."
         cause = "Something kept density from being learned there, or it was dropped in baking."
         remedy = "Try train.min_views=off and without masks (poses.masks=ignore); a lower bake.weight_threshold."
-        found.append(Finding("missing", "poor" if missing > MOST_MISSING else "usable", sentence, cause, remedy, DEPTH))
-    if points["agreeing"] < AGREEING:
+        found.append(ResultProblem("missing", "poor" if missing > MOST_MISSING else "usable", sentence, cause, remedy, DEPTH))
+    grade = "poor" if points["agreeing"] < LEAST_AGREEING else "usable"
+    if points["agreeing"] < AGREEING and not any(each.grade in ("poor", grade) for each in found):  # else it comes from what is missing
         agreeing, nearer, farther = (f"{100 * points[name]:.0f} %" for name in ("agreeing", "nearer", "farther"))
         sentence = f"The asset's depth agrees with {agreeing} of the sparse points: it is nearer than {nearer} of them, farther than {farther}."
         cause = "Colours stand at a wrong depth: too few directions show the scene, or the cameras are off."
         remedy = "Move sideways between photographs; try train.camera_refinement=on."
-        found.append(Finding("depth", "poor" if points["agreeing"] < LEAST_AGREEING else "usable", sentence, cause, remedy, DEPTH))
+        found.append(ResultProblem("depth", grade, sentence, cause, remedy, DEPTH))
     return found
 
 
-def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Finding]:
+def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[ResultProblem]:
     """Of the mesh where the asset is not strongly blurred itself; and whether there is one."""
     picture = f"{MeshOutputs.stage}/{MeshOutputs.check}"
     if metrics["mesh"]["faces"] == 0:
         remedy = "Train longer, or set mesh.density_threshold by hand."
-        return [Finding("mesh", "usable", "The mesh is empty.", "The asset has no clear surface.", remedy, picture)]
+        return [ResultProblem("mesh", "usable", "The mesh is empty.", "The asset has no clear surface.", remedy, picture)]
     if not _only_of_this(figures["mesh_blur"], figures):
         return []
     sentence = f"The mesh is far behind the asset: {metrics['mesh']['psnr']:.1f} dB, {blur_in_words(figures['mesh_blur'])}."
     cause = "Its surface is not where the asset's is, or what it shows has none (fur, leaves, glass)."
-    return [Finding("mesh", "usable", sentence, cause, "Raise mesh.max_faces, or set mesh.density_threshold by hand; use the asset or the splats.", picture)]
+    remedy = "Raise mesh.max_faces, or set mesh.density_threshold by hand; use the asset or the splats."
+    return [ResultProblem("mesh", "usable", sentence, cause, remedy, picture)]
 
 
-def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Finding]:
+def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[ResultProblem]:
     if not _only_of_this(figures["splats_blur"], figures):
         return []
     sentence = f"The 3D Gaussians are far behind the asset: {metrics['splats']['psnr']:.1f} dB, {blur_in_words(figures['splats_blur'])}."
     picture = f"{SplatsOutputs.stage}/{SplatsOutputs.preview}"
-    return [Finding("splats", "usable", sentence, "They are too few, or too few steps fitted them.", "Raise splats.count or splats.iterations.", picture)]
+    return [ResultProblem("splats", "usable", sentence, "They are too few, or too few steps fitted them.", "Raise splats.count or splats.iterations.", picture)]
 
 
 def _only_of_this(blur: float | None, figures: Mapping[str, Any]) -> bool:
@@ -342,13 +344,13 @@ def _only_of_this(blur: float | None, figures: Mapping[str, Any]) -> bool:
     return blur is not None and blur > POOR_BLUR and figures["blur"] is not None and figures["blur"] <= POOR_BLUR
 
 
-def _of_cameras(cameras: CameraVerdict | None) -> list[Finding]:
+def _of_cameras(cameras: CameraVerdict | None) -> list[ResultProblem]:
     """What held-out photographs cannot show of cameras: that those which have none are missing, or that depth is a guess."""
     if cameras is None or cameras.grade not in ("poor", "failed"):
         return []
     picture = f"{PosesOutputs.stage}/{PosesOutputs.cameras}"
     sentence = f"The cameras are {cameras.grade}: {cameras.sentence}"
-    return [Finding("cameras", "usable", sentence, "The photographs, as the verdict on the cameras has it.", cameras.remedy, picture)]
+    return [ResultProblem("cameras", "usable", sentence, "The photographs, as the verdict on the cameras has it.", cameras.remedy, picture)]
 
 
 def camera_verdict_of(document: Any) -> CameraVerdict | None:

@@ -27,8 +27,8 @@ INTERRUPTED = 128 + signal.SIGINT  # exit code
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    epilog="Exit codes: 0 done; 2 usage or bad input; 3 a stage failed, or output could not be written; 4 corrupt artifact; 5 run locked; 6 assets differ, or a result that --fail-on names; "
-    "130, 143 interrupted.",
+    epilog="Exit codes: 0 done; 2 usage or bad input; 3 a stage failed, or output could not be written; 4 corrupt artifact; 5 run locked; "
+    "6 assets differ, or a result that --fail-on names; 130, 143 interrupted.",
 )
 @click.version_option(package_name="efficientnerf", prog_name="enerf")
 def enerf() -> None:

@@ -99,7 +99,7 @@ class PosesReport(msgspec.Struct):
     warnings: list[str] | None = None
 
 
-class ResultFinding(msgspec.Struct):
+class ResultProblem(msgspec.Struct):
     """Something that stands against a result: what it comes from, what to do, and the picture in the run that shows it."""
 
     grade: str = ""
@@ -114,7 +114,7 @@ class ResultVerdict(msgspec.Struct):
 
     grade: str = ""
     summary: str = ""
-    findings: list[ResultFinding] = []
+    problems: list[ResultProblem] = []
 
     def is_as_bad_as(self, grade: str) -> bool:
         """Whether the grade is this one, or worse."""

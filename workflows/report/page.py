@@ -204,13 +204,13 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
 
 
 def _result(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
-    """The verdict on the result: its grade, a sentence, and a row for each finding with the picture that shows it."""
+    """The verdict on the result: its grade, a sentence, and a row for each problem with the picture that shows it."""
     found: ResultVerdict | None = _read(folder / EVALUATE.verdict, ResultVerdict, damaged)
     if found is None:
         return None
     pictures = {name.as_posix(): name for name in SHOWN}
-    rows = [(each.grade, each.sentence, f"{each.cause} {each.remedy}", pictures.get(each.picture)) for each in found.findings]
-    return {"grade": found.grade, "summary": found.summary, "findings": rows}
+    rows = [(each.grade, each.sentence, f"{each.cause} {each.remedy}", pictures.get(each.picture)) for each in found.problems]
+    return {"grade": found.grade, "summary": found.summary, "problems": rows}
 
 
 def _verdict(folder: Path, damaged: list[str]) -> dict[str, Any] | None:

@@ -14,7 +14,7 @@ from pipeline.text import printable
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.progress import duration, size
 from workflows.report import documents
-from workflows.report.documents import Metrics, ResultFinding, ResultVerdict
+from workflows.report.documents import Metrics, ResultProblem, ResultVerdict
 
 RUN = Path()
 # The files of a run that a user wants.
@@ -109,11 +109,11 @@ def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
     found = None if document is None else msgspec.convert(document, Metrics)
     if (quality := quality_in_words(found)) is not None:
         lines.append(f"  {'quality':<10} {quality}")
-    findings = [] if verdict is None else [finding_in_words(each) for each in verdict.findings]
-    return lines + [f"  {'':<10} {text}" for text in (against_network(found), *findings) if text]
+    problems = [] if verdict is None else [problem_in_words(each) for each in verdict.problems]
+    return lines + [f"  {'':<10} {text}" for text in (against_network(found), *problems) if text]
 
 
-def finding_in_words(found: ResultFinding) -> str:
+def problem_in_words(found: ResultProblem) -> str:
     """What stands against the result, what it comes from, what to do, and where to look."""
     return printable(f"{found.grade}: {found.sentence} {found.cause} {found.remedy} ({found.picture})", 1000)
 

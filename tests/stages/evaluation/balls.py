@@ -87,6 +87,6 @@ def verdict_of(job: Job) -> dict[str, Any]:
     return json.loads((job.out / "verdict.json").read_text())
 
 
-def findings_of(job: Job) -> set[str]:
+def problems_of(job: Job) -> set[str]:
     """What stands against a result."""
-    return {each["what"] for each in verdict_of(job)["findings"]}
+    return {each["what"] for each in verdict_of(job)["problems"]}

@@ -14,7 +14,7 @@ from efficientnerf.geometry.cameras import Camera
 from stages.evaluation.views import ground_truth, subsample
 from stages.io.scene import load
 from tests.fakes import WHITE, BallField, BallTree
-from tests.stages.evaluation.balls import TREE, figures_of, findings_of, job_in, make_scene, measure, settings
+from tests.stages.evaluation.balls import TREE, figures_of, job_in, make_scene, measure, problems_of, settings
 
 
 @pytest.mark.parametrize("background", [WHITE, None])
@@ -68,7 +68,7 @@ def test_floaters_are_what_hangs_before_the_surface(tmp_path: Path) -> None:
     measure(replace(TREE, sigma=1e-7), lambda: BallField(TREE, background=WHITE), nothing)
     assert figures_of(nothing)["floaters"] is None
     assert figures_of(nothing)["holes"] > 0.1
-    assert {"gap", "holes"} <= findings_of(nothing)
+    assert {"gap", "holes"} <= problems_of(nothing)
 
 
 def test_photographs_decide_who_is_wrong_where_asset_and_network_differ(tmp_path: Path) -> None:
@@ -77,23 +77,23 @@ def test_photographs_decide_who_is_wrong_where_asset_and_network_differ(tmp_path
     def told(name: str, asset: BallTree, network: BallTree) -> tuple[dict[str, Any], set[str]]:
         job = job_in(tmp_path / name, poses)
         measure(asset, lambda: BallField(network, background=WHITE), job)
-        return figures_of(job), findings_of(job)
+        return figures_of(job), problems_of(job)
 
     larger, smaller = replace(TREE, radius=0.7), replace(TREE, radius=0.45)
-    found, findings = told("network too large", TREE, larger)
+    found, problems = told("network too large", TREE, larger)
     assert found["holes"] > 0.03
     assert found["holes_excess_error"] < -0.001
-    assert "holes" not in findings
-    found, findings = told("network too small", TREE, smaller)
+    assert "holes" not in problems
+    found, problems = told("network too small", TREE, smaller)
     assert found["floaters"] - found["network"]["floaters"] > 0.02
     assert found["floaters_excess_error"] < -0.001
-    assert "floaters" not in findings
-    found, findings = told("asset too small", smaller, TREE)
+    assert "floaters" not in problems
+    found, problems = told("asset too small", smaller, TREE)
     assert found["holes_excess_error"] > 0.001
-    assert "holes" in findings
-    found, findings = told("asset too large", larger, TREE)
+    assert "holes" in problems
+    found, problems = told("asset too large", larger, TREE)
     assert found["floaters_excess_error"] > 0.001
-    assert "floaters" in findings
+    assert "floaters" in problems
 
 
 def test_a_colour_cast_is_fitted_away(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The verdict on a result: the grade that people who look at the pictures give, worse figures never a better one, and each finding with what to do."""
+"""The verdict on a result: the grade that people who look at the pictures give, worse figures never a better one, and each problem with what to do."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stages.io.scene import load, save, save_points
 from stages.verdict.grades import GRADES
 from stages.verdict.result import CameraVerdict, ResultVerdict, camera_verdict_of, verdict_on_result
 from tests.fakes import WHITE, BallField
-from tests.stages.evaluation.balls import TREE, figures_of, findings_of, job_in, make_scene, measure, settings, verdict_of
+from tests.stages.evaluation.balls import TREE, figures_of, job_in, make_scene, measure, problems_of, settings, verdict_of
 from tests.stages.evaluation.results import WORSE, a_result, worse
 from workflows import asset
 
@@ -46,7 +46,7 @@ def test_captures_are_graded_as_who_looks_at_them_does(name: str) -> None:
 
 def test_nothing_stands_against_a_good_result() -> None:
     found = verdict_on_result(a_result(), CameraVerdict("good"))
-    assert (found.grade, found.findings) == ("good", ())
+    assert (found.grade, found.problems) == ("good", ())
 
 
 SETTINGS = {f"{stage.name}.{name}" for stage in asset.STAGES for name in stage.settings.__dataclass_fields__}
@@ -58,9 +58,9 @@ PICTURES = {
 
 def check(found: ResultVerdict) -> None:
     """What holds of every verdict."""
-    assert found.grade == max([each.grade for each in found.findings], key=GRADES.index, default="good")
-    assert [each.grade for each in found.findings] == sorted((each.grade for each in found.findings), key=GRADES.index, reverse=True)
-    for each in found.findings:
+    assert found.grade == max([each.grade for each in found.problems], key=GRADES.index, default="good")
+    assert [each.grade for each in found.problems] == sorted((each.grade for each in found.problems), key=GRADES.index, reverse=True)
+    for each in found.problems:
         assert all(text.strip() for text in (each.what, each.sentence, each.cause, each.remedy)), each
         assert each.picture in PICTURES
         assert set(re.findall(r"\b(?:poses|train|bake|mesh|splats|evaluate)\.[a-z_]+\b(?!\.)", each.remedy)) <= SETTINGS, each.remedy
@@ -91,7 +91,7 @@ def test_each_thing_that_is_bad_is_found_and_is_no_failure_by_itself(name: str) 
     alone = {"holes": ["holes' error"], "floaters": ["floaters' error"], "holes' error": ["holes"], "floaters' error": ["floaters"]}.get(name, [])
     found = verdict_on_result(worse(a_result(), *[name] * needed, *alone))
     check(found)
-    assert found.findings
+    assert found.problems
     assert found.grade == ("failed" if name == "asset" else found.grade)
     assert name == "asset" or found.grade != "failed"
 
@@ -111,19 +111,19 @@ CAUSES: dict[str, tuple[Any, str]] = {
 def test_a_cause_that_is_seen_is_named_with_its_own_remedy(name: str) -> None:
     found = a_result(22.0)
     CAUSES[name][0](found)
-    (pictures,) = (each for each in verdict_on_result(found).findings if each.what == "pictures")
+    (pictures,) = (each for each in verdict_on_result(found).problems if each.what == "pictures")
     assert CAUSES[name][1] in pictures.remedy
 
 
 def test_exposure_that_nobody_can_know_of_a_photograph_is_no_fault_of_the_asset() -> None:
     found = verdict_on_result(a_result(24.0, fitted=29.0))
-    assert (found.grade, [each.what for each in found.findings]) == ("good", ["colours"])
+    assert (found.grade, [each.what for each in found.problems]) == ("good", ["colours"])
     assert verdict_on_result(a_result(16.0, fitted=29.0)).grade == "usable", "no better than one colour"
 
 
 def test_bad_cameras_of_a_good_result_are_named_and_no_more() -> None:
     found = verdict_on_result(a_result(), CameraVerdict("poor", "Only 10 of 40 photographs have a camera.", "Take more."))
-    assert (found.grade, [each.what for each in found.findings]) == ("usable", ["cameras"])
+    assert (found.grade, [each.what for each in found.problems]) == ("usable", ["cameras"])
     assert verdict_on_result(a_result(), CameraVerdict("usable", "S.", "R.")).grade == "good"
 
 
@@ -176,7 +176,7 @@ def test_an_asset_at_another_depth_is_found_by_its_points(tmp_path: Path, radius
     job = job_in(tmp_path, poses)
     measure(replace(TREE, radius=radius), lambda: BallField(TREE, background=WHITE), job)
     assert figures_of(job)["sparse_points"][which] > 0.6
-    assert "depth" in findings_of(job)
+    assert ("missing" if which == "farther" else "depth") in problems_of(job)
     picture = np.asarray(Image.open(job.out / EvaluateOutputs.sparse_points))
     colour = COLOURS[FARTHER if which == "farther" else NEARER]
     assert (picture == colour).all(-1).sum() > 20
@@ -201,8 +201,8 @@ def test_what_the_asset_loses_makes_it_fail(tmp_path: Path) -> None:
     measure(replace(TREE, sigma=1e-7), lambda: BallField(TREE, background=WHITE), job)
     found = verdict_of(job)
     assert found["grade"] == "failed"
-    assert {"pictures", "missing", "gap", "holes"} <= findings_of(job)
-    assert all((job.out.parent / job.out.name / Path(each["picture"]).name).is_file() for each in found["findings"] if each["picture"].startswith("evaluate/"))
+    assert {"pictures", "missing", "gap", "holes"} <= problems_of(job)
+    assert all((job.out.parent / job.out.name / Path(each["picture"]).name).is_file() for each in found["problems"] if each["picture"].startswith("evaluate/"))
 
 
 def test_grades_fall_with_what_of_the_ball_is_there(tmp_path: Path) -> None:

@@ -140,8 +140,8 @@ POOR = {
 }
 
 
-FINDING = {"grade": "poor", "sentence": "It has <b>.", "cause": "Few rays.", "remedy": "Raise bake.max_mib.", "picture": "evaluate/strip_worst.png"}
-VERDICT = {"grade": "poor", "summary": "Result: poor. It has <b>.", "blur": 0.03, "findings": [FINDING]}
+PROBLEM = {"grade": "poor", "sentence": "It has <b>.", "cause": "Few rays.", "remedy": "Raise bake.max_mib.", "picture": "evaluate/strip_worst.png"}
+VERDICT = {"grade": "poor", "summary": "Result: poor. It has <b>.", "blur": 0.03, "problems": [PROBLEM]}
 
 
 def test_the_page_shows_the_asset_against_its_network_and_the_verdict(tmp_path: Path) -> None:
@@ -155,12 +155,12 @@ def test_the_page_shows_the_asset_against_its_network_and_the_verdict(tmp_path: 
     for shown in ("gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %", "28.75", "-2.25", "&lt;b&gt;.jpg: photograph | network 25.00 dB, 0.800 SSIM |",
                   "Result: poor. It has &lt;b&gt;.", "<td>Few rays. Raise bake.max_mib.</td>"):  # fmt: skip
         assert shown in text, shown
-    assert found.count("evaluate/strip_worst.png") == 3, "of the finding, of the strip and its link"
+    assert found.count("evaluate/strip_worst.png") == 3, "of the problem, of the strip and its link"
 
 
 @pytest.mark.parametrize("picture", ["../../etc/passwd", "/etc/passwd", "javascript:alert(1)", "poses/images/a.png", "evaluate/strip_worst.png/..", ""])
 def test_a_finding_links_to_no_other_picture(tmp_path: Path, picture: str) -> None:
-    run = a_run(tmp_path / "run", POOR, VERDICT | {"findings": [FINDING | {"picture": picture}]})
+    run = a_run(tmp_path / "run", POOR, VERDICT | {"problems": [PROBLEM | {"picture": picture}]})
     (run.path / "evaluate/strip_worst.png").write_bytes(b"x")
     assert set(links(page(run, []))) == {"evaluate/metrics.json", "evaluate/verdict.json", "evaluate/strip_worst.png"}
 
@@ -173,7 +173,7 @@ def test_the_closing_summary_begins_with_the_grade(tmp_path: Path) -> None:
     assert any("network 29.84 dB PSNR, 0.910 SSIM; asset 27.95 dB PSNR" in line for line in lines)
     assert any("gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %" in line for line in lines)
     assert any("bake.max_mib" in line and "Few rays." in line and "evaluate/strip_worst.png" in line for line in lines)
-    good = a_run(tmp_path / "good", POOR, {"grade": "good", "summary": "Result: good.", "findings": []})
+    good = a_run(tmp_path / "good", POOR, {"grade": "good", "summary": "Result: good.", "problems": []})
     lines = in_words(good.path, [])
     assert "good" in lines[0]
     assert lines[-1].strip() == "gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %"
@@ -200,7 +200,7 @@ ODD = {
         '{"views": 7}', '{"views": [3]}', '{"views": [{"name": ["x"]}]}', '{"network": []}', '{"split": {}}', "[1]", "3", "[" * 100_000,
         '{"network": {"psnr": NaN}}', '{"gap": 3}', '{"holes": "many"}', '{"holes": 1e999}', '{"strips": {"which": "worst"}}', '{"strips": [{"which": 1}]}',
     ],
-    "evaluate/verdict.json": ["[1]", '{"grade": 3}', '{"findings": {}}', '{"findings": [{"picture": []}]}', '"\\ud800"', "[" * 100_000],
+    "evaluate/verdict.json": ["[1]", '{"grade": 3}', '{"problems": {}}', '{"problems": [{"picture": []}]}', '"\\ud800"', "[" * 100_000],
     "poses/report.json": ['{"registered": 5}', '{"rejected": {"a": 1}}', '{"rejected": [{"name": 3}]}', '{"warnings": 4}', '"\\ud800"',
         '{"\\ud800": 1}', '{"reprojection_error": "far"}'],
     "bake/report.json": ["[]", '"text"', '{"voxels": ' + "9" * 5000 + "}", "\0"],
