@@ -21,6 +21,7 @@ from efficientnerf.asset.file import packed, streams
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.quantisation import ENTRIES, LIMIT, base_codes, clustered, quantised_density
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0
 
 PASSES = 3  # docs/experiments/packed.md
@@ -175,7 +176,7 @@ def _bases(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _slopes(base: np.ndarray) -> np.ndarray:
     """How fast a colour changes with its coefficients; a little more than nothing where it is saturated."""
-    colour = 1 / (1 + np.exp(-C0 * base))
+    colour = sigmoid(C0 * base)
     return np.maximum(colour * (1 - colour), 0.05)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0
 
 ENTRIES = 256  # of a table whose codes are bytes
@@ -99,7 +100,7 @@ def base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             levels = known.astype(np.float64)
         else:
             fine = np.linspace(known[0], known[-1], 2**14)
-            colour = 1 / (1 + np.exp(-C0 * fine))
+            colour = sigmoid(C0 * fine)
             curve = 0.8 * (colour - colour[0]) / (colour[-1] - colour[0]) + 0.2 * (fine - fine[0]) / (fine[-1] - fine[0])
             levels = np.interp(np.linspace(0, 1, ENTRIES), curve, fine)
         rounded = levels.astype(np.float32)

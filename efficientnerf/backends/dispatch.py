@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.backends import Notice
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.rendering.compositing import Composite
 from efficientnerf.sampling.samples import Samples
@@ -80,7 +81,7 @@ def triton_usable() -> bool:
     try:
         from efficientnerf.backends.triton.adam import adam as probe
     except ImportError as error:
-        warnings.warn(f"Triton cannot be imported ({error}); plain torch is used on CUDA, many times slower. Install triton.", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"Triton cannot be imported ({error}); plain torch is used on CUDA, many times slower. Install triton.", Notice, stacklevel=3)
         return False
     try:
         one = torch.ones(1, device="cuda")
@@ -89,7 +90,7 @@ def triton_usable() -> bool:
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         warnings.warn(
             f"The CUDA kernels cannot be built here ({reason[0][:200]}); plain torch is used, many times slower. Usually a C compiler is missing: install gcc.",
-            RuntimeWarning,
+            Notice,
             stacklevel=3,
         )
         return False

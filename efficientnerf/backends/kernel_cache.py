@@ -36,6 +36,8 @@ from pathlib import Path
 
 import platformdirs
 
+from efficientnerf.backends import Notice
+
 PACKAGE = Path(__file__).resolve().parent.parent
 KERNELS = ("backends/numba", "structures")  # folders of the package that hold kernels
 CONSTANTS = (  # modules that these import: numbers among them are part of the compiled code
@@ -71,7 +73,7 @@ def folder() -> Path:
         place = Path(tempfile.mkdtemp(prefix="efficientnerf-kernels-"))
         atexit.register(shutil.rmtree, place, ignore_errors=True)
     if refusals:
-        warnings.warn(f"compiled kernels are kept in {place}; refused: {', '.join(refusals)}. ENERF_CACHE_DIR chooses a folder.", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"compiled kernels are kept in {place}; refused: {', '.join(refusals)}. ENERF_CACHE_DIR chooses a folder.", Notice, stacklevel=2)
     return place
 
 

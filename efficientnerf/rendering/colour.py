@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+_LARGEST_EXPONENT = {4: 88.0, 8: 709.0}  # of exp, by the bytes of a number
+
 
 def linear_from_srgb(srgb: np.ndarray) -> np.ndarray:
     """Light of sRGB values, any shape; float32 stays float32, else float64. Values below 0 and above 1 continue the curve."""
@@ -15,6 +17,11 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     """The inverse of linear_from_srgb."""
     linear = _floating(linear)
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0) ** (1.0 / 2.4) - 0.055).astype(linear.dtype)
+
+
+def sigmoid(values: np.ndarray) -> np.ndarray:
+    """1 / (1 + exp(-x)) in the type of the values, floating point; where exp would overflow it is as good as 0."""
+    return np.asarray(1 / (1 + np.exp(np.minimum(-values, _LARGEST_EXPONENT[values.dtype.itemsize]))), values.dtype)
 
 
 def straight_from_premultiplied(colour: np.ndarray, opacity: np.ndarray) -> np.ndarray:

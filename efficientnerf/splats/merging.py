@@ -22,6 +22,7 @@ import numpy as np
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
+from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0, basis_numpy
 from efficientnerf.splats.gaussians import MAX_DEGREE, Gaussians, quaternions_from
 
@@ -180,7 +181,7 @@ def merged(tree: NerfTree, cameras: Sequence[Camera], most: int, degree: int) ->
     if not len(shown.voxels):
         return shell
     parts = (shown.voxels[begin : begin + AT_ONCE] for begin in range(0, len(shown.voxels), AT_ONCE))
-    base = 1 / (1 + np.exp(-C0 * np.concatenate([tree.coefficients(part)[:, 0] for part in parts]).astype(np.float64)))
+    base = sigmoid(C0 * np.concatenate([tree.coefficients(part)[:, 0] for part in parts]).astype(np.float64))
     begin = cells_of(shown, base, most - len(shell))
     gaussians = _gaussians_of_cells(tree, shown, begin, min(degree, tree.degree, MAX_DEGREE))
     return joined(gaussians, shell)
@@ -265,7 +266,7 @@ def _convert(tree: NerfTree, shown: Shown, begin: np.ndarray, weight: np.ndarray
         out[cells] = 0
         for n in range(len(directions)):  # not by BLAS, whose sums depend on its threads
             raw = sum(np.float32(basis[n, k]) * mixed[:, k] for k in range(basis.shape[1]))
-            colour = 1 / (1 + np.exp(-np.asarray(raw))) - np.float32(0.5)
+            colour = sigmoid(np.asarray(raw)) - np.float32(0.5)
             for k in range(out.shape[1]):
                 out[cells, k] += back[k, n] * colour
 

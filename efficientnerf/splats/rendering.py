@@ -8,6 +8,7 @@ import numpy as np
 
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, fold_radius, rays
+from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.splats.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -106,6 +107,6 @@ def gaussians_from(values: np.ndarray, count: int) -> Gaussians:
     """The first `count` Gaussians of groups, see `values_of`."""
     rows = ungrouped(values, count).astype(np.float64)
     rotations = rows[:, 6:10] / np.linalg.norm(rows[:, 6:10], axis=1, keepdims=True)
-    opacities = np.clip(1 / (1 + np.exp(-rows[:, 10])), 1e-4, 1 - 1e-4)
+    opacities = np.clip(sigmoid(rows[:, 10]), 1e-4, 1 - 1e-4)
     parts = rows[:, :3], np.exp(rows[:, 3:6]), rotations, opacities, rows[:, 11:].reshape(count, -1, 3)
     return Gaussians(*(np.ascontiguousarray(part, np.float32) for part in parts))

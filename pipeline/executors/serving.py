@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,6 +20,7 @@ from pipeline.executors.child import Event, end_with
 from pipeline.executors.local import execute_alone
 from pipeline.executors.memory import Limit, resident
 from pipeline.failures import history
+from pipeline.library_output import warnings_for_users
 from pipeline.run import Run
 from pipeline.runner import run_stages
 from pipeline.sharing import take_over
@@ -83,6 +85,9 @@ class _Channel:
         except BrokenPipeError:
             os.killpg(0, signal.SIGKILL)
 
+    def warn(self, stage: str, text: str) -> None:
+        self.send({"event": "warning", "stage": stage, "text": text, "time": time.time()})
+
     def receive(self) -> dict[str, Any]:
         found: dict[str, Any] = self._lines.get()
         return found
@@ -93,10 +98,11 @@ def serve(program: Program) -> None:
     channel = _Channel()
     end_with(channel.receive()["parent"])
     while (request := channel.receive())["kind"] != "end":
-        try:
-            answer = {"ok": True, **_answer(program, request, channel)}
-        except Exception as error:
-            answer = {"ok": False, **_failure(error)}
+        with warnings_for_users(partial(channel.warn, request.get("stage") or "")):
+            try:
+                answer = {"ok": True, **_answer(program, request, channel)}
+            except Exception as error:
+                answer = {"ok": False, **_failure(error)}
         channel.send({"event": "result", **answer})
     sys.stderr.flush()
     os._exit(0)  # libraries that take the process down while they are unloaded have no say
@@ -106,7 +112,7 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     path = Path(request["run"])
     if request["kind"] == "prepare":
         for text in program.prepare(path, request["scene"]):
-            channel.send({"event": "warning", "stage": "", "text": text, "time": time.time()})
+            channel.warn("", text)
         found = _survey(program, path)
         return {"stages": found, "finished": program.is_finished(path), **_estimates(program, path, found, request, channel), **program.describe(path)}
     if request["kind"] == "finish":

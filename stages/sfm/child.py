@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pipeline.executors.child import end_with
+from pipeline.library_output import warnings_for_users
 
 
 class Stopped(Exception):
@@ -66,7 +67,8 @@ def main() -> None:
     request = channel.receive()
     end_with(request["parent"])
     try:
-        value = _work(request["task"])(request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
+        with warnings_for_users(channel.warn):
+            value = _work(request["task"])(request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
     except BaseException as error:
         if not _was_stopped(error):
             _send_error(channel, error)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -30,7 +33,7 @@ class TrainSettings:
     iterations: PositiveInt = setting(4, "Steps.")
     rate: float = setting(0.5, "Speed.")
     seed: int = setting(0, "Of the random numbers.")
-    fail: Literal["", "bad", "error", "disk", "memory", "greedy", "ended", "slow"] = setting("", "How to fail.")
+    fail: Literal["", "bad", "error", "disk", "memory", "greedy", "ended", "slow", "noisy"] = setting("", "How to fail.")
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,8 @@ def _train(job: Job) -> None:
             raise MemoryError
         case "greedy" | "ended":
             _take_all_memory(job)
+        case "noisy":
+            _make_noise()
         case "slow":
             _wait_for(job.out.parents[5] / "go on", job)
     for step in range(job.settings.iterations):
@@ -65,6 +70,24 @@ def _train(job: Job) -> None:
         job.safe_point()
     text = (job.inputs["poses"] / "text.txt").read_text(encoding="utf-8")
     (job.out / "field.txt").write_text(f"{text} {job.settings.iterations} {job.settings.rate} {job.settings.seed}", encoding="utf-8")
+
+
+def _make_noise() -> None:
+    """What libraries say in every way, and a warning for users."""
+    import logging
+    import threading
+
+    from efficientnerf.backends import Notice
+
+    warnings.warn("NOISE overflow encountered in exp", RuntimeWarning, stacklevel=1)
+    warnings.warn("NOISE of an old function", DeprecationWarning, stacklevel=1)
+    os.write(2, b"NOISE TIFFjpeg_progress_monitor: exceeds\n")
+    logging.getLogger("a.library").warning("NOISE of a logger")
+    thread = threading.Thread(target=lambda: 1 / 0, name="NOISE")
+    thread.start()
+    thread.join()
+    subprocess.run([sys.executable, "-c", "import os; os.write(2, b'NOISE of a child\\n')"], check=True)
+    warnings.warn("for users: the cache is damaged", Notice, stacklevel=1)
 
 
 def _take_all_memory(job: Job) -> None:

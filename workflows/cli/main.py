@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None, workflow: Workflow | None = Non
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     as_json, debug = "--json" in given, "--debug" in given
-    with watched() as out:
+    with watched(debug=debug) as out:
         try:
             result = enerf.main(args=given, prog_name="enerf", standalone_mode=False, obj=workflow)
             code = result if isinstance(result, int) else 0

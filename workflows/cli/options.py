@@ -58,4 +58,4 @@ def workflow() -> Workflow:
 
 def common_options(command: C) -> C:
     """--debug, which main() finds by itself, so that it holds for errors of the command line too."""
-    return click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")(command)
+    return click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error, and what libraries said.")(command)

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TextIO, cast
 
+from pipeline.library_output import libraries_apart
 from pipeline.text import printable
 
 UNWRITTEN = 3  # exit code: what was asked for on standard output could not be written
@@ -112,18 +113,22 @@ class Stream:
 
 
 @contextmanager
-def watched() -> Iterator[Stream]:
-    """While open, standard output and standard error are Streams; yields the first."""
+def watched(*, debug: bool = False) -> Iterator[Stream]:
+    """While open, standard output and standard error are Streams, and what libraries say goes into a log (`pipeline.library_output`); yields the first.
+
+    debug  whether to show the log in the end
+    """
     _fill_descriptors()
     former = sys.stdout, sys.stderr
-    out, err = Stream(sys.stdout, missed=True), Stream(sys.stderr, missed=False)
-    sys.stdout, sys.stderr = cast("TextIO", out), cast("TextIO", err)
-    try:
-        yield out
-    finally:
-        sys.stdout, sys.stderr = former
-        out.settle()
-        err.settle()
+    with libraries_apart(show=debug) as terminal:
+        out, err = Stream(sys.stdout, missed=True), Stream(terminal, missed=False)
+        sys.stdout, sys.stderr = cast("TextIO", out), cast("TextIO", err)
+        try:
+            yield out
+        finally:
+            sys.stdout, sys.stderr = former
+            out.settle()
+            err.settle()
 
 
 def _fill_descriptors() -> None:

@@ -75,6 +75,11 @@ def sentence(event: Event) -> str:
             return ""
 
 
+def warning(text: str, stage: str = "") -> Event:
+    """The event that shows a warning."""
+    return {"event": "warning", "stage": stage, "text": text, "time": time.time()}
+
+
 def _line(stage: str, words: str) -> str:
     """An event as one line; names of files in it may hold anything."""
     return printable(f"{stage:<9} {words}" if stage else words)

@@ -104,10 +104,11 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
     import time
 
     from pipeline.executors.local import execute_alone
+    from pipeline.library_output import kept_in, warnings_for_users
     from pipeline.runner import run_stages
     from workflows.cli.device import resolve_device
     from workflows.cli.output import closing, write_json
-    from workflows.cli.progress import display
+    from workflows.cli.progress import display, warning
     from workflows.report.pages import has_pages, write_pages
     from workflows.report.summary import graded, in_words, summary
 
@@ -116,10 +117,10 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
     started = time.monotonic()
     run: Run = plan.run
     try:
-        with display(as_json=as_json, quiet=quiet) as show:
+        with display(as_json=as_json, quiet=quiet) as show, warnings_for_users(lambda text: show(warning(text))):
             for text in plan.warnings:
-                show({"event": "warning", "stage": "", "text": text, "time": time.time()})
-            with nullcontext(run) if dry_run else plan.written() as run:
+                show(warning(text))
+            with nullcontext(run) if dry_run else plan.written() as run, nullcontext() if dry_run else kept_in(run.path):
                 how: dict[str, Any] = {"device": device, "memory": plan.memory, "report": show, "dry_run": dry_run, "execute": execute_alone}
                 outcomes = run_stages(run, workflow().stages, **how, **selection)
                 if not dry_run and (any(outcome.action == "ran" for outcome in outcomes) or not has_pages(run, workflow().stages)):

@@ -25,7 +25,7 @@ from typing import Any
 import numba
 from numba.core import caching, event
 
-from efficientnerf.backends import LAYERS, kernel_cache
+from efficientnerf.backends import LAYERS, Notice, kernel_cache
 
 if os.environ.get("NUMBA_THREADING_LAYER_PRIORITY", LAYERS) == LAYERS:
     numba.config.THREADING_LAYER_PRIORITY = LAYERS.split()  # numba may have been imported before the environment said so
@@ -65,7 +65,7 @@ class KernelLocator(caching._CacheLocator):
 
 @functools.cache
 def _warn_once(text: str) -> None:
-    warnings.warn(text, RuntimeWarning, stacklevel=2)
+    warnings.warn(text, Notice, stacklevel=2)
 
 
 class KernelFiles(caching.IndexDataCacheFile):
@@ -127,7 +127,7 @@ class KernelFiles(caching.IndexDataCacheFile):
         if hashlib.sha256(content[:-32]).digest() == content[-32:]:
             return True
         Path(path).unlink(missing_ok=True)
-        warnings.warn(f"{path}: damaged, as by a power cut; removed, and compiled again.", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{path}: damaged, as by a power cut; removed, and compiled again.", Notice, stacklevel=2)
         return False
 
 

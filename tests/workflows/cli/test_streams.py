@@ -99,7 +99,8 @@ def test_what_is_opened_does_not_take_the_place_of_a_closed_stream(toys: Path, t
         done = subprocess.run(["sh", "-c", command, sys.executable, program, str(toys), str(run)], capture_output=True, check=False)
         assert done.returncode == code
         assert subprocess.run([sys.executable, "-m", "workflows.cli.main", "verify", str(run)], capture_output=True, check=False).returncode == 0
-        assert b"stray" not in b"".join(path.read_bytes() for path in run.rglob("*") if path.is_file())
+        others = [path for path in run.rglob("*") if path.is_file() and path.name != "libraries.log"]  # what is said on descriptor 2 is kept there
+        assert b"stray" not in b"".join(path.read_bytes() for path in others)
 
 
 LOCALES = ({"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, {"LC_ALL": "C"})
