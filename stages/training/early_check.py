@@ -27,7 +27,7 @@ MIN_STEP = 256  # before the warm-up of the density voxels ends nothing is expec
 VIEWS = 5  # that are rendered
 SIDE = 48  # px, their longest side
 MARGIN = 3  # px round the subject
-PATCHES = 8  # along the longest side of the blurred photograph
+BLUR = 0.04  # standard deviation of the blurred photograph, of its longest side: what the verdict calls failed (stages/verdict/result.py)
 MIN_PIXELS = 16  # of a view that are compared
 MIN_KEPT = 0.1  # of a subject, that masks have to keep to be believed
 # docs/experiments/early-check.md
@@ -120,19 +120,11 @@ def _decibels(error: np.ndarray) -> float:
 
 def _errors(view: HeldOutView, render: np.ndarray) -> tuple[float, float, float]:
     """Mean squared errors of the render, the mean colour and the blurred photograph."""
+    from stages.evaluation.trivial import blurred
+
     truth, at = view.colour, view.counted
     gain = (render[at] * truth[at]).sum(axis=0) / np.maximum((render[at] ** 2).sum(axis=0), 1e-9)
     render = np.clip(render * np.clip(gain, 1 / MAX_GAIN, MAX_GAIN), 0, 1)
     plain = np.broadcast_to(truth[at].mean(axis=0), truth.shape)
-    error, mean, blurred = (float(((picture[at] - truth[at]) ** 2).mean()) for picture in (render, plain, _blurred(truth, at)))
-    return error, mean, blurred
-
-
-def _blurred(colour: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Each pixel the mean of the counted ones in a square round it of 1 / PATCHES of the longest side."""
-    import cv2
-
-    side = 2 * (max(colour.shape[:2]) // (2 * PATCHES)) + 1
-    weight = counted.astype(np.float32)
-    total, count = (cv2.blur(part, (side, side), borderType=cv2.BORDER_CONSTANT) for part in (colour * weight[..., None], weight))
-    return np.asarray(total / np.maximum(count, 1e-6)[..., None])
+    error, mean, patches = (float(((picture[at] - truth[at]) ** 2).mean()) for picture in (render, plain, blurred(truth, BLUR * max(truth.shape[:2]), at)))
+    return error, mean, patches

@@ -16,6 +16,7 @@ from PIL import Image
 from pipeline.errors import CorruptArtifact, Interrupted, StageFailed
 from stages import train
 from stages.artifacts import TrainOutputs
+from stages.evaluation.trivial import blurred
 from stages.io import scene as scenes
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import View
@@ -103,7 +104,7 @@ def test_no_plain_colour_is_progress_and_the_photograph_is(seed: int) -> None:
     assert (good.views, good.step) == (3, 7)
     assert result(lambda view: 0.6 * view.colour).learning  # an exposure of its own
     assert result(lambda view: view.colour if view is not views[0] else np.zeros_like(view.colour)).learning  # one of three has a wrong camera
-    assert result(lambda view: early_check._blurred(view.colour, view.counted)).progress == pytest.approx(1, abs=0.1)
+    assert result(lambda view: blurred(view.colour, early_check.BLUR * 40)).progress == pytest.approx(1, abs=0.1)
 
 
 def test_a_render_close_to_a_plain_photograph_is_no_failure() -> None:
