@@ -106,7 +106,7 @@ def judge(views: Sequence[HeldOutView], render: Callable[[Camera], np.ndarray], 
 
     render  colours (H, W, 3) that a camera sees
     """
-    found = [_errors(view, np.clip(render(view.camera), 0, 1)) for view in views if view.counted.sum() >= MIN_PIXELS]
+    found = [_errors(view, np.clip(np.nan_to_num(render(view.camera)), 0, 1)) for view in views if view.counted.sum() >= MIN_PIXELS]
     if not found:
         return None
     error, mean, blurred = np.array(found).T

@@ -97,6 +97,9 @@ def test_no_plain_colour_is_progress_and_the_photograph_is(seed: int) -> None:
     assert not plain.learning
     assert not result(lambda view: np.zeros_like(view.colour)).learning
     assert not result(lambda view: rng.random(view.colour.shape)).learning
+    diverged = result(lambda view: np.full_like(view.colour, np.nan))
+    assert not diverged.learning
+    assert np.isfinite(diverged.progress)
     assert not result(lambda view: views[0].colour if view is not views[0] else views[1].colour).learning
     good = result(lambda view: view.colour)
     assert good.learning
