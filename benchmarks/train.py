@@ -86,7 +86,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     m = model(space_of(s), settings, s.background, "cpu", (near, far))
     hold = settings.occupancy_warmup_steps + TIMED
     schedule = dataclasses.replace(schedule_of(settings), iterations=UNKNOWN, hold=hold) if whole else schedule_of(settings)
-    t = trainer(m, len(views), schedule)
+    t = trainer(m, schedule=schedule)
     warmed: list[tuple[int, float]] = []
 
     def plan(step: int, wall: float) -> Any:

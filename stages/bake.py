@@ -145,7 +145,7 @@ def run(job: Job) -> None:
     from stages.baking.whole_scene import bounds_are_given
     from stages.evaluation.views import constant_background
     from stages.io import scene
-    from stages.io.field_file import gains_of_views, load_renderer
+    from stages.io.field_file import load_renderer
     from stages.io.refined_cameras import load_scene
     from stages.training.data import pixels_of
 
@@ -159,14 +159,14 @@ def run(job: Job) -> None:
     most = given(settings.max_mib) or mib  # of the file
     phases = schedule.PHASES
     splits = schedule.count_splits(phases)
-    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole))
+    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole), job.inputs["train"])
     plan = _plan(job, m, s, pixels, mib, splits, whole=whole)
     room = partial(_room, settings, m, plan, mib)
     _check(job, m, plan)
     refuse_more_than_fits(job, m, views, pixels, plan, mib, splits, room)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
-    targets = _targets(s, pixels, plan, gains_of_views(job.inputs["train"], views))
+    targets = _targets(s, pixels, plan)
     tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, phases, room, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
@@ -258,12 +258,12 @@ def _check(job: Job, m: Any, plan: Plan) -> None:
     job.say(f"{resolution} voxels along the longest side ({plan.choice.why}); {plan.voxels:,} voxels{of} are baked")
 
 
-def _targets(s: Scene, pixels: Pixels, plan: Plan, gains: np.ndarray | None) -> Targets:
+def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
     """What the tree is fitted to."""
     from efficientnerf.asset.refinement.targets import Targets
     from stages.evaluation.views import constant_background
 
-    return Targets(pixels, constant_background(s), plan.environment, reaches_infinity=plan.space.reaches_infinity, gains=gains)
+    return Targets(pixels, constant_background(s), plan.environment, reaches_infinity=plan.space.reaches_infinity)
 
 
 STAGE = Stage(

@@ -149,6 +149,7 @@ def evaluate(
     refinement  of the asset, `refinement_of`
     """
     from stages.io.refined_cameras import load_scene
+    from stages.training.averaged import without_vignetting
 
     settings: EvaluateSettings = job.settings
     scene = load_scene(job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage])
@@ -163,6 +164,7 @@ def evaluate(
     composited = surrounded and constant_background(scene) is None
     perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in networks_of(settings)}
     points = sure_points(job.inputs[PosesOutputs.stage], scene, asset.reach)
+    unshaded = without_vignetting(job.inputs[TrainOutputs.stage])
     figures, others = [], [name for name, known in (("splats", splats), ("sparse_points", points)) if known is not None]
     for k, view in enumerate(views):
         job.safe_point()
@@ -174,7 +176,7 @@ def evaluate(
             field = load_field() if with_field or not surrounded else None
             measured, images = evaluate_view(
                 asset, mesh, field, scene, view, job, with_field=with_field, stride=stride if with_field or rest is None else rest, perceptual=perceptual,
-                splats=splats, points=points,
+                splats=splats, points=points, unshaded=unshaded,
             )  # fmt: skip
             note(done, measured, _save_thumbnails(images, job.work, k) if with_field else ())
         figures.append(measured)

@@ -48,7 +48,7 @@ REMOVED: dict[str, dict[str, str]] = {
 }
 
 # Values that have another name under the present name of their setting.
-VALUES: dict[str, dict[str, dict[str, str]]] = {"poses": {"alpha": {"composite": "silhouette", "mask": "ignore"}}}
+VALUES: dict[str, dict[str, dict[str, str]]] = {"poses": {"alpha": {"composite": "silhouette", "mask": "ignore"}}, "train": {"exposure": {"gain": "on"}}}
 
 # Words that replace 0, none and empty texts.
 WORDS = ("auto", "off", "all")

@@ -1,6 +1,6 @@
 """The train stage: a scene in, a trained field out.
 
-field.safetensors  both fields, the density voxels, what they mean; the schedule; each photograph's gains where exposure was learned
+field.safetensors  both fields, the density voxels, what they mean; the schedule; the exposure of photographs where it was learned
 cameras.json       the training cameras, where they were refined
 choices.json       what training did otherwise than the scene and the settings state, where it learned nothing with them
 report.json        steps and seconds
@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,7 @@ from stages.cores import use_all_cores
 from stages.training.budget import UNKNOWN, Budget, training_budget
 from stages.training.checkpoints import Checkpoints
 from stages.training.data import count_pixels, depth_range, pixels_of, refuse_planes_out_of_order, sparse_depth_of, with_camera_refinement
+from stages.training.exposure import begin_exposure, exposure_facts, saved_exposure
 from stages.training.log import TrainLog
 from stages.training.previews import Previews
 from stages.training.priors import Prior, mask_uncovered_cells
@@ -62,17 +64,17 @@ def trained(job: Job) -> bool:
 
     use_all_cores()
     folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
-    watch = Watch(job, scene.load(folder), folder)
-    s = watch.scene
+    s = (watch := Watch(job, scene.load(folder), folder)).scene
     views = scene.views_of(s, "train")
     settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views)), s), field_file.space_of(s)
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views, rows_for_training(job, folder, views, settings, space))
     near, far = depth_range(s, pixels, settings, job.warn)
-    m = model(space, settings, s.background, job.device, (near, far))
+    exposure = begin_exposure(folder, s, pixels, settings.exposure, job.device, job.say)
+    m = model(space, replace(settings, exposure="off" if exposure is None else "on"), s.background, job.device, (near, far))
     priors = mask_uncovered_cells(m, views, job)
 
-    t = loop.trainer(m, len(views), cameras=[view.camera for view in views])
+    t = loop.trainer(m, exposure, cameras=[view.camera for view in views])
     checkpoints = Checkpoints(job)
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
@@ -101,7 +103,7 @@ def trained(job: Job) -> bool:
         checkpoints.reach(t, log, every=settings.checkpoint_every, last=last)
         log.begin_step()
     log.flush()
-    field_file.save_model(m, near, far, outputs.field, gains_of(t, views), t.schedule)
+    field_file.save_model(m, near, far, outputs.field, saved_exposure(t.exposure, s), t.schedule)
     write_cameras(outputs.cameras, t, views)
     watch.write_choices(outputs.choices)
     write_report(outputs.report, job, t, log.seconds, previews.figures | watch.report(), priors)
@@ -150,15 +152,6 @@ def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
         job.say(f"{t.schedule.iterations} steps fit into the budget of {job.settings.time_budget} s{rest}")
 
 
-def gains_of(t: Trainer, views: tuple[View, ...]) -> dict[str, np.ndarray] | None:
-    """The learned gains (3,) of each training view, by the name of its image; None where exposure was not learned."""
-    if t.exposure is None:
-        return None
-    from efficientnerf.training.exposure import log_gains
-
-    return dict(zip((view.image for view in views), np.exp(log_gains(t.exposure.detach()).cpu().numpy()), strict=True))
-
-
 def write_cameras(path: Path, t: Trainer, views: tuple[View, ...]) -> None:
     """The training cameras, where they were refined."""
     if t.cameras is not None:
@@ -184,6 +177,7 @@ def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[s
         **found,
         "cameras": camera_changes(t),
         "priors": {prior.name: {"masked": round(prior.masked, 4), "contradicted": round(prior.contradicted, 4), "applied": prior.applied} for prior in priors},
+        "exposure": exposure_facts(t.exposure),
         "occupied": t.model.voxels.occupied,
         "log2_hashmap_size": settings.log2_hashmap_size,
         "finest_resolution": settings.finest_resolution,
@@ -202,7 +196,7 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
 
 STAGE = Stage(
     name="train",
-    version=8,
+    version=9,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,

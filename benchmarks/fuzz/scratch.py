@@ -35,7 +35,7 @@ def _trainer() -> Any:
 
     torch.set_num_threads(1)
     assert field_file
-    return loop.trainer(model(space_from(BOUNDS, contracted=False), settings(**QUICK), (1.0, 1.0, 1.0), "cpu", (1.0, 5.0)), 4)
+    return loop.trainer(model(space_from(BOUNDS, contracted=False), settings(**QUICK), (1.0, 1.0, 1.0), "cpu", (1.0, 5.0)))
 
 
 def _digest(t: Any) -> str:

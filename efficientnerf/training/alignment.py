@@ -10,7 +10,7 @@ from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.training.camera_refinement import FAR, Alignment, CameraCorrections, add_round, solve
 from efficientnerf.training.device_pixels import DevicePixels
-from efficientnerf.training.exposure import exposed
+from efficientnerf.training.exposure.model import Exposure, exposed, places
 from efficientnerf.training.pixels import Pixels
 
 # docs/experiments/photographs.md
@@ -28,16 +28,16 @@ def is_due(number: int, fraction: float) -> bool:
     return number % EVERY == 0 and BEGIN <= fraction <= END
 
 
-def refine_cameras(m: Model, pixels: Pixels, source: Pixels | DevicePixels, c: CameraCorrections, rng: np.random.Generator, gains: Tensor | None) -> float:
+def refine_cameras(m: Model, pixels: Pixels, source: Pixels | DevicePixels, c: CameraCorrections, rng: np.random.Generator, exposure: Exposure | None) -> float:
     """A round of refinement; the pixels' rays are those of the corrected cameras afterwards. Returns the largest motion, in pixels.
 
-    gains  (C, 3) learned logarithms of the photographs' gains, see `efficientnerf.training.exposure`; None: there are none
+    exposure  what is learned of it, without gradients, see `efficientnerf.training.exposure.model`; None: nothing is
     """
     count = int(np.clip(PIXELS // len(c.given), MIN_PIXELS, MAX_PIXELS))
     chosen = [_choose(pixels, view, count, rng) for view in range(len(c.given))]
     if not any(len(index) for index in chosen):
         return 0.0
-    colour, points = _rendered(m, source, np.concatenate(chosen), gains)
+    colour, points = _rendered(m, source, np.concatenate(chosen), exposure)
     ends = np.cumsum([len(index) for index in chosen])[:-1]
     seen = [
         _alignment(pixels, view, index, shown, at) if len(index) else None
@@ -73,7 +73,7 @@ def _alignment(pixels: Pixels, view: int, index: np.ndarray, shown: np.ndarray, 
 
 
 @torch.no_grad()
-def _rendered(m: Model, source: Pixels | DevicePixels, index: np.ndarray, gains: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
+def _rendered(m: Model, source: Pixels | DevicePixels, index: np.ndarray, exposure: Exposure | None) -> tuple[np.ndarray, np.ndarray]:
     """Colours (R, 3) and points (R, 3) in the world that the field shows at pixels, float64."""
     colours, points = [], []
     # Where nothing is pruned a ray has as many samples as there are.
@@ -83,9 +83,9 @@ def _rendered(m: Model, source: Pixels | DevicePixels, index: np.ndarray, gains:
         origins, directions, near, far = (torch.as_tensor(a, device=m.device) for a in source.bundle(part)[:4])
         outputs = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), m.behind(directions))
         colour = outputs.fine_colour
-        if gains is not None:
+        if exposure is not None:
             pixels = source.pixels if isinstance(source, DevicePixels) else source
-            colour = exposed(colour, torch.from_numpy(pixels.view_of(part)).to(m.device), gains)
+            colour = exposed(colour, *places(pixels, part, m.device), exposure)
         colours.append(colour.double().cpu().numpy())
         points.append((origins + surface_distance(outputs)[:, None] * directions).double().cpu().numpy())
     return np.concatenate(colours), np.concatenate(points)

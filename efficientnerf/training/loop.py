@@ -22,7 +22,6 @@ from torch import Tensor
 
 from efficientnerf import model as models
 from efficientnerf.backends import dispatch
-from efficientnerf.backends.transfer import to_device
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.sampling.samples import complete_rays
@@ -30,7 +29,7 @@ from efficientnerf.training.alignment import is_due, refine_cameras
 from efficientnerf.training.batch import ray_batch, ray_count
 from efficientnerf.training.camera_refinement import CameraCorrections
 from efficientnerf.training.device_pixels import DevicePixels
-from efficientnerf.training.exposure import exposure_loss
+from efficientnerf.training.exposure.model import Exposure, exposure_loss, is_learned, places
 from efficientnerf.training.losses import colour_losses, distortion_loss, scale_gradients_by_distance
 from efficientnerf.training.occupancy_update import update_occupancy
 from efficientnerf.training.optimiser import Adam, ParameterGroup, parameter_groups
@@ -74,7 +73,7 @@ class Trainer:
 
     schedule         the one that the next step follows; another may take its place between steps
     samples_per_ray  the running average that sets the number of rays
-    exposure         (C, 3) learned logarithms of gains (`efficientnerf.training.exposure`), or None
+    exposure         of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
     cameras          corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
     """
 
@@ -83,22 +82,21 @@ class Trainer:
     schedule: Schedule
     step: int = 0
     samples_per_ray: float = 0.0
-    exposure: torch.nn.Parameter | None = None
+    exposure: Exposure | None = None
     cameras: CameraCorrections | None = None
 
 
-def trainer(m: Model, views: int = 0, schedule: Schedule | None = None, cameras: Sequence[Camera] = ()) -> Trainer:
+def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | None = None, cameras: Sequence[Camera] = ()) -> Trainer:
     """A trainer at its beginning.
 
-    views     number of training images, needed where their exposure is learned
+    exposure  of the training images, that is learned; None: none is
     schedule  None: that of the model's settings
     cameras   of the training images, needed where they are refined
     """
     schedule = schedule or schedule_of(m.settings)
     groups = parameter_groups(m)
-    exposure = torch.nn.Parameter(torch.zeros(views, 3, device=m.device)) if m.settings.exposure == "gain" and m.background is None and views else None
     if exposure is not None:
-        groups.append(ParameterGroup({"exposure": exposure}))
+        groups.append(ParameterGroup(exposure.parameters))
     # Until it is known better, every interval is sampled, and as many pivots as there may be.
     samples = float(m.max_intervals + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
     corrections = CameraCorrections.none(cameras) if m.settings.camera_refinement == "on" and cameras else None
@@ -109,7 +107,7 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
     """All that a resumed run needs beside its schedule, by name."""
     moments = {f"adam.{k}.{name}": pair[k] for name, pair in t.adam.moments.items() for k in (0, 1)}
     progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
-    exposure = {} if t.exposure is None else {"exposure": t.exposure.detach()}
+    exposure = {} if t.exposure is None else {name: values.detach() for name, values in t.exposure.parameters.items()}
     cameras = {} if t.cameras is None else {f"cameras.{name}": torch.from_numpy(values) for name, values in t.cameras.state.items()}
     return models.state_of(t.model) | moments | exposure | cameras | {"progress": progress}
 
@@ -119,7 +117,8 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     step, samples_per_ray = _check(t, state)
     models.restore(t.model, state)
     if t.exposure is not None:
-        t.exposure.data.copy_(state["exposure"])
+        for name, learned in t.exposure.parameters.items():
+            learned.data.copy_(state[name])
     if t.cameras is not None:
         for name, values in t.cameras.state.items():
             values[...] = state[f"cameras.{name}"].numpy()
@@ -173,11 +172,12 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         outputs = render_rays(m, *batch[:6], prune=prune, rng=rng, capacity=capacity, samples_per_pivot=samples_per_pivot)
 
         complete = complete_rays(outputs.coarse, outputs.fine)
-        view = None if t.exposure is None else to_device(torch.from_numpy(pixels.view_of(batch.pixel)), m.device)
-        fine_loss, coarse_loss = colour_losses(outputs, batch.colour, complete, view, t.exposure)
+        exposure = t.exposure if t.exposure is None or is_learned(fraction) else t.exposure.detached
+        at = None if exposure is None else places(pixels, batch.pixel, m.device)
+        fine_loss, coarse_loss = colour_losses(outputs, batch.colour, complete, at, exposure)
         loss = fine_loss if coarse_loss is None else fine_loss + coarse_loss  # weighted equally, as in the authors' release
-        if t.exposure is not None:
-            loss = loss + exposure_loss(t.exposure)
+        if exposure is not None:
+            loss = loss + exposure_loss(exposure)
         if m.space.unbounded:
             loss = loss + distortion_loss(m, outputs, fraction, complete)
         if m.space.scales_near_gradients:
@@ -191,7 +191,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         t.adam.step(number, t.schedule.learning_rate_at(number))
         update_occupancy(m, outputs, number, rng, padded=capacity is not None, may_wait=readback is None)
         if t.cameras is not None and is_due(number, fraction):
-            refine_cameras(m, pixels, source, t.cameras, rng, None if t.exposure is None else t.exposure.detach())
+            refine_cameras(m, pixels, source, t.cameras, rng, None if exposure is None else exposure.detached)
 
         t.step = number
         yield _progress(t, count, fine_loss, outputs, readback)

@@ -8,7 +8,7 @@ from torch import Tensor
 from efficientnerf.backends.transfer import to_device
 from efficientnerf.model import Model, RayOutputs
 from efficientnerf.rendering.compositing import ray_of_sample
-from efficientnerf.training.exposure import exposed
+from efficientnerf.training.exposure.model import Exposure, exposed, squared_error
 
 
 def mean_over(values: Tensor, rays: Tensor | None) -> Tensor:
@@ -20,18 +20,23 @@ def mean_over(values: Tensor, rays: Tensor | None) -> Tensor:
     return torch.where(rays, per_ray, 0).sum() / rays.sum().clamp(min=1)
 
 
-def colour_losses(outputs: RayOutputs, colour: Tensor, complete: Tensor | None, view: Tensor | None, exposure: Tensor | None) -> tuple[Tensor, Tensor | None]:
+def colour_losses(
+    outputs: RayOutputs, colour: Tensor, complete: Tensor | None, at: tuple[Tensor, Tensor] | None = None, exposure: Exposure | None = None
+) -> tuple[Tensor, Tensor | None]:
     """Mean squared error of the fine colours, and of the coarse ones (None where there is no coarse stage).
 
     colour    (R, 3) of the photographs
     complete  (R,) bool, rays that count; None: all
-    view      (R,) int64 photograph of each ray; exposure (C, 3), see `efficientnerf.training.exposure`; None: exposure is not learned
+    at        photograph (R,) int64 of each ray and r^2 (R,) in it, where exposure is learned, see `efficientnerf.training.exposure.model`
     """
     fine, coarse = outputs.fine_colour, outputs.coarse_colour
-    if exposure is not None and view is not None:
-        fine = exposed(fine, view, exposure)
-        coarse = None if coarse is None else exposed(coarse, view, exposure)
-    return mean_over((fine - colour) ** 2, complete), None if coarse is None else mean_over((coarse - colour) ** 2, complete)
+
+    def error(seen: Tensor) -> Tensor:
+        if exposure is None or at is None:
+            return (seen - colour) ** 2
+        return squared_error(exposed(seen, *at, exposure), colour)
+
+    return mean_over(error(fine), complete), None if coarse is None else mean_over(error(coarse), complete)
 
 
 def distortion_loss(m: Model, outputs: RayOutputs, fraction: float, complete: Tensor | None) -> Tensor:

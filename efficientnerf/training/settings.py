@@ -89,8 +89,10 @@ class TrainSettings:
     sparse_depth_loss_weight: NonNegative = setting(
         0.1, "Weight of the loss that puts the surface at the sparse points (DS-NeRF); it falls to zero by half of the steps.", advanced=True
     )
-    exposure: Literal["off", "gain"] = setting(
-        "off", "What is learned of the exposure of each photograph in unbounded scenes: nothing (off), or a gain for each colour channel (gain)."
+    exposure: Literal["auto", "off", "on"] = setting(
+        "auto",
+        "Whether exposure and white balance of each photograph, and vignetting and response of each camera, are learned in unbounded scenes; auto: where"
+        " sparse points show that photographs differ.",
     )
     camera_refinement: Literal["auto", "off", "on"] = setting(
         "auto", "Whether poses and the focal length of the training cameras are corrected in training (on), or left alone (off); auto: off.", advanced=True,

@@ -8,12 +8,15 @@ floaters  opacity of the asset nearer than the network's surfaces, less a margin
 holes_excess_error, floaters_excess_error  the asset's squared error less the network's, of those pixels and weighed by that opacity, over what `holes` and
           `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there
 
-psnr_colour_fitted is the PSNR once the render's colours have had the affine change that fits the photograph best (`metrics.colour_fitted`).
+psnr_colour_fitted is the PSNR once the render's colours have had the affine change, twelve numbers a view, that fits the photograph best
+(`metrics.colour_fitted`). Held-back photographs have an exposure of their own that nothing learned; where training learned vignetting, it is of the photograph
+without that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +31,7 @@ from stages.evaluation.splats import EvaluatedSplats, splats_image, splats_metri
 from stages.evaluation.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluation.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.io.scene import Scene, View
+from stages.training.averaged import Unshaded
 
 if TYPE_CHECKING:
     from efficientnerf.evaluation.lpips import Lpips
@@ -43,6 +47,7 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 def evaluate_view(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
     perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: SurePoints | None = None,
+    unshaded: Unshaded | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
@@ -50,10 +55,12 @@ def evaluate_view(
     stride      of the pixels that the field renders
     perceptual  LPIPS networks by the name of their metric
     points      that the asset's depth is compared with
+    unshaded    `stages.training.averaged.without_vignetting`
     """
     from stages.figures.plots import error_map, to_uint8
 
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
+    truth = truth if unshaded is None else replace(truth, flat=unshaded(view, truth.colour))
     unbounded = constant_background(scene) is None
     metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
     images: list[np.ndarray] = []
@@ -186,11 +193,12 @@ def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) ->
     used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
     boxed = None if inside is None else used & inside
     windows = used[5:-5, 5:-5]
+    flat = truth.colour if truth.flat is None else truth.flat
     return {
         "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,
         "ssim": ssim(image, truth.colour, truth.mask) if windows.any() else None,
         "psnr_in_box": min(MAX_PSNR, psnr(image, truth.colour, boxed)) if boxed is not None and boxed.any() else None,
-        "psnr_colour_fitted": min(MAX_PSNR, psnr(colour_fitted(image, truth.colour, truth.mask), truth.colour, truth.mask)) if used.any() else None,
+        "psnr_colour_fitted": min(MAX_PSNR, psnr(colour_fitted(image, flat, truth.mask), flat, truth.mask)) if used.any() else None,
     }
 
 

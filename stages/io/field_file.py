@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,8 +28,9 @@ if TYPE_CHECKING:
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.model import Model
     from efficientnerf.rendering.field_renderer import FieldRenderer
+    from efficientnerf.training.exposure.model import Exposure
     from efficientnerf.training.schedule import Schedule
-    from stages.io.scene import Scene, View
+    from stages.io.scene import Scene
 
 FORMAT = 1
 
@@ -97,16 +97,16 @@ def space_of(s: Scene) -> Space:
     return space_from(s.bounds, contracted=s.contracted) if s.forward is None else space_from(s.forward.bounds, ndc=s.forward.ndc)
 
 
-GAINS = "exposure.gains"
+EXPOSURE = ("exposure.photographs", "exposure.cameras", "exposure.camera_of")
 
 
-def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, np.ndarray] | None = None, schedule: Schedule | None = None) -> None:
+def save_model(
+    m: Model, near: float, far: float, path: Path, exposure: tuple[list[str], Exposure] | None = None, schedule: Schedule | None = None
+) -> None:
     """
-    gains     of each training view by the name of its image, (3,) the gains from the scene's colours to the photograph's, where they were learned
+    exposure  images of photographs, and what was learned of them, where it was
     schedule  that the model was trained with, which gives it again to the byte
     """
-    import torch
-
     from efficientnerf.model import state_of
 
     trained = {} if schedule is None else {"iterations": schedule.iterations}
@@ -121,45 +121,45 @@ def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, n
         "far": far,
     }
     tensors = state_of(m)
-    if gains:
-        tensors[GAINS] = torch.from_numpy(np.stack([gains[name] for name in sorted(gains)]).astype(np.float32))  # (C, 3)
-        about["exposed"] = sorted(gains)
+    if exposure is not None:
+        about["exposed"], e = exposure
+        tensors |= dict(zip(EXPOSURE, (e.photographs, e.cameras, e.camera_of), strict=True))
     write_tensors(tensors, about, path)
 
 
-def load_gains(folder: Path) -> dict[str, np.ndarray]:
-    """What `save_model` was given: the factors (3,) of each training view; none where exposure was not learned."""
+def load_exposure(folder: Path) -> tuple[list[str], Exposure] | None:
+    """What `save_model` was given; None where exposure was not learned. Raises CorruptArtifact."""
+    from efficientnerf.training.exposure.model import Exposure
+
     path = TrainOutputs(folder).field
-    if not _names_gains(path):
-        return {}
+    if not _names_exposure(path):
+        return None
     tensors, about = read_tensors(path)
     names = about.get("exposed", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise CorruptArtifact(f"{printable(path)}: 'exposed' is {shown(names)}; expected a list of names. Train again.")
-    if not names and GAINS not in tensors:
-        return {}
-    if GAINS not in tensors or tuple(tensors[GAINS].shape) != (len(names), 3):
-        found = tuple(tensors[GAINS].shape) if GAINS in tensors else None
-        raise CorruptArtifact(f"{path}: '{GAINS}' is {found}; expected {(len(names), 3)}. Train again.")
-    return dict(zip(names, tensors[GAINS].numpy(), strict=True))
+    cameras = tuple(tensors[EXPOSURE[1]].shape) if EXPOSURE[1] in tensors else ()
+    count = cameras[0] if len(cameras) == 2 else 0
+    for name, shape in zip(EXPOSURE, ((len(names), 3), (count, 4), (len(names),)), strict=True):
+        found = tuple(tensors[name].shape) if name in tensors else None
+        if found != shape or not count:
+            raise CorruptArtifact(f"{path}: '{name}' is {found}; expected {shape}. Train again.")
+    photographs, per_camera, camera_of = (tensors[name] for name in EXPOSURE)
+    if not (photographs.isfinite().all() and per_camera.isfinite().all() and ((camera_of >= 0) & (camera_of < count)).all()):
+        raise CorruptArtifact(f"{path}: an exposure that no photograph has. Train again.")
+    return names, Exposure(photographs.float(), per_camera.float(), camera_of.long())
 
 
-def _names_gains(path: Path) -> bool:
-    """Whether a field file has gains, by its head alone: where exposure was not learned, nobody waits for the rest. One that cannot be read has none: it is
+def _names_exposure(path: Path) -> bool:
+    """Whether a field file has it, by its head alone: where exposure was not learned, nobody waits for the rest. One that cannot be read has none: it is
     refused where the field is needed."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with opened(path), safe_open(path, framework="pt", device="cpu") as file:
-            return GAINS in file.keys() or '"exposed"' in (file.metadata() or {}).get("field", "")  # noqa: SIM118 (not a dict)
+            return bool(set(EXPOSURE) & set(file.keys())) or '"exposed"' in (file.metadata() or {}).get("field", "")
     except (SafetensorError, ValueError, OSError, TypeError):
         return False
-
-
-def gains_of_views(folder: Path, views: Sequence[View]) -> np.ndarray | None:
-    """(C, 3) the gains of views from the scene's colours to the photograph's, as the train stage in `folder` learned them, 1 for others; None: none were."""
-    known = load_gains(folder)
-    return np.stack([known.get(view.image, np.ones(3, np.float32)) for view in views]) if known else None
 
 
 def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:

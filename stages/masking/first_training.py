@@ -66,7 +66,7 @@ def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settin
     pixels = Pixels(cameras, images, [None] * len(images), near, far, 3)
     m = model(space_of(scene), settings, None, "cpu", (float(near.min()), float(far.max())))
     mask_cells_by(m, cameras, near.tolist(), None, filled_points(folder, len(cameras)))
-    for done in loop.train(loop.trainer(m, len(cameras)), pixels, sparse_depth_of(folder, scene, settings.seed)):
+    for done in loop.train(loop.trainer(m), pixels, sparse_depth_of(folder, scene, settings.seed)):
         job.reached(done.step, settings.iterations, "a first training, to find the foreground")
     return FirstField(m, float(near.min()), float(far.max()), tuple(cameras), pixels)
 

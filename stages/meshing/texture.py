@@ -103,14 +103,11 @@ def largest_photograph(inputs: MeshInputs, choice: str) -> int:
 def photographs(inputs: MeshInputs, views: tuple[View, ...]) -> Iterator[Photograph]:
     """The photographs of views, read when they are asked for; where training learned their exposure, as if all had been exposed alike."""
     from efficientnerf.surface.texturing.photographs import photograph
-    from efficientnerf.training.exposure import averaged_image
-    from stages.io.field_file import gains_of_views
-    from stages.io.scene import read_image, read_mask
+    from stages.training.averaged import averaged_views
 
-    gains = gains_of_views(inputs.train.folder, views)
-    for number, view in enumerate(views):
-        image = read_image(inputs.poses.folder, view)
-        yield photograph(view.camera, image if gains is None else averaged_image(image, gains[number]), read_mask(inputs.poses.folder, view))
+    read = averaged_views(inputs.poses.folder, inputs.train.folder)
+    for view in views:
+        yield photograph(view.camera, *read(view))
 
 
 def facts_of(report: dict[str, Any]) -> str:

@@ -26,16 +26,12 @@ def photographs(folder: Path, scene: Scene, trained: Path) -> list[View]:
     trained  of the stage train: where it learned the photographs' exposure, they are as if all had been exposed alike
     """
     from efficientnerf.splats.build import View
-    from efficientnerf.training.exposure import averaged_image
-    from stages.io.field_file import gains_of_views
-    from stages.io.scene import read_image, read_mask, views_of
+    from stages.io.scene import views_of
+    from stages.training.averaged import averaged_views
 
-    found = []
-    views = views_of(scene, "train")
-    gains = gains_of_views(trained, views)
-    for number, view in enumerate(views):
-        pixels, mask = read_image(folder, view), read_mask(folder, view)
-        pixels = pixels if gains is None else averaged_image(pixels, gains[number])
+    found, read = [], averaged_views(folder, trained)
+    for view in views_of(scene, "train"):
+        pixels, mask = read(view)
         if pixels.shape[2] == 4 and scene.background is None:
             covered = pixels[..., 3] >= 128
             pixels, mask = np.ascontiguousarray(pixels[..., :3]), covered if mask is None else mask & covered

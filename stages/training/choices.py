@@ -32,7 +32,7 @@ class TrainingChoices:
     near               near planes as the scene states them; none farther than their median; or none farther than NEAR_SHARE of the way to the subject
     masks              whether the views' masks are used
     min_views          whether `train.min_views` is
-    exposure           whether gains of the photographs are learned although the settings do not say so
+    exposure           whether exposure of the photographs is learned although the settings do not say so
     camera_refinement  whether cameras are corrected, likewise
     """
 
@@ -45,7 +45,7 @@ class TrainingChoices:
     def settings(self, given: TrainSettings) -> TrainSettings:
         """The settings with these choices."""
         changes: dict[str, str] = {} if self.min_views else {"min_views": "off"}
-        changes |= {"exposure": "gain"} if self.exposure else {}
+        changes |= {"exposure": "on"} if self.exposure else {}
         changes |= {"camera_refinement": "on"} if self.camera_refinement else {}
         return replace(given, **changes)  # type: ignore[arg-type]
 

@@ -32,16 +32,21 @@ def with_camera_refinement(settings: TrainSettings, s: Scene) -> TrainSettings:
     return replace(settings, camera_refinement=choice)
 
 
-def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None) -> Pixels:
+def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None, trained: Path | None = None) -> Pixels:
     """All pixels of some views of a scene, as bytes; one image at a time is held beside them.
 
-    rows  where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
+    rows     where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
+    trained  of the stage train, where it learned the photographs' exposure: they are as if all had been exposed alike; None: as they are
     """
     from efficientnerf.training.pixels import Pixels
     from stages.io import scene
+    from stages.training.averaged import averaged_views, exposures_of
 
     images = (scene.read_image(folder, view) for view in views)
     masks = (scene.read_mask(folder, view) for view in views)
+    if trained is not None and exposures_of(trained) is not None:
+        read = averaged_views(folder, trained)
+        images, masks = (read(view)[0] for view in views), (read(view)[1] for view in views)
     near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
     return Pixels([view.camera for view in views], images, masks, near, far, channels_of(folder, views), rows)
 

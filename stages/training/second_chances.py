@@ -61,8 +61,8 @@ def candidates(s: Scene, settings: TrainSettings) -> dict[str, TrainingChoices]:
         priors = replace(priors, min_views=False)
     if priors not in found.values():
         found["all of these off"] = priors
-    if s.background is None and settings.exposure != "gain":
-        found["exposure gains"] = replace(own, exposure=True)
+    if s.background is None and settings.exposure != "on":
+        found["exposure"] = replace(own, exposure=True)
     if settings.camera_refinement != "on":
         found["camera refinement"] = replace(own, camera_refinement=True)
     return found
@@ -118,6 +118,7 @@ def _train(
     from stages.io.field_file import space_of
     from stages.io.scene import views_of
     from stages.training.data import depth_range
+    from stages.training.exposure import begin_exposure
     from stages.training.priors import filled_points, mask_cells_by
 
     views, small = views_of(s, "train"), _small(settings)
@@ -126,7 +127,8 @@ def _train(
     m = model(space_of(s), small, s.background, job.device, (near, far))
     cameras, folder = [view.camera for view in views], job.inputs[PosesOutputs.stage]
     mask_cells_by(m, cameras, own.near.tolist(), kept_pixels(folder, views), filled_points(folder, len(views)))
-    for done in loop.train(loop.trainer(m, len(views), cameras=cameras), own, depth):
+    exposure = begin_exposure(folder, s, own, small.exposure, job.device)
+    for done in loop.train(loop.trainer(m, exposure, cameras=cameras), own, depth):
         job.reached(done.step, small.iterations, f"second chance, {name}")
     return judge(held, lambda camera: FieldRenderer(m, near, far).render(camera).colour, small.iterations)
 

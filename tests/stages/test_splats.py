@@ -11,20 +11,22 @@ import pytest
 
 from efficientnerf.asset.format import load, save
 from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.splats.rendering import render
+from efficientnerf.training.exposure.model import exposure_of
 from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job
 from stages import splats
 from stages.artifacts import SplatsOutputs
 from stages.evaluation.splats import load_splats
 from stages.framing.captured import captured_metadata
-from stages.io import field_file
 from stages.io.exporters.splats.ply import read_splats
 from stages.io.exporters.writing import source_frame
 from stages.io.png import read_png
 from stages.io.scene import load as load_scene
 from stages.splats import SplatsSettings, budget_of, gaussians_of
 from stages.splatting.pictures import LONGER_SIDE, photographs, render_cameras, renders
+from stages.training import averaged
 from tests.efficientnerf.balls import BOUNDS, CENTRE, RADIUS, cameras, picture
 from tests.stages.balls import ORBIT, SIMILARITY, poses
 
@@ -139,11 +141,13 @@ def test_photographs_are_as_if_all_had_been_exposed_alike(inputs: dict[str, Path
     scene = load_scene(inputs["poses"])
     plain = photographs(inputs["poses"], scene, inputs["train"])
     names = [view.image for view in scene.views if view.split == "train"]
-    monkeypatch.setattr(field_file, "load_gains", lambda folder: {names[1]: np.array([2.0, 1.0, 0.5], np.float32)})
+    logs = np.log([[2.0, 1.0, 0.5], [0.5, 1.0, 2.0]])
+    learned = exposure_of([view.camera for view in scene.views[:2]], logs).detached
+    monkeypatch.setattr(averaged, "load_exposure", lambda folder: ([names[1], "another"], learned))
     some = photographs(inputs["poses"], scene, inputs["train"])
     np.testing.assert_array_equal(some[0].pixels, plain[0].pixels)
-    wanted = np.clip(np.rint(plain[1].pixels[..., :3] / np.array([2.0, 1.0, 0.5])), 0, 255)
-    assert np.abs(some[1].pixels[..., :3] - wanted).max() <= 1
+    light = linear_from_srgb(plain[1].pixels[..., :3] / 255.0) / np.array([2.0, 1.0, 0.5])
+    assert np.abs(some[1].pixels[..., :3] - np.rint(255 * srgb_from_linear(light.clip(0, 1)))).max() <= 1
     np.testing.assert_array_equal(some[1].pixels[..., 3], plain[1].pixels[..., 3])
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from efficientnerf.rendering.colour import linear_from_srgb
 from pipeline.errors import CorruptArtifact, Interrupted, UsageError
 from pipeline.stage import Job
 from stages import train
@@ -18,11 +20,13 @@ from stages.artifacts import TrainOutputs
 from stages.io import refined_cameras
 from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
-from stages.io.field_file import load_gains, load_renderer
+from stages.io.field_file import load_exposure, load_renderer
+from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
 from stages.poses import PosesSettings
 from stages.training import data
 from stages.training.data import depth_range, pixels_of, sparse_depth_of
+from stages.training.exposure import begin_exposure
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -247,13 +251,46 @@ def test_other_cameras_than_training_wrote_are_refused(tmp_path: Path, spoil: Ca
 
 def test_exposures_are_saved(tmp_path: Path) -> None:
     scene = poses(tmp_path / "poses", photographs=True)
-    made = job(tmp_path / "a", settings(exposure="gain", iterations=6, preview_every="off"), poses=scene)
+    made = job(tmp_path / "a", settings(exposure="on", iterations=12, preview_every="off"), poses=scene)
     train.run(made)
-    gains = load_gains(made.out)
-    assert len(gains) == 7  # of the training views alone
-    assert all((scene / name).exists() for name in gains)
-    assert np.log(np.stack(list(gains.values()))).mean(axis=0) == pytest.approx(0, abs=1e-6)
-    assert any(np.abs(gain - 1).max() > 1e-6 for gain in gains.values())
+    found = load_exposure(made.out)
+    assert found is not None
+    names, learned = found
+    assert names == [view.image for view in scenes.load(scene).views]  # the test view is the last
+    gains = learned.log_gains().numpy()
+    assert gains.mean(axis=0) == pytest.approx(0, abs=1e-6)
+    assert np.abs(gains[:7]).max() > 1e-4
+    assert np.abs(gains[7]).max() < 1e-6  # held back: as exposed on average
+    report = json.loads((made.out / "report.json").read_text())
+    assert report["exposure"]["least_stops"] <= 0 <= report["exposure"]["most_stops"]
+    assert load_renderer(made.out).model.settings.exposure == "on"
+
+
+@pytest.mark.parametrize("differ", [True, False])
+def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, differ: bool) -> None:
+    """Photographs of the same points, of one brightness or of several; without points nothing is known, and before a constant background nothing is learned."""
+    scene = poses(tmp_path / "poses", photographs=True, points=True, side=32)
+    s = scenes.load(scene)
+    rng = np.random.default_rng(0)
+    for n, view in enumerate(s.views):
+        image = read_png(scene / view.image)
+        write_png(np.full_like(image, 120 if not differ else (70, 120, 180)[n % 3]) + rng.integers(0, 4, image.shape, np.uint8), scene / view.image)
+    xyz = rng.uniform(-0.2, 0.2, (60, 3))
+    scenes.save_points(SparsePoints(xyz, np.zeros((60, 3), np.uint8), np.zeros(60), ((0, 1, 2, 3, 4, 5, 6, 7),) * 60), scene)
+    used = {}
+    for choice in ("auto", "off", "on"):
+        used[choice] = begin_exposure(scene, s, pixels_of(scene, scenes.views_of(s, "train")), choice, "cpu")
+    assert (used["auto"] is not None) == differ
+    assert used["off"] is None
+    assert used["on"] is not None
+    stops = used["on"].log_gains().detach().numpy()[:, 1] / np.log(2)
+    if differ:
+        assert stops[1] - stops[0] == pytest.approx(np.log2(linear_from_srgb(121.5 / 255) / linear_from_srgb(71.5 / 255)), abs=0.1)
+    else:
+        assert np.abs(stops).max() < 0.01
+    pixels = pixels_of(scene, scenes.views_of(s, "train"))
+    assert begin_exposure(scene, replace(s, points=False), pixels, "auto", "cpu") is None
+    assert begin_exposure(scene, replace(s, background=(1.0, 1.0, 1.0)), pixels, "auto", "cpu") is None
 
 
 @pytest.mark.parametrize("planes", [{"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}])

@@ -30,7 +30,6 @@ class Targets:
     background        constant sRGB colour behind the scene; None: an unbounded scene, which is laid over its environment map
     environment       (H, 2 H, 3) float32 sRGB colours by direction (`efficientnerf.rendering.environment`), of unbounded scenes
     reaches_infinity  whether the box reaches to infinity, so that the tree should be opaque
-    gains             (C, 3) of each training view where its exposure was learned (`efficientnerf.training.exposure`): the tree has the scene's colours
 
     Objects with alpha, and boxes that reach to infinity, are compared over a random background, each channel uniform over 0 to 1. The expected error is
     that over its mean plus the channels' summed variance, 3 / 12, times the squared error of the opacity: taken in closed form, without noise.
@@ -40,7 +39,6 @@ class Targets:
     background: tuple[float, float, float] | None
     environment: Any = None
     reaches_infinity: bool = False
-    gains: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.background is None and self.environment is None:
@@ -87,8 +85,6 @@ class Targets:
         origins, directions, colour = bundle
         ones = colour[:, 0] * 0 + 1
         truth = colour[:, :3]
-        if self.gains is not None:
-            truth = self._averaged(truth, index)
         if self.background is None:
             lookup = environment.lookup_on if self.on_device else environment.lookup
             behind = lookup(self.environment, directions)
@@ -104,14 +100,6 @@ class Targets:
             opacity = colour[:, 3] * 1
             truth = truth * opacity[:, None] + behind * (1 - opacity[:, None])
         return origins, directions, RayTargets(truth * 1, behind, ones, opacity, VARIANCE if random_background else 0.0)
-
-
-    def _averaged(self, colour: Any, index: np.ndarray) -> Any:
-        from efficientnerf.training.exposure import averaged
-
-        assert self.gains is not None
-        gain = self.gains[self.host_pixels.view_of(index)].astype(np.float32)
-        return averaged(colour, gain if isinstance(self.pixels, Pixels) else self.pixels.to_device(gain))
 
 
 def step_rng(seed: int, step: int) -> np.random.Generator:

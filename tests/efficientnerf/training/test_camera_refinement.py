@@ -22,6 +22,7 @@ from efficientnerf.training.camera_refinement import (
     take_similarity_out,
 )
 from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.exposure.model import exposure_of
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
@@ -145,13 +146,13 @@ def test_pixels_of_a_device_are_refined_alike(changes: dict[str, str]) -> None:
     """Also with gains of the photographs, and with a field of which nothing is pruned."""
     made = cameras(3, 16)
     m = untrained(contracted=True, initial_density=3.0, **changes)
-    gains = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 0.5], [-0.5, 0.0, -0.5]])
+    exposure = exposure_of(made, np.array([[0.05, 0.0, 0.0], [0.0, 0.0, 0.05], [-0.05, 0.0, -0.05]])).detached
     found = []
     for on_device in (False, True):
         p = photographs(made, made)
         source = DevicePixels(p, "cpu") if on_device else p
         c = CameraCorrections.none(made)
-        moved_by = refine_cameras(m, p, source, c, np.random.default_rng(9), gains)
+        moved_by = refine_cameras(m, p, source, c, np.random.default_rng(9), exposure)
         assert 0 < moved_by <= 1
         bundle = source.bundle(np.arange(0, 768, 7))
         expected = photographs(made, c.cameras).bundle(np.arange(0, 768, 7))
@@ -172,7 +173,7 @@ def test_perturbed_cameras_are_refined_beside_the_field() -> None:
     errors = {}
     for kind in ("off", "on"):
         m = untrained(contracted=True, iterations=600, camera_refinement=kind, occupancy_warmup_steps=60)
-        t = trainer(m, len(true), replace(schedule_of(m.settings), ramp_steps=10), given)
+        t = trainer(m, None, replace(schedule_of(m.settings), ramp_steps=10), given)
         losses = [done.loss for done in train(t, photographs(true, given))][-50:]
         assert (t.cameras is None) == (kind == "off")
         errors[kind] = (np.mean(losses), error(given if t.cameras is None else t.cameras.cameras, true))
@@ -186,14 +187,14 @@ def test_a_resumed_run_refines_as_an_uninterrupted_one() -> None:
     states = []
     for stop in (None, EVERY + 20):
         m = untrained(contracted=True, iterations=2 * EVERY + 30, camera_refinement="on", sample_batch_size=1024)
-        t = trainer(m, 6, cameras=given)
+        t = trainer(m, cameras=given)
         for done in train(t, photographs(true, given)):
             if done.step == stop:
                 break
         if stop is not None:
             state = {name: tensor.clone() for name, tensor in state_of(t).items()}
             assert any(name.startswith("cameras.") for name in state)
-            t = trainer(untrained(contracted=True, iterations=2 * EVERY + 30, camera_refinement="on", sample_batch_size=1024), 6, cameras=given)
+            t = trainer(untrained(contracted=True, iterations=2 * EVERY + 30, camera_refinement="on", sample_batch_size=1024), cameras=given)
             restore(t, state)
             for _ in train(t, photographs(true, given)):
                 pass

@@ -1,89 +1,234 @@
-"""Exposure: factors of mean one, gradients, and photographs exposed differently from which the same scene is learned."""
+"""Exposure: against loops over plain numbers, its inverse, gradients, and photographs exposed differently from which the same scene is learned."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
-from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.training.exposure import SCALE, averaged_image, exposed, exposure_loss, log_gains
+from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
+from efficientnerf.training.exposure import model as module
+from efficientnerf.training.exposure.fit import fit_exposure
+from efficientnerf.training.exposure.model import (
+    OFFSET_SCALE,
+    SCALE,
+    Exposure,
+    averaged,
+    averaged_image,
+    camera_numbers,
+    exposed,
+    exposure_loss,
+    exposure_of,
+    places,
+    squared_error,
+    squared_radius,
+    unshaded_image,
+)
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
 from tests.efficientnerf.balls import cameras, photograph, untrained
 
-
-def random(*shape: int) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+CPU = torch.device("cpu")
 
 
-def test_the_mean_of_the_logarithms_is_zero_whatever_is_learned() -> None:
-    learned = random(5, 3) + 4
-    torch.testing.assert_close(log_gains(learned).mean(dim=0), torch.zeros(3, dtype=torch.float64), atol=1e-12, rtol=0)
-    view = torch.tensor([0, 4, 4])
-    expected = torch.ones(3, 3, dtype=torch.float64) * torch.exp(SCALE * (learned - learned.mean(0)))[view]
-    torch.testing.assert_close(exposed(torch.ones(3, 3, dtype=torch.float64), view, learned), expected)
-    torch.testing.assert_close(exposed(random(3, 3), view, learned * 0), random(3, 3))
-    assert exposure_loss(learned * 0) == 0 < exposure_loss(learned)
+def random(*shape: int, seed: int = 1) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def some(count: int = 4, lenses: int = 2, strength: float = 2.0) -> Exposure:
+    return Exposure(strength * random(count, 3, seed=2), strength * random(lenses, 4, seed=3), torch.arange(count) % lenses)
+
+
+def shown_by_loop(colour: float, log_gain: float, radius: float, own: list[float], average: list[float]) -> float:
+    """One channel of one pixel; own and average: a, b, shoulder and offset."""
+
+    def shoulder(x: float, s: float) -> float:
+        return x * math.exp(s) / (1 + (math.exp(s) - 1) * x) if x <= 1 else 1 + (x - 1) * math.exp(-s)
+
+    light = shoulder((float(linear_from_srgb(np.float64(colour))) - average[3]) / (1 - average[3]), -average[2])
+    light *= math.exp(log_gain + own[0] * (radius - 1 / 3) + own[1] * (radius**2 - 1 / 9))
+    return float(srgb_from_linear(np.float64(own[3] + (1 - own[3]) * shoulder(light, own[2]))))
+
+
+def test_photographs_show_the_scene_as_the_equations_say() -> None:
+    e, colour, view = some(), torch.rand(40, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64), torch.arange(40) % 4
+    radius = torch.linspace(0, 1, 40, dtype=torch.float64)
+    scale = [SCALE, SCALE, SCALE, OFFSET_SCALE]
+    lenses = [[value * unit for value, unit in zip(row, scale, strict=True)] for row in e.cameras.tolist()]
+    average = [sum(column) / len(lenses) for column in zip(*lenses, strict=True)]
+    mean = [sum(column) / 4 for column in zip(*e.photographs.tolist(), strict=True)]
+    expected = [
+        [
+            shown_by_loop(float(colour[n, k]), SCALE * (float(e.photographs[n % 4, k]) - mean[k]), float(radius[n]), lenses[n % 4 % 2], average)
+            for k in range(3)
+        ]
+        for n in range(40)
+    ]
+    torch.testing.assert_close(exposed(colour, view, radius, e), torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("strength", [0.5, 3.0, 8.0])
+def test_averaged_undoes_exposed_beyond_white_too(strength: float) -> None:
+    e, colour, view = some(strength=strength), torch.linspace(0, 1.3, 60, dtype=torch.float64)[:, None].expand(60, 3), torch.arange(60) % 4
+    radius = torch.linspace(1, 0, 60, dtype=torch.float64)
+    torch.testing.assert_close(averaged(exposed(colour, view, radius, e), view, radius, e), colour, rtol=1e-9, atol=1e-9)
+
+
+def test_brighter_stays_brighter() -> None:
+    e, colour = some(strength=5.0), torch.linspace(0, 1, 300, dtype=torch.float64)[:, None].expand(300, 3)
+    for view in range(4):
+        seen = exposed(colour, torch.full((300,), view), torch.full((300,), 0.7, dtype=torch.float64), e)
+        assert (seen.diff(dim=0) > 0).all()
+
+
+def test_without_differences_nothing_changes_whatever_the_response() -> None:
+    """Of one camera, whose photographs were exposed alike, the response has no effect, and the mean of the gains is of no consequence."""
+    colour, radius = torch.rand(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), torch.zeros(20, dtype=torch.float64) + 0.3
+    cameras = torch.tensor([[0.0, 0.0, 7.0, -3.0]], dtype=torch.float64)
+    e = Exposure(torch.full((3, 3), 4.0, dtype=torch.float64), cameras, torch.zeros(3, dtype=torch.int64))
+    torch.testing.assert_close(exposed(colour, torch.arange(20) % 3, radius, e), colour)
+    assert exposure_loss(Exposure(e.photographs, 0 * cameras, e.camera_of)) == 0 < exposure_loss(some())
+
+
+def test_a_middling_distance_from_the_middle_keeps_its_brightness() -> None:
+    e = Exposure(torch.zeros(1, 3), torch.tensor([[-9.0, 4.0, 0.0, 0.0]]), torch.zeros(1, dtype=torch.int64))
+    colour, view = torch.full((3, 3), 0.5), torch.zeros(3, dtype=torch.int64)
+    middle, between, corner = exposed(colour, view, torch.tensor([0.0, 1 / 3, 1.0]), e)[:, 0].tolist()
+    assert between == pytest.approx(0.5, abs=1e-6)
+    assert middle > 0.5 > corner
+    y, x = np.mgrid[:60, :80]
+    assert squared_radius(x, y, 80, 60).mean() == pytest.approx(1 / 3, abs=1e-3)
+    assert squared_radius(np.array([0]), np.array([0]), 800, 600).item() == pytest.approx(1, abs=0.01)
 
 
 def test_gradients() -> None:
-    view = torch.tensor([0, 1, 1, 3, 3, 3])
-    assert torch.autograd.gradcheck(lambda c, e: (exposed(c, view, e), exposure_loss(e)), (random(6, 3).requires_grad_(), random(4, 3).requires_grad_()))
+    view, radius, camera_of = torch.tensor([0, 1, 1, 3, 3, 3]), torch.rand(6, dtype=torch.float64), torch.tensor([0, 0, 1, 1])
+
+    def both(colour: torch.Tensor, photographs: torch.Tensor, of_cameras: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        e = Exposure(photographs, of_cameras, camera_of)
+        return exposed(colour, view, radius, e), averaged(colour, view, radius, e), exposure_loss(e)
+
+    colour = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5)) * 0.9 + 0.05
+    assert torch.autograd.gradcheck(both, (colour.requires_grad_(), random(4, 3).requires_grad_(), random(2, 4).requires_grad_()))
+
+
+def test_black_has_finite_gradients() -> None:
+    colour = torch.zeros(2, 3, requires_grad=True)
+    e = exposure_of(cameras(2))
+    exposed(colour, torch.tensor([0, 1]), torch.zeros(2), e).sum().backward()
+    assert colour.grad is not None
+    assert all(torch.isfinite(grad).all() for grad in (colour.grad, e.photographs.grad, e.cameras.grad) if grad is not None)
+
+
+def test_clipped_pixels_say_at_least_so_bright() -> None:
+    shown, photo = torch.tensor([[1.4, 0.9, 0.5]]), torch.tensor([[1.0, 1.0, 0.4]])
+    torch.testing.assert_close(squared_error(shown, photo), torch.tensor([[0.0, 0.01, 0.01]]))
+
+
+def test_one_camera_upright_or_not_and_others_by_size_and_focal_length() -> None:
+    def camera(width: int, height: int, focal: float) -> Camera:
+        return Camera("a", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), np.eye(4))
+
+    numbers = camera_numbers([camera(80, 60, 90.0), camera(60, 80, 90.0), camera(80, 60, 91.0), camera(80, 60, 45.0), camera(90, 60, 90.0)])
+    assert numbers[0] == numbers[1] == numbers[2]
+    assert len({*numbers.tolist()}) == 3
+
+
+def test_a_photograph_as_if_exposed_like_the_others() -> None:
+    """Alpha stays, nothing is brighter than white, and what was clipped by more light is left out."""
+    e = Exposure(torch.tensor([[np.log(2.0)] * 3, [-np.log(2.0)] * 3], dtype=torch.float32) / SCALE, torch.zeros(1, 4), torch.zeros(2, dtype=torch.int64))
+    image = np.array([[[100, 200, 10, 7], [255, 255, 255, 255]]], np.uint8)
+    bright, used = averaged_image(image, None, 0, e)
+    dark, all_used = averaged_image(image, np.array([[True, False]]), 1, e)
+    half = np.rint(255 * srgb_from_linear(linear_from_srgb(image[0, :, :3] / 255.0) / 2))
+    assert np.abs(bright[0, :, :3] - half).max() <= 1
+    assert used is not None
+    assert used.tolist() == [[True, False]]
+    assert dark[0, 1].tolist() == [255] * 4
+    assert all_used is not None
+    assert all_used.tolist() == [[True, False]]
+    assert (bright[..., 3].tolist(), image[0, 0].tolist()) == ([[7, 255]], [100, 200, 10, 7])
+    plain = image[..., :3] / np.float32(255)
+    np.testing.assert_allclose(unshaded_image(plain, 0, e), plain, atol=1e-6)
+
+
+def test_a_photograph_without_its_vignetting() -> None:
+    e = Exposure(random(2, 3).float(), torch.tensor([[-4.0, -1.0, 0.0, 0.0]]), torch.zeros(2, dtype=torch.int64))
+    still = Exposure(torch.zeros(2, 3), e.cameras, e.camera_of)
+    y, x = np.divmod(np.arange(48), 8)
+    seen = exposed(torch.full((48, 3), 0.4), torch.zeros(48, dtype=torch.int64), torch.from_numpy(squared_radius(x, y, 8, 6)), still)
+    assert seen.std() > 0.01
+    np.testing.assert_allclose(unshaded_image(seen.numpy().reshape(6, 8, 3), 1, e), 0.4, atol=1e-5)
 
 
 def photographs(gains: np.ndarray) -> Pixels:
+    """Of the ball, with factors (C, 3) of linear light."""
     made = cameras(len(gains))
-    images = [np.clip(photograph(camera) * gain, 0, 255).astype(np.uint8) for camera, gain in zip(made, gains, strict=True)]
+    lights = [linear_from_srgb(photograph(camera) / 255.0) * gain for camera, gain in zip(made, gains, strict=True)]
+    images = [np.rint(255 * srgb_from_linear(light.clip(0, 1))).astype(np.uint8) for light in lights]
     return Pixels(made, images, [None] * len(made), np.full(len(made), 1.0), np.full(len(made), 50.0))
 
 
-def test_differences_between_photographs_are_found() -> None:
-    gains = np.exp(0.1 * np.array([1.0, -1, 1, -1, 1, -1, 1, -1]))[:, None] * np.array([1.0, 1.0, 0.95])
+@pytest.mark.parametrize("begun", [False, True])
+def test_differences_between_photographs_are_found(monkeypatch: pytest.MonkeyPatch, begun: bool) -> None:
+    """Without a beginning, and from one that is not quite right."""
+    monkeypatch.setattr(module, "BEGIN", 0.0)
+    logs = 0.4 * np.array([1.0, -1, 1, -1, 1, -1, 1, -1])[:, None] * np.array([1.0, 1.0, 0.8])
     losses = {}
-    for kind in ("gain", "off"):
-        m = untrained(contracted=True, iterations=150, exposure=kind)
-        t = trainer(m, len(gains), replace(schedule_of(m.settings), ramp_steps=10))
-        losses[kind] = np.mean([done.loss for done in train(t, photographs(gains))][-20:])
-        if kind == "gain":
-            assert t.exposure is not None
-            found = log_gains(t.exposure.detach()).numpy()
-            assert np.corrcoef(found.mean(axis=1), np.log(gains[:, 0]))[0, 1] > 0.7
-            assert 0.02 < np.abs(found).mean() < 0.15
-            assert "exposure" not in dict(t.model.parameters())
-            again = trainer(untrained(contracted=True, iterations=150, exposure=kind), len(gains))
+    for learned in (True, False):
+        m = untrained(contracted=True, iterations=200)
+        t = trainer(m, exposure_of(cameras(8), 0.8 * logs if begun else None) if learned else None, replace(schedule_of(m.settings), ramp_steps=10))
+        losses[learned] = np.mean([done.loss for done in train(t, photographs(np.exp(logs)))][-20:])
+        if t.exposure is not None:
+            found = t.exposure.log_gains().detach().numpy()
+            assert np.corrcoef(found.ravel(), logs.ravel())[0, 1] > (0.9 if begun else 0.6)
+            again = trainer(untrained(contracted=True, iterations=200), exposure_of(cameras(8)))
             restore(again, state_of(t))
             assert again.exposure is not None
-            assert torch.equal(again.exposure, t.exposure)
-        else:
-            assert t.exposure is None
-    assert losses["gain"] < 0.9 * losses["off"]
+            assert torch.equal(again.exposure.photographs, t.exposure.photographs)
+            assert torch.equal(again.exposure.cameras, t.exposure.cameras)
+    assert losses[True] < 0.95 * losses[False]
 
 
-def test_scenes_on_a_constant_background_have_none() -> None:
-    assert trainer(untrained(exposure="gain"), 8).exposure is None
+def test_places_of_pixels() -> None:
+    p = photographs(np.ones((3, 3)))
+    index = np.array([0, 255, 256, 700])
+    view, radius = places(p, index, CPU)
+    assert view.tolist() == [0, 0, 1, 2]
+    y, x = np.divmod(index - p.offsets[view.numpy()], 16)
+    np.testing.assert_allclose(radius, ((2 * x + 1 - 16) ** 2 + (2 * y + 1 - 16) ** 2) / 512, rtol=1e-6)
 
 
-def test_an_asset_is_fitted_to_what_the_field_was_photographs_over_their_gains() -> None:
-    """Photographs of one scene that were exposed differently are alike again, on the host and where pixels were sent to a device."""
-    scene = np.random.default_rng(0).integers(40, 120, (3, 8, 6, 3)).astype(np.uint8)
-    gains = np.array([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0], [2.0, 1.5, 0.75]])
-    seen = [np.rint(image * gain).astype(np.uint8) for image, gain in zip(scene, gains, strict=True)]
-    cameras = [Camera(f"{n}.png", 6, 8, "SIMPLE_PINHOLE", (9.0, 3.0, 4.0), np.eye(4)) for n in range(3)]
-    made = Targets(Pixels(cameras, seen, [None] * 3, np.ones(3), np.full(3, 2.0)), None, np.zeros((4, 8, 3), np.float32), gains=gains)
-    index = np.random.default_rng(1).permutation(3 * 48)[:60]
-    for targets in (made, made.sent("cpu")):
-        truth = np.asarray(targets.of(index)[2].colour)
-        assert truth.dtype == np.float32
-        np.testing.assert_allclose(truth, scene.reshape(-1, 3)[index] / 255, atol=1.1 / 255)
-    plain = replace(made, gains=None).of(index)[2].colour
-    np.testing.assert_array_equal(plain, np.concatenate(seen).reshape(-1, 3)[index].astype(np.float32) / np.float32(255))
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_points_show_gives_gains_and_vignetting_despite_outliers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    views, points, lenses = 9, 300, np.arange(9) % 2
+    gains, falloff = rng.normal(0, 0.4, (views, 3)), np.array([[-0.5, -0.1], [0.0, 0.0]])
+    gains -= gains.mean(axis=0)
+    point, view = np.repeat(np.arange(points), 4), np.concatenate([rng.permutation(views)[:4] for _ in range(points)])
+    radius = rng.uniform(0, 1, len(view))
+    vignetting = (np.stack([radius - 1 / 3, radius**2 - 1 / 9], axis=1) * falloff[lenses[view]]).sum(axis=1)
+    light = rng.normal(-1, 0.7, (points, 3))[point] + gains[view] + vignetting[:, None] + rng.normal(0, 0.03, (len(view), 3))
+    wrong = rng.random(len(view)) < 0.1
+    light[wrong] += rng.normal(0, 2, (int(wrong.sum()), 3))
+    found = fit_exposure(light, point, view, radius, lenses)
+    assert np.abs(found.gains - gains).max() < 0.03
+    r = np.linspace(0, 1, 9)
+    assert np.abs((found.vignetting - falloff) @ np.stack([r - 1 / 3, r**2 - 1 / 9])).max() < 0.04
+    assert found.explained > 0.9
+    nothing = fit_exposure(light - gains[view] - vignetting[:, None], point, view, radius, lenses)
+    assert nothing.explained < 0.1
+    assert np.abs(nothing.gains).max() < 0.03
 
 
-def test_a_photograph_over_its_gains_keeps_its_alpha_and_is_no_brighter_than_white() -> None:
-    image = np.array([[[100, 200, 10, 7], [255, 255, 255, 255]]], np.uint8)
-    assert averaged_image(image, np.array([2.0, 0.5, 1.0])).tolist() == [[[50, 255, 10, 7], [128, 255, 255, 255]]]
-    assert image[0, 0].tolist() == [100, 200, 10, 7]
+def test_a_photograph_without_points_keeps_the_mean() -> None:
+    light = np.log(np.array([[0.1] * 3, [0.4] * 3, [0.2] * 3, [0.8] * 3]))
+    found = fit_exposure(light, np.array([0, 0, 7, 7]), np.array([0, 1, 0, 1]), np.full(4, 1 / 3), np.zeros(3, np.int64))
+    assert found.observed.tolist() == [2, 2, 0]
+    assert found.gains[1, 0] > found.gains[2, 0] > found.gains[0, 0]
+    assert np.isfinite(found.gains).all()

@@ -20,10 +20,11 @@ from efficientnerf.sampling.occupancy import density_voxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples, complete_rays
 from efficientnerf.training import loop, readback
 from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.exposure.model import exposure_of
 from efficientnerf.training.losses import mean_over
 from efficientnerf.training.readback import AsyncOccupancy, AsyncReadback
 from efficientnerf.training.sparse_depth import SparseDepthRays
-from tests.efficientnerf.balls import BOUNDS, pixels, settings
+from tests.efficientnerf.balls import BOUNDS, cameras, pixels, settings
 from tests.efficientnerf.device import DEVICE
 
 
@@ -237,10 +238,10 @@ def test_no_line_that_makes_a_bundle_waits(monkeypatch: pytest.MonkeyPatch) -> N
 def test_no_line_of_a_step_on_photographs_waits(discretise: int | str, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """With exposures, sparse depth and exploration."""
     monkeypatch.setattr(dispatch, "composite", compositing.composite)
-    m = model_of("contracted", iterations=9, exposure="gain", exploration_fraction=0.1, discretise=discretise)
+    m = model_of("contracted", iterations=9, exploration_fraction=0.1, discretise=discretise)
     origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
     sparse_depth = SparseDepthRays(origins, directions, np.full(8, 3.0, np.float32))
-    running = loop.train(loop.trainer(m, 3), pixels(3, 8), sparse_depth, readback=quick_readback())
+    running = loop.train(loop.trainer(m, exposure_of(cameras(3, 8))), pixels(3, 8), sparse_depth, readback=quick_readback())
     assert lines_that_wait(running) == []
 
 

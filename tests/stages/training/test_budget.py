@@ -67,7 +67,7 @@ def repeated(scene: Path, said: dict[str, Any]) -> dict[str, bytes]:
     pixels = pixels_of(scene, views)
     given = with_auto_sizes(settings(**QUICK), s, len(pixels))
     m = model(space_of(s), given, s.background, span=depth_range(s, pixels, given))
-    t = loop.trainer(m, len(views), schedule_of(given, said["schedule"]))
+    t = loop.trainer(m, None, schedule_of(given, said["schedule"]))
     assert len(list(loop.train(t, pixels))) == said["iterations"]
     return {name: tensor.numpy().tobytes() for name, tensor in state_of(m).items()}
 

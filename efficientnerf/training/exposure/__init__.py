@@ -1,0 +1,1 @@
+"""Exposure, white balance, vignetting and response of photographs."""

@@ -1,0 +1,206 @@
+"""Exposure, white balance, vignetting and response of photographs: learned beside the field and left out of it.
+
+    light      l   = f^-1(c)                     c: sRGB colour of the scene, f: response of the cameras on average
+    exposed    l_v = l exp(g_v + d_k(r))         photograph v of camera k, at distance r from the middle of the image
+    shown      c_v = f_k(l_v)
+
+    g_v    (3,) logarithms of exposure and white balance; their mean over the photographs is taken off, so that the scene is as exposed on average
+    d_k    a (r^2 - 1/3) + b (r^4 - 1/9), vignetting; r = 1 in the corners. The mean of r^2 over an image is 1/3: images stay as bright as they are
+    f_k    a shoulder, an offset, then sRGB's curve
+
+A camera's response bends how much a change of exposure does to light and dark colours; where nothing differs from the average it has no effect, whatever it is.
+The four parts are those of Deutsch et al. 2026, "PPISP"; theirs have a homography of chromaticities and curves of each channel. docs/experiments/exposure.md
+
+What is made of the field with the photographs' help is the scene as it was exposed on average, too: `averaged` undoes `exposed`.
+
+R rays, C photographs, K cameras.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from efficientnerf.backends.transfer import to_device
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.training.pixels import Pixels
+
+SCALE = 0.1  # of what is learned: with the field's learning rate a logarithm changes by at most a few thousandths in a step
+OFFSET_SCALE = 0.01  # the same of the offset, which is of light itself
+WEIGHT = 1e-3  # of the mean square of all logarithms in the loss: without a reason they stay as they are. docs/experiments/exposure.md
+BEGIN = 0.1  # of the schedule, before which nothing is learned: an early field is grey, and gains would be those of what each photograph shows
+CLIPPED = 253  # level from which a photograph says no more than that the scene is as bright or brighter
+OVEREXPOSED = 0.1  # logarithm of a gain from which clipped pixels of a photograph are left out
+FOCAL_STEP = 1.2  # focal lengths, over the longer side, of one camera are within this factor
+VIGNETTING, SHOULDER, OFFSET = slice(0, 2), 2, 3  # of a camera's numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """What is learned; zero is no difference.
+
+    photographs  (C, 3) logarithms of gains over SCALE, before their mean is taken off
+    cameras      (K, 4) a, b and shoulder over SCALE, offset over OFFSET_SCALE
+    camera_of    (C,) int64 camera of each photograph
+    """
+
+    photographs: Tensor
+    cameras: Tensor
+    camera_of: Tensor
+
+    @property
+    def parameters(self) -> dict[str, nn.Parameter]:
+        """What is learned, by name."""
+        assert isinstance(self.photographs, nn.Parameter)
+        assert isinstance(self.cameras, nn.Parameter)
+        return {"exposure.photographs": self.photographs, "exposure.cameras": self.cameras}
+
+    @property
+    def detached(self) -> Exposure:
+        """The same without gradients."""
+        return Exposure(self.photographs.detach(), self.cameras.detach(), self.camera_of)
+
+    def log_gains(self) -> Tensor:
+        """(C, 3) g, of mean zero."""
+        return SCALE * (self.photographs - self.photographs.mean(dim=0))
+
+
+def is_learned(fraction: float) -> bool:
+    """Whether it is learned at this fraction of the schedule."""
+    return fraction >= BEGIN
+
+
+def exposure_of(
+    cameras: Sequence[Camera], gains: np.ndarray | None = None, vignetting: np.ndarray | None = None, device: torch.device | str = "cpu"
+) -> Exposure:
+    """What is learned at its beginning.
+
+    cameras     of the photographs
+    gains       (C, 3) g and vignetting (K, 2) a and b to begin with; None: zero
+    """
+    camera_of = camera_numbers(cameras)
+    per_camera = np.zeros((int(camera_of.max()) + 1, 4), np.float32)
+    if vignetting is not None:
+        per_camera[:, VIGNETTING] = vignetting / SCALE
+    per_photograph = np.zeros((len(cameras), 3), np.float32) if gains is None else (gains / SCALE).astype(np.float32)
+    photographs, of_cameras = (nn.Parameter(torch.from_numpy(values).to(device)) for values in (per_photograph, per_camera))
+    return Exposure(photographs, of_cameras, torch.from_numpy(camera_of).to(device))
+
+
+def camera_numbers(cameras: Sequence[Camera]) -> np.ndarray:
+    """(C,) int64 which of the cameras each photograph was taken with: those of equal sides, upright or not, and about the same focal length, are one."""
+    keys = []
+    for camera in cameras:
+        sides = sorted((camera.width, camera.height))
+        keys.append((*sides, round(math.log(camera.intrinsics["fx"] / sides[1]) / math.log(FOCAL_STEP))))
+    numbers = {key: number for number, key in enumerate(sorted(set(keys)))}
+    return np.array([numbers[key] for key in keys], np.int64)
+
+
+def places(pixels: Pixels, index: np.ndarray, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The photograph (R,) of each pixel, and r^2 (R,) in it."""
+    view = pixels.view_of(index)
+    y, x = np.divmod(index - pixels.offsets[view], pixels.width[view])
+    radius = squared_radius(x, y, pixels.width[view], pixels.height[view])
+    return to_device(torch.from_numpy(view), device), to_device(torch.from_numpy(radius), device)
+
+
+def squared_radius(x: np.ndarray, y: np.ndarray, width: np.ndarray | int, height: np.ndarray | int) -> np.ndarray:
+    """r^2 of the pixels in columns x and rows y, float32."""
+    return np.asarray(((2 * x + 1 - width) ** 2 + (2 * y + 1 - height) ** 2) / (np.square(width) + np.square(height)), np.float32)
+
+
+def exposed(colour: Tensor, view: Tensor, radius: Tensor, e: Exposure) -> Tensor:
+    """Colours (R, 3) of the scene as photographs `view` (R,) show them at r^2 = `radius` (R,), not clipped."""
+    of, average, gain = _response_and_gain(view, radius, e)
+    return _seen(_light(colour, average) * gain, of)
+
+
+def averaged(colour: Tensor, view: Tensor, radius: Tensor, e: Exposure) -> Tensor:
+    """Colours (R, 3) of photographs as those of the scene, not clipped: the inverse of `exposed`."""
+    of, average, gain = _response_and_gain(view, radius, e)
+    return _seen(_light(colour, of) / gain, average)
+
+
+def averaged_image(image: np.ndarray, mask: np.ndarray | None, number: int, e: Exposure) -> tuple[np.ndarray, np.ndarray | None]:
+    """Photograph `number` as if all had been exposed alike: (H, W, 3 or 4) uint8, alpha as it was, and the mask (H, W) bool of what is to be used of it:
+    clipped pixels of what was exposed more say nothing of how bright the scene is."""
+    height, width = image.shape[:2]
+    at = _places_of_image(image, number)
+    colour = torch.from_numpy(image[..., :3].reshape(-1, 3).astype(np.float32) / np.float32(255))
+    with torch.no_grad():
+        seen = averaged(colour, *at, e)
+        more = _response_and_gain(*at, e)[2] > math.exp(OVEREXPOSED)
+    out = image.copy()
+    out[..., :3] = torch.round(255 * seen.clamp(0, 1)).to(torch.uint8).numpy().reshape(height, width, 3)
+    blind = np.asarray((more.numpy().reshape(height, width, 3) & (image[..., :3] >= CLIPPED)).any(axis=-1))
+    if not blind.any():
+        return out, mask
+    return out, ~blind if mask is None else mask & ~blind
+
+
+def unshaded_image(image: np.ndarray, number: int, e: Exposure) -> np.ndarray:
+    """Photograph `number` (H, W, 3) float32, 0-1, without its camera's vignetting, exposed as it was."""
+    still = Exposure(torch.zeros_like(e.photographs), e.cameras, e.camera_of)
+    with torch.no_grad():
+        seen = averaged(torch.from_numpy(image.reshape(-1, 3)), *_places_of_image(image, number), still)
+    return np.asarray(seen.clamp(0, 1).numpy().reshape(image.shape))
+
+
+def squared_error(shown: Tensor, colour: Tensor) -> Tensor:
+    """(R, 3) of colours as photographs show them, and of the photographs: where these are clipped, only too dark a colour is wrong."""
+    return torch.where((colour >= CLIPPED / 255) & (shown > colour), 0, (shown - colour) ** 2)
+
+
+def exposure_loss(e: Exposure) -> Tensor:
+    """The weighted mean squares of the gains' logarithms, and of the cameras' numbers."""
+    return WEIGHT * ((e.log_gains() ** 2).mean() + ((SCALE * e.cameras) ** 2).mean())
+
+
+def _places_of_image(image: np.ndarray, number: int) -> tuple[Tensor, Tensor]:
+    """`places` of all pixels of an image (H, W, ...) of photograph `number`."""
+    height, width = image.shape[:2]
+    y, x = np.divmod(np.arange(height * width), width)
+    return torch.full((height * width,), number), torch.from_numpy(squared_radius(x, y, width, height))
+
+
+def _response_and_gain(view: Tensor, radius: Tensor, e: Exposure) -> tuple[Tensor, Tensor, Tensor]:
+    """Response (R, 2) of the rays' cameras, that (2,) of all on average, and gains (R, 3)."""
+    cameras = torch.cat([SCALE * e.cameras[:, :OFFSET], OFFSET_SCALE * e.cameras[:, OFFSET:]], dim=1)
+    of = cameras[e.camera_of[view]]  # (R, 4)
+    falloff = of[:, 0] * (radius - 1 / 3) + of[:, 1] * (radius**2 - 1 / 9)
+    return of[:, SHOULDER:], cameras.mean(dim=0)[SHOULDER:], torch.exp(e.log_gains()[view] + falloff[:, None])
+
+
+def _light(colour: Tensor, response: Tensor) -> Tensor:
+    """f^-1; response (..., 2)."""
+    offset = response[..., 1:]
+    return _shoulder((_linear(colour) - offset) / (1 - offset), -response[..., :1])
+
+
+def _seen(light: Tensor, response: Tensor) -> Tensor:
+    """f; response (..., 2)."""
+    offset = response[..., 1:]
+    return _encoded(offset + (1 - offset) * _shoulder(light, response[..., :1]))
+
+
+def _shoulder(x: Tensor, s: Tensor) -> Tensor:
+    """0 and 1 stay, light in between is raised by s > 0: x e^s / (1 + (e^s - 1) x), and beyond 1 a straight line. The inverse is that of -s."""
+    rise = torch.expm1(s)
+    low = x.clamp(max=1)
+    return (1 + rise) * low / (1 + rise * low) + (x - low) / (1 + rise)
+
+
+def _linear(colour: Tensor) -> Tensor:
+    """`efficientnerf.rendering.colour.linear_from_srgb`, with gradients."""
+    return torch.where(colour <= 0.04045, colour / 12.92, ((colour.clamp(min=0.04) + 0.055) / 1.055) ** 2.4)
+
+
+def _encoded(light: Tensor) -> Tensor:
+    """The inverse of `_linear`."""
+    return torch.where(light <= 0.0031308, light * 12.92, 1.055 * light.clamp(min=0.003) ** (1 / 2.4) - 0.055)
