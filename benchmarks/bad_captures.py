@@ -172,7 +172,7 @@ CAPTURES = (
     Capture("overexposed", each(brighter(14)), ("clipped", "white")),
     Capture("exposure steps", each(brighter(0.25), every=2), ("exposure", "brighter or darker")),
     Capture("two scenes mixed", mixed, APART, placeable=lambda names: names[::2]),
-    Capture("one image many times", lambda good: dict.fromkeys(good, next(iter(good.values()))), ("duplicates", "same picture", "one place", "parallax")),
+    Capture("one image many times", lambda good: dict.fromkeys(good, next(iter(good.values()))), ("duplicates", "same as another", "one place", "parallax")),
     Capture("zoom changes", each(zoomed), ("zoom", "focal", "reprojection error")),
     Capture("cropped", each(cropped), ("cropped", "focal", "sizes", "reprojection error", "not registered")),
     Capture("tiny", each(shrunk), ("small", "smaller", "few points", "not registered")),

@@ -259,11 +259,12 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
 
 
 def _facts_of_matching(images: Sequence[WorkImage], found: ladder.Found, how: str) -> dict[str, object]:
-    """How the photographs were matched, the sizes of the parts that they fall into, by overlap and of the sub-models, and what was tried."""
+    """How the photographs were matched, the sizes of the parts they fall into, by overlap and of the sub-models that add to the first, and what was tried."""
+    parts = [{image.name for image in model.images.values() if image.has_pose} for model in found.models]
     return {
         "matching": how,
         "components": [len(part) for part in ladder.components(ladder.neighbours(found.work, len(images)))],
-        "models": [int(model.num_reg_images()) for model in found.models],
+        "models": [len(part) for part in parts if part is parts[0] or part - parts[0]],
         "rungs": found.rungs,
         "planar_pairs": planar_share(database_path(found.work)),
         **({LENS: OWN_LENSES[found.rung]} if found.rung in OWN_LENSES else {}),

@@ -101,7 +101,9 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
     overlaps = _overlaps(list(small.values()), settings.seed)
     posed = importers.IMPORTERS[kind].posed
     problems = [*of_looks(seen), *_of_files(small, unreadable, len(names))]
-    if not posed:
+    if posed:
+        problems += _of_stated_cameras(folder, kind, settings)
+    else:
         problems += of_sizes(seen)
         problems += _with_turning(_of_overlap(list(small), overlaps), {name: files[name] for name in small})
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
@@ -232,6 +234,16 @@ def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) ->
     return found
 
 
+def _of_stated_cameras(folder: Path, kind: str, settings: Any) -> list[Problem]:
+    """Why a run of a source that states its cameras would be refused."""
+    try:
+        importers.IMPORTERS[kind].read(folder, settings)
+    except BadInput as error:
+        remedy = "--as photographs finds the cameras of all photographs afresh."
+        return [Problem("cameras", "failed", f"The cameras that the source states cannot be read: {error}", remedy)]
+    return []
+
+
 def _with_turning(problems: Sequence[Problem], files: Mapping[str, Path]) -> list[Problem]:
     """The problems; where nothing seems to move, a small subject may turn before so much of a wall that hardly a feature is its own."""
     if not any(each.what == "stands still" for each in problems):
@@ -254,7 +266,8 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
         found.append(Problem("few", grade, sentence, "20 or more all round a subject are better."))
     reduced = tuple(name for name, each in small.items() if TINY <= max(each.size) < SMALL)
     if len(reduced) > 0.5 * len(small):
-        found.append(Problem("small", "usable", f"{len(reduced)} photographs are smaller than {SMALL} px.", "Give the originals, of 1000 px or more.", reduced))
+        sentence = f"{len(reduced)} of {len(small)} photographs are smaller than {SMALL} px."
+        found.append(Problem("small", "usable", sentence, "Give the originals, of 1000 px or more.", reduced))
     groups = zooms({name: 1000.0 * each.focal / max(each.size) for name, each in small.items() if each.focal is not None})
     if len(groups) > 1:
         words = ", ".join(f"{len(group)} at {focal:.0f} px" for focal, group in groups)

@@ -333,8 +333,8 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
             found.append(Problem(what, "usable" if share > SHARE else "good", sentence, remedy, tuple(names)))
     same = looks_of.duplicates(looks)
     if same:
-        words = worded(len(same), "photographs are", "photograph is")
-        sentence = f"{len(same)} {words} the same picture as another: {abbreviated([f'{name} as {first}' for name, first in same.items()])}."
+        words = worded(len(same), "photographs look", "photograph looks")
+        sentence = f"{len(same)} {words} the same as another: {abbreviated([f'{name} as {first}' for name, first in same.items()])}."
         grade = "poor" if len(looks) - len(same) < 3 else "usable" if len(same) > 0.4 * len(looks) else "good"
         found.append(Problem("duplicates", grade, sentence, "They add nothing; photographs from other places would.", tuple(same)))
     return found

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import BadInput
+from stages.io.importers import IMPORTERS
 from stages.io.photo import read_photo
 from stages.poses import PosesSettings
 from stages.sfm import matches
@@ -227,6 +228,19 @@ def test_cameras_that_are_known_need_no_overlap(tmp_path: Path) -> None:
     assert "overlap" not in {problem.what for problem in found.problems}
     assert found.figures["forecast"]["pairs"] == 0
     assert check(source, PosesSettings(format="photographs"), 2).figures["forecast"]["pairs"] == 15
+
+
+def test_stated_cameras_that_a_run_would_refuse_are_told(tmp_path: Path) -> None:
+    """As of a file that another system wrote, which lists photographs elsewhere."""
+    captures.blender(tmp_path / "good")
+    assert check(tmp_path / "good", PosesSettings(), 2).grade != "failed"
+    for path in (tmp_path / "good").glob("transforms*.json"):
+        path.write_text(path.read_text().replace('"./', '"../elsewhere/'))
+    found = check(tmp_path / "good", PosesSettings(), 2)
+    assert (found.grade, found.problems[0].what) == ("failed", "cameras")
+    with pytest.raises(BadInput):
+        IMPORTERS["blender"].read(tmp_path / "good", PosesSettings())
+    assert "cameras" not in problems(tmp_path / "good", format="photographs")
 
 
 def test_of_many_photographs_an_even_choice_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,6 +74,7 @@ def in_words(found: dict[str, Any]) -> list[str]:
     about = found["forecast"]
     sizes = found["sizes"]
     what = f"{found['photographs']} photographs, {', '.join(sizes[:3])}{' ...' if len(sizes) > 3 else ''}, read as {found['format']}"
+    what += f"; {found['looked_at']} of them were looked at" if found["looked_at"] < found["photographs"] else ""
     lines = [printable(f"{found['source']}: {found['grade']}; {what}", 400)]
     for problem in found["problems"]:
         lines.append(printable(f"  {problem['sentence']} {problem['remedy']}", 600))

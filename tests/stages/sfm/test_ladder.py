@@ -13,7 +13,7 @@ from PIL import Image, ImageFilter
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.sfm import ladder, lenses, mapping, matches, merging, pairs
+from stages.sfm import ladder, lenses, mapping, matches, merging, pairs, reconstruction
 from stages.sfm.images import WorkImage
 from stages.sfm.reconstruction import find_cameras
 
@@ -225,6 +225,15 @@ def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> 
     errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))
     assert len(errors) == 6
     assert errors.max() < 0.02
+
+
+def test_sub_models_are_said_that_have_photographs_which_the_largest_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(ladder, "neighbours", lambda work, count: {i: set() for i in range(count)})
+    monkeypatch.setattr(reconstruction, "planar_share", lambda path: None)
+    parts = [range(17), range(12, 17), range(15, 20), range(17, 20)]
+    models = [SimpleNamespace(images={k: SimpleNamespace(name=IMAGES[k].file, has_pose=True) for k in part}) for part in parts]
+    assert reconstruction._facts_of_matching(IMAGES, ladder.Found(models, tmp_path, []), "exhaustive")["models"] == [17, 5, 3]
+    assert reconstruction._facts_of_matching(IMAGES, ladder.Found([], tmp_path, []), "exhaustive")["models"] == []
 
 
 def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:
