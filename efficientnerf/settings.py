@@ -13,6 +13,8 @@ from msgspec import Meta
 
 T = TypeVar("T")
 
+LEAST_RESOLUTION = 8  # voxels along the longest side of what is baked: two coarse cells of the default brick; of fewer there is no surface to put points on
+
 Auto = Literal["auto"]
 Off = Literal["off"]
 Count = Annotated[int, Meta(ge=0)]

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, Seed, given, setting
+from efficientnerf.settings import LEAST_RESOLUTION, Auto, Count, Fraction, NonNegative, Off, Seed, given, setting
 from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, needs_of
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 class BakeSettings:
     """How finely the field is baked."""
 
-    resolution: Annotated[int, Meta(ge=1, le=4096)] | Auto = setting(
+    resolution: Annotated[int, Meta(ge=LEAST_RESOLUTION, le=4096)] | Auto = setting(
         "auto", "Voxels along the longest side of the box, of a whole scene of its innermost cascade; auto: train.discretise, or as many as max_mib holds and"
         " images resolve.",
     )
@@ -78,7 +78,7 @@ class BakeSettings:
         " in view are baked where it exceeds 30 times this.",
         advanced=True,
     )
-    max_mib: Annotated[float, Meta(gt=0.0)] | Auto = setting(
+    max_mib: Annotated[float, Meta(ge=0.001)] | Auto = setting(  # the header alone has a thousand bytes
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
         " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed, whose codes"

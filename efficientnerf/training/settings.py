@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, PositiveInt, Seed, setting
+from efficientnerf.settings import LEAST_RESOLUTION, Auto, Count, Fraction, NonNegative, Off, PositiveInt, Seed, setting
 
 # What `auto` means for train.log2_hashmap_size and train.finest_resolution in bounded scenes.
 LOG2_TABLE = 17
@@ -39,7 +39,7 @@ class TrainSettings:
         " (hierarchical), or evenly and once (uniform).",
         advanced=True,
     )
-    discretise: Annotated[int, Meta(ge=1, le=4096)] | Off = setting(
+    discretise: Annotated[int, Meta(ge=LEAST_RESOLUTION, le=4096)] | Off = setting(
         "off",
         "Voxels along the longest side of the box at whose centres the field is evaluated, so that baking with bake.lookup=nearest is exact; off: anywhere.",
         advanced=True,

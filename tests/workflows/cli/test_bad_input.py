@@ -223,6 +223,21 @@ def test_a_setting_too_small_for_training_is_refused_before_the_poses(enerf: Ene
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--set", "bake.resolution=1"), ("--set", "bake.resolution=7"), ("--set", "train.discretise=1"), ("--set", "bake.max_mib=0.0001"),
+        ("--target-mib", "0.0001"),
+    ],
+)  # fmt: skip
+def test_an_asset_too_small_to_have_a_surface_is_refused_before_the_poses(enerf: Enerf, tmp_path: Path, options: tuple[str, ...]) -> None:
+    """Not by the stage points, after all others."""
+    blender(tmp_path / "source")
+    result = enerf("run", tmp_path / "source", "--out", tmp_path / "run", *options)
+    assert (result.code, "at least" in result.err) == (2, True), result.err
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_folder_that_is_no_run(enerf: Enerf, tmp_path: Path) -> None:
     blender(tmp_path / "source")
     (tmp_path / "run").mkdir()
