@@ -13,6 +13,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,23 @@ from pipeline.stage import Job
 from stages.io import scene
 from stages.poses import PosesSettings
 from stages.poses import run as find_poses
+from stages.training.priors import Prior, mask_uncovered_cells
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_MASKED = 0.01  # of the subject's voxels: at the borders of photographs the middle of a voxel may be in view of fewer than the point in it
-COLUMNS = ("capture", "photographs", "sparse points", "subject's voxels", "masked %", "of all voxels %", "near planes", "subject's distance")
+COLUMNS = (
+    "capture",
+    "photographs",
+    "sparse points",
+    "subject's voxels",
+    "masked %",
+    "of all voxels %",
+    "refuted",
+    "near planes",
+    "subject's distance",
+    "its size",
+    "out of the box %",
+)
 SMALL = {"log2_hashmap_size": 8, "num_levels": 2, "finest_resolution": 32, "hidden_dim": 16, "coarse_hidden_dim": 16}  # of a model that is not trained
 
 
@@ -44,7 +58,7 @@ def measured(name: str, capture: MadeCapture, work: Path, width: int, side: int,
     trained = {Path(view.name).name for view in scene.views_of(found, "train")}
     right = [camera for n, camera in enumerate(captures.cameras(capture, width)) if camera.name in trained and n not in capture.wrong]
     points = found.world_from_capture.points(captures.subject_points(capture, right, seed=seed))
-    voxels, of_subject = masked_voxels(found, poses, side), np.unique(cells_of(found, points, side), axis=0)
+    (voxels, priors), of_subject = masked_voxels(found, poses, side), np.unique(cells_of(found, points, side), axis=0)
     planes, centres = np.array([view.near for view in found.views]), np.array([view.camera.centre for view in found.views])
     return {
         "photographs": len(found.views),
@@ -52,21 +66,23 @@ def measured(name: str, capture: MadeCapture, work: Path, width: int, side: int,
         "voxels": len(of_subject),
         "masked": float(voxels[tuple(of_subject.T)].mean()),
         "masked_of_all": float(voxels.mean()),
+        "outside": float(((points < found.bounds[0]) | (points > found.bounds[1])).any(axis=1).mean()),
+        "size": float(np.ptp(np.quantile(points, [0.01, 0.99], axis=0), axis=0).max()),
+        "priors": [asdict(prior) for prior in priors],
         "near": [float(value) for value in np.quantile(planes, [0.0, 0.5, 1.0])],
         "distance": float(np.median(np.linalg.norm(centres - points.mean(0), axis=1))),
     }
 
 
-def masked_voxels(found: scene.Scene, poses: Path, side: int) -> np.ndarray:
-    """(D, D, D) bool of the density voxels that are masked before the first step, D = `side`."""
+def masked_voxels(found: scene.Scene, poses: Path, side: int) -> tuple[np.ndarray, tuple[Prior, ...]]:
+    """(D, D, D) bool of the density voxels that are masked before the first step, D = `side`; and by what."""
     from efficientnerf.model import model
     from stages.io.field_file import space_of
-    from stages.training.priors import mask_uncovered_cells
 
     views = scene.views_of(found, "train")
     made = model(space_of(found), TrainSettings(occupancy_resolution=side, **SMALL), found.background)
-    mask_uncovered_cells(made, views, Job(settings=made.settings, inputs={"poses": poses}, out=poses / "out", work=poses / "work"))
-    return np.asarray(np.isneginf(made.voxels.values.numpy()))
+    priors = mask_uncovered_cells(made, views, Job(settings=made.settings, inputs={"poses": poses}, out=poses / "out", work=poses / "work"))
+    return np.asarray(np.isneginf(made.voxels.values.numpy())), priors
 
 
 def cells_of(found: scene.Scene, points: np.ndarray, side: int) -> np.ndarray:
@@ -94,9 +110,13 @@ def in_markdown(rows: Mapping[str, Mapping[str, Any]]) -> str:
     lines += ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
     for name, row in rows.items():
         near = " / ".join(f"{value:.2f}" for value in row["near"])
-        parts = [name, row["photographs"], row["points"], row["voxels"], f"{100 * row['masked']:.2f}", f"{100 * row['masked_of_all']:.1f}", near]
-        lines.append("| " + " | ".join(map(str, [*parts, f"{row['distance']:.2f}"])) + " |")
-    return "\n".join([*lines, "", "Near planes (least, median, greatest) and distances in units of the training frame.", ""])
+        parts = [name, row["photographs"], row["points"], row["voxels"], f"{100 * row['masked']:.2f}", f"{100 * row['masked_of_all']:.1f}"]
+        parts += [", ".join(f"{prior['name']} ({100 * prior['contradicted']:.1f} %)" for prior in row["priors"] if not prior["applied"]), near]
+        lines.append("| " + " | ".join(map(str, [*parts, f"{row['distance']:.2f}", f"{row['size']:.2f}", f"{100 * row['outside']:.1f}"])) + " |")
+    note = "Refuted: priors that are dropped, for so many of the reliable sparse points contradict them. Near planes: least, median, greatest."
+    return "\n".join(
+        [*lines, "", f"{note} Out of the box: of the subject's points. Lengths are in units of the training frame, whose box is 2 along its longest side.", ""]
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -108,13 +128,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
     given = parser.parse_args(arguments)
-    rows = {}
+    table, about = given.out / "made_captures.json", {"width": given.width, "side": given.side, "seed": given.seed}
+    before = json.loads(table.read_text(encoding="utf-8")) if table.exists() else {}
+    rows = dict(before["rows"]) if about.items() <= before.items() else {}  # of other kinds
     for name in given.kinds.split(","):
         rows[name] = measured(name, captures.captures()[name], given.work.resolve(), given.width, given.side, given.seed)
         print(f"{name}: {100 * rows[name]['masked']:.2f} % of the subject masked, {100 * rows[name]['masked_of_all']:.1f} % of all", flush=True)
     given.out.mkdir(parents=True, exist_ok=True)
-    table = given.out / "made_captures.json"
-    about = {"width": given.width, "side": given.side, "seed": given.seed}
+    rows = {name: rows[name] for name in captures.captures() if name in rows}
     write_atomically(table, (json.dumps({**about, "rows": rows}, indent=1) + "\n").encode())
     write_atomically(table.with_suffix(".md"), in_markdown(rows).encode())
     return 1 if any(row["masked"] > MOST_MASKED for row in rows.values()) else 0

@@ -188,14 +188,14 @@ def _corridor() -> MadeCapture:
 
 
 def _before_black() -> MadeCapture:
-    bone = Material(((0.75, 0.70, 0.58), (0.60, 0.54, 0.42)), "noise", 22.0)
+    bone = Material(((2.6, 2.4, 2.0), (0.6, 0.5, 0.35)), "noise", 30.0)  # brighter than white: by the flash
     skull: tuple[Shape, ...] = (
         Sphere((0.0, 0.0, 0.18), 0.11, bone),
         Box((0.0, -0.07, 0.08), (0.055, 0.05, 0.05), bone),
         *(Sphere((x, -0.1, 0.17), 0.03, Material(BLACK)) for x in (-0.04, 0.04)),
     )
     night = Sphere((0.0, 0.0, 0.0), 30.0, Material(((0.0, 0.0, 0.0),) * 2))
-    places = (*ring(16, 0.7, 0.15, target=(0.0, 0.0, 0.15)), *ring(14, 0.65, 0.5, target=(0.0, 0.0, 0.15), seed=2))
+    places = (*ring(16, 0.5, 0.15, target=(0.0, 0.0, 0.15)), *ring(14, 0.45, 0.4, target=(0.0, 0.0, 0.15), seed=2))
     return MadeCapture(skull, (night, Capsule((0.0, 0.0, -0.3), (0.0, 0.0, 0.02), 0.03, Material(BLACK))), places, wrong=(11,))
 
 

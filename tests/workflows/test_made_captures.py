@@ -25,7 +25,7 @@ def test_no_subject_is_masked_before_training(kind: str, tmp_path: Path) -> None
 
 
 def test_a_mask_over_everything_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(made_captures, "masked_voxels", lambda found, poses, side: np.ones((side,) * 3, bool))
+    monkeypatch.setattr(made_captures, "masked_voxels", lambda found, poses, side: (np.ones((side,) * 3, bool), ()))
     assert made_captures.measured("arc", KINDS["arc"], tmp_path, WIDTH, 16, seed=0)["masked"] == 1
     assert made_captures.main(["--work", str(tmp_path), "--kinds", "arc", "--width", "120", "--side", "16", "--out", str(tmp_path / "out")]) == 1
 
