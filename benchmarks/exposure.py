@@ -106,7 +106,7 @@ def write_scene(folder: Path, kind: str, counts: dict[str, int], size: int, seed
 
 
 def figures(render: Any, poses: Path) -> dict[str, float]:
-    """Mean PSNR over the test views, as they are and with fitted colours."""
+    """Mean PSNR over the test views, as they are, and with fitted colours."""
     from efficientnerf.evaluation.metrics import colour_fitted, psnr
     from stages.evaluation.views import ground_truth
     from stages.io import scene

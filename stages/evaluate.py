@@ -149,7 +149,7 @@ def evaluate(
     refinement  of the asset, `refinement_of`
     """
     from stages.io.refined_cameras import load_scene
-    from stages.training.averaged import without_vignetting
+    from stages.training.averaged import as_taken
 
     settings: EvaluateSettings = job.settings
     scene = load_scene(job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage])
@@ -164,7 +164,7 @@ def evaluate(
     composited = surrounded and constant_background(scene) is None
     perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in networks_of(settings)}
     points = sure_points(job.inputs[PosesOutputs.stage], scene, asset.reach)
-    unshaded = without_vignetting(job.inputs[TrainOutputs.stage])
+    taken = as_taken(job.inputs[TrainOutputs.stage])
     figures, others = [], [name for name, known in (("splats", splats), ("sparse_points", points)) if known is not None]
     for k, view in enumerate(views):
         job.safe_point()
@@ -176,12 +176,12 @@ def evaluate(
             field = load_field() if with_field or not surrounded else None
             measured, images = evaluate_view(
                 asset, mesh, field, scene, view, job, with_field=with_field, stride=stride if with_field or rest is None else rest, perceptual=perceptual,
-                splats=splats, points=points, unshaded=unshaded,
+                splats=splats, points=points, taken=taken,
             )  # fmt: skip
             note(done, measured, _save_thumbnails(images, job.work, k) if with_field else ())
         figures.append(measured)
     job.progress(len(views), len(views))
-    strips = write_strips(asset, mesh, load_field, scene, views, strip_views(figures), job, warn) if settings.strips == "on" else []
+    strips = write_strips(asset, mesh, load_field, scene, views, strip_views(figures), job, warn, taken) if settings.strips == "on" else []
     train = None if split == "train" else training_figures(asset, scene, job)
     metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips, mesh=mesh.facts,
                       splats=None if splats is None else splats.facts, refinement=refinement, train=train)  # fmt: skip

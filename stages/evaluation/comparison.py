@@ -8,15 +8,16 @@ floaters  opacity of the asset nearer than the network's surfaces, less a margin
 holes_excess_error, floaters_excess_error  the asset's squared error less the network's, of those pixels and weighed by that opacity, over what `holes` and
           `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there
 
-psnr_colour_fitted is the PSNR once the render's colours have had the affine change, twelve numbers a view, that fits the photograph best
-(`metrics.colour_fitted`). Held-back photographs have an exposure of their own that nothing learned; where training learned vignetting, it is of the photograph
-without that.
+Where training learned vignetting and response of the camera, renders are compared as that camera would show them, exposed as on average. A held-back
+photograph has an exposure of its own, which nothing has learned: psnr_colour_fitted is the PSNR once the render's colours have had the affine change, twelve
+numbers a view, that fits the photograph best (`metrics.colour_fitted`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from stages.evaluation.splats import EvaluatedSplats, splats_image, splats_metri
 from stages.evaluation.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluation.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.io.scene import Scene, View
-from stages.training.averaged import Unshaded
+from stages.training.averaged import Taken
 
 if TYPE_CHECKING:
     from efficientnerf.evaluation.lpips import Lpips
@@ -47,7 +48,7 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 def evaluate_view(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
     perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: SurePoints | None = None,
-    unshaded: Unshaded | None = None,
+    taken: Taken | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
@@ -55,12 +56,12 @@ def evaluate_view(
     stride      of the pixels that the field renders
     perceptual  LPIPS networks by the name of their metric
     points      that the asset's depth is compared with
-    unshaded    `stages.training.averaged.without_vignetting`
+    taken       `stages.training.averaged.as_taken`
     """
     from stages.figures.plots import error_map, to_uint8
 
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
-    truth = truth if unshaded is None else replace(truth, flat=unshaded(view, truth.colour))
+    shown = partial(as_shown, job, view, taken)
     unbounded = constant_background(scene) is None
     metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
     images: list[np.ndarray] = []
@@ -70,7 +71,7 @@ def evaluate_view(
         limits = asset.limits if with_field else None
         seen = field.render(small_camera, progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach, limits=limits)
     image, opacity, depth = render_asset(asset, scene, view, seen, stride)
-    image = clipped(image, job, f"{view.name}: the asset")
+    image = shown(image, "the asset")
     metrics |= {"trivial": trivial(truth), "sparse_points": None if points is None else against_points(points, scene, view, depth, truth)}
     size = {"width": view.camera.width, "height": view.camera.height}
     inside = upsample(seen.inside_opacity, stride, **size) >= 0.5 if unbounded and seen is not None else truth.inside
@@ -78,19 +79,19 @@ def evaluate_view(
     if unbounded and asset.inner is None:
         metrics["asset"]["background_scale"] = 1.0 / stride
     drawn, plain, covered = mesh_image(mesh, asset, scene, view, seen, stride)
-    metrics["mesh"] = mesh_metrics(clipped(drawn, job, f"{view.name}: the mesh"), clipped(plain, job, f"{view.name}: the mesh"), covered, image, truth)
+    metrics["mesh"] = mesh_metrics(shown(drawn, "the mesh"), shown(plain, "the mesh"), covered, image, truth)
     if splats is not None:
-        metrics["splats"] = splats_metrics(clipped(splats_image(splats, asset, scene, view), job, f"{view.name}: the Gaussians"), truth)
+        metrics["splats"] = splats_metrics(shown(splats_image(splats, asset, scene, view), "the Gaussians"), truth)
     if with_field and seen is not None:
         small = truth.subsampled(stride)
-        render = clipped(seen.colour, job, f"{view.name}: the field")
+        render = shown(seen.colour, "the field", stride)
         inside = seen.inside_opacity >= 0.5 if unbounded else small.inside
         network = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0], **sample_shares(seen.counts)}
         metrics["network"] = network | lpips_metrics(perceptual or {}, render, small)
         same_image, same_opacity = subsample(image, stride), subsample(opacity, stride)
-        metrics |= differences(asset, subsample_camera(view.camera, stride), same_image, same_opacity, seen, small, metrics["network"])
+        metrics |= differences(asset, subsample_camera(view.camera, stride), same_image, same_opacity, replace(seen, colour=render), small, metrics["network"])
         if unbounded and asset.inner is not None:
-            other = clipped(over_field(asset.inner, view, seen, stride)[0], job, f"{view.name}: the asset over the field")
+            other = shown(over_field(asset.inner, view, seen, stride)[0], "the asset over the field")
             metrics["asset_with_network_background"] = {**compare(other, truth, upsample(seen.inside_opacity, stride, **size) >= 0.5), **size}
         images += [to_uint8(small.colour), to_uint8(render), error_map(render, small.colour)]
     if metrics["asset"]["psnr"] is None:
@@ -193,13 +194,18 @@ def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) ->
     used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
     boxed = None if inside is None else used & inside
     windows = used[5:-5, 5:-5]
-    flat = truth.colour if truth.flat is None else truth.flat
     return {
         "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,
         "ssim": ssim(image, truth.colour, truth.mask) if windows.any() else None,
         "psnr_in_box": min(MAX_PSNR, psnr(image, truth.colour, boxed)) if boxed is not None and boxed.any() else None,
-        "psnr_colour_fitted": min(MAX_PSNR, psnr(colour_fitted(image, flat, truth.mask), flat, truth.mask)) if used.any() else None,
+        "psnr_colour_fitted": min(MAX_PSNR, psnr(colour_fitted(image, truth.colour, truth.mask), truth.colour, truth.mask)) if used.any() else None,
     }
+
+
+def as_shown(job: Job, view: View, taken: Taken | None, image: np.ndarray, what: str, stride: int = 1) -> np.ndarray:
+    """A render of every stride-th pixel of a view as it is compared: clipped, and as the view's camera shows it."""
+    image = clipped(image, job, f"{view.name}: {what}")
+    return image if taken is None else taken(view, image, stride)
 
 
 def clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:

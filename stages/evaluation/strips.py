@@ -18,12 +18,13 @@ import numpy as np
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs, PosesOutputs
 from stages.evaluation.asset import EvaluatedAsset, render_asset
-from stages.evaluation.comparison import clipped, compare
+from stages.evaluation.comparison import as_shown, compare
 from stages.evaluation.mesh import EvaluatedMesh, mesh_image
 from stages.evaluation.summary import quality
 from stages.evaluation.views import ground_truth, stride_for, subsample, subsample_camera
 from stages.io.scene import Scene, View
 from stages.scratch import Warn, note, noted
+from stages.training.averaged import Taken
 
 STRIP_RAYS = 2**20  # through the field, for one strip
 FIGURES = ("psnr", "ssim")
@@ -40,7 +41,7 @@ def strip_views(figures: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
 
 def write_strips(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, load_field: Callable[[], Any], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]],
-    job: Job, warn: Warn,
+    job: Job, warn: Warn, taken: Taken | None = None,
 ) -> list[dict[str, Any]]:
     """Write the strips of the chosen views; returns their entries of metrics.json. A strip is kept in job.work, so that a kill costs at most one."""
     entries: list[dict[str, Any]] = []
@@ -52,7 +53,7 @@ def write_strips(
         entry = noted(done, dict[str, Any], warn, partial(_check, picture, views[k]))
         if entry is None:
             stride = stride_for([views[k]], STRIP_RAYS)
-            entry = _write_strip(asset, mesh, load_field(), scene, views[k], stride, picture, job)
+            entry = _write_strip(asset, mesh, load_field(), scene, views[k], stride, picture, job, taken)
             rays += entry["width"] * entry["height"]
             note(done, entry, [picture])
         path = EvaluateOutputs(job.out).strip(which)
@@ -65,20 +66,21 @@ def write_strips(
 
 
 def _write_strip(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, stride: int, path: Path, job: Job
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
 ) -> dict[str, Any]:
     from stages.figures.plots import contact_sheet
 
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     seen = field.render(subsample_camera(view.camera, stride), progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach)
     truth = truth.subsampled(stride)
-    network = clipped(seen.colour, job, f"{view.name}: the field")
-    image = subsample(clipped(render_asset(asset, scene, view, seen, stride)[0], job, f"{view.name}: the asset"), stride)
-    drawn = subsample(clipped(mesh_image(mesh, asset, scene, view, seen, stride)[0], job, f"{view.name}: the mesh"), stride)
-    shown = {"network": network, "asset": image, "mesh": drawn}
-    found = {name: {key: compare(picture, truth, None)[key] for key in FIGURES} for name, picture in shown.items()}
-    pictures: list[np.ndarray | None] = [truth.colour, *shown.values()]
-    labels = [f"photograph {view.name}", *(f"{name} {quality(found[name])}" for name in shown)]
+    shown = partial(as_shown, job, view, taken)
+    network = shown(seen.colour, "the field", stride)
+    image = subsample(shown(render_asset(asset, scene, view, seen, stride)[0], "the asset"), stride)
+    drawn = subsample(shown(mesh_image(mesh, asset, scene, view, seen, stride)[0], "the mesh"), stride)
+    renders = {"network": network, "asset": image, "mesh": drawn}
+    found = {name: {key: compare(picture, truth, None)[key] for key in FIGURES} for name, picture in renders.items()}
+    pictures: list[np.ndarray | None] = [truth.colour, *renders.values()]
+    labels = [f"photograph {view.name}", *(f"{name} {quality(found[name])}" for name in renders)]
     contact_sheet([pictures], [labels], path, thumbnail=max(image.shape[:2]))
     return {"view": view.name, **found, "width": image.shape[1], "height": image.shape[0]}
 

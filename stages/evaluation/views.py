@@ -20,18 +20,15 @@ class GroundTruth:
     colour  (H, W, 3) float32, on the scene's background
     mask    (H, W) bool, pixels that are compared; None: all
     inside  (H, W) bool, pixels that the image's alpha covers; None without alpha
-    flat    colour without the camera's vignetting, where training learned that; None: as it is
     """
 
     colour: np.ndarray
     mask: np.ndarray | None
     inside: np.ndarray | None
-    flat: np.ndarray | None = None
 
     def subsampled(self, stride: int) -> GroundTruth:
         """That of the pixels that `subsample` keeps."""
-        parts = (None if part is None else subsample(part, stride) for part in (self.mask, self.inside, self.flat))
-        return GroundTruth(subsample(self.colour, stride), *parts)
+        return GroundTruth(subsample(self.colour, stride), *(None if part is None else subsample(part, stride) for part in (self.mask, self.inside)))
 
 
 def evaluation_views(scene: Scene) -> tuple[tuple[View, ...], str]:

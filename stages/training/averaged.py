@@ -14,7 +14,7 @@ from stages.io.scene import View, read_image, read_mask
 if TYPE_CHECKING:
     from efficientnerf.training.exposure.model import Exposure
 
-Unshaded = Callable[[View, np.ndarray], np.ndarray]
+Taken = Callable[[View, np.ndarray, int], np.ndarray]
 ReadView = Callable[[View], tuple[np.ndarray, np.ndarray | None]]  # (H, W, 3 or 4) uint8, and (H, W) bool or None
 
 
@@ -39,18 +39,21 @@ def averaged_views(folder: Path, trained: Path) -> ReadView:
     return read
 
 
-def without_vignetting(trained: Path) -> Unshaded | None:
-    """What takes the vignetting of its camera from the photograph (H, W, 3) of a view, as the train stage in `trained` learned it; None: it learned none."""
+def as_taken(trained: Path) -> Taken | None:
+    """What shows a render (H, W, 3) of every stride-th pixel of a view as the view's camera would, by what the train stage in `trained` learned of it; None: it
+    learned nothing. Held-back views are exposed as on average."""
     known = exposures_of(trained)
     if known is None:
         return None
 
-    def unshaded(view: View, colour: np.ndarray) -> np.ndarray:
-        from efficientnerf.training.exposure.model import unshaded_image
+    def taken(view: View, image: np.ndarray, stride: int) -> np.ndarray:
+        from efficientnerf.training.exposure.model import image_as_taken
 
-        return unshaded_image(colour, known[0][view.image], known[1]) if view.image in known[0] else colour
+        if view.image not in known[0]:
+            return image
+        return image_as_taken(image, known[0][view.image], known[1], (view.camera.width, view.camera.height), stride)
 
-    return unshaded
+    return taken
 
 
 def exposures_of(trained: Path) -> tuple[dict[str, int], Exposure] | None:

@@ -25,6 +25,7 @@ from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
 from stages.poses import PosesSettings
 from stages.training import data
+from stages.training.averaged import as_taken
 from stages.training.data import depth_range, pixels_of, sparse_depth_of
 from stages.training.exposure import begin_exposure
 from tests.efficientnerf.balls import settings
@@ -264,6 +265,12 @@ def test_exposures_are_saved(tmp_path: Path) -> None:
     report = json.loads((made.out / "report.json").read_text())
     assert report["exposure"]["least_stops"] <= 0 <= report["exposure"]["most_stops"]
     assert load_renderer(made.out).model.settings.exposure == "on"
+    taken, image = as_taken(made.out), np.full((16, 16, 3), 0.5, np.float32)
+    assert taken is not None
+    seen = [taken(view, image, 1) for view in scenes.load(scene).views]
+    assert np.abs(seen[0] - image).max() > 1e-5  # vignetting
+    np.testing.assert_array_equal(seen[0], seen[7])  # without the exposure of each
+    assert as_taken(tmp_path) is None
 
 
 @pytest.mark.parametrize("differ", [True, False])

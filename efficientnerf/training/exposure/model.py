@@ -131,7 +131,7 @@ def averaged_image(image: np.ndarray, mask: np.ndarray | None, number: int, e: E
     """Photograph `number` as if all had been exposed alike: (H, W, 3 or 4) uint8, alpha as it was, and the mask (H, W) bool of what is to be used of it:
     clipped pixels of what was exposed more say nothing of how bright the scene is."""
     height, width = image.shape[:2]
-    at = _places_of_image(image, number)
+    at = _places_of_image(number, width, height)
     colour = torch.from_numpy(image[..., :3].reshape(-1, 3).astype(np.float32) / np.float32(255))
     with torch.no_grad():
         seen = averaged(colour, *at, e)
@@ -144,11 +144,12 @@ def averaged_image(image: np.ndarray, mask: np.ndarray | None, number: int, e: E
     return out, ~blind if mask is None else mask & ~blind
 
 
-def unshaded_image(image: np.ndarray, number: int, e: Exposure) -> np.ndarray:
-    """Photograph `number` (H, W, 3) float32, 0-1, without its camera's vignetting, exposed as it was."""
+def image_as_taken(image: np.ndarray, number: int, e: Exposure, size: tuple[int, int], stride: int = 1) -> np.ndarray:
+    """A render (H, W, 3) float32, 0-1, of every stride-th pixel of an image of size (width, height), the first in the middle of the first stride, as the camera
+    of photograph `number` would show it, exposed as on average."""
     still = Exposure(torch.zeros_like(e.photographs), e.cameras, e.camera_of)
     with torch.no_grad():
-        seen = averaged(torch.from_numpy(image.reshape(-1, 3)), *_places_of_image(image, number), still)
+        seen = exposed(torch.from_numpy(image.reshape(-1, 3)), *_places_of_image(number, *size, stride), still)
     return np.asarray(seen.clamp(0, 1).numpy().reshape(image.shape))
 
 
@@ -162,11 +163,11 @@ def exposure_loss(e: Exposure) -> Tensor:
     return WEIGHT * ((e.log_gains() ** 2).mean() + ((SCALE * e.cameras) ** 2).mean())
 
 
-def _places_of_image(image: np.ndarray, number: int) -> tuple[Tensor, Tensor]:
-    """`places` of all pixels of an image (H, W, ...) of photograph `number`."""
-    height, width = image.shape[:2]
-    y, x = np.divmod(np.arange(height * width), width)
-    return torch.full((height * width,), number), torch.from_numpy(squared_radius(x, y, width, height))
+def _places_of_image(number: int, width: int, height: int, stride: int = 1) -> tuple[Tensor, Tensor]:
+    """`places` of every stride-th pixel of an image of photograph `number`."""
+    first = (stride - 1) // 2
+    y, x = np.mgrid[first:height:stride, first:width:stride]
+    return torch.full((x.size,), number), torch.from_numpy(squared_radius(x.ravel(), y.ravel(), width, height))
 
 
 def _response_and_gain(view: Tensor, radius: Tensor, e: Exposure) -> tuple[Tensor, Tensor, Tensor]:

@@ -23,14 +23,15 @@ from efficientnerf.training.exposure.model import (
     exposed,
     exposure_loss,
     exposure_of,
+    image_as_taken,
     places,
     squared_error,
     squared_radius,
-    unshaded_image,
 )
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
+from stages.evaluation.views import subsample
 from tests.efficientnerf.balls import cameras, photograph, untrained
 
 CPU = torch.device("cpu")
@@ -153,17 +154,19 @@ def test_a_photograph_as_if_exposed_like_the_others() -> None:
     assert all_used is not None
     assert all_used.tolist() == [[True, False]]
     assert (bright[..., 3].tolist(), image[0, 0].tolist()) == ([[7, 255]], [100, 200, 10, 7])
-    plain = image[..., :3] / np.float32(255)
-    np.testing.assert_allclose(unshaded_image(plain, 0, e), plain, atol=1e-6)
 
 
-def test_a_photograph_without_its_vignetting() -> None:
-    e = Exposure(random(2, 3).float(), torch.tensor([[-4.0, -1.0, 0.0, 0.0]]), torch.zeros(2, dtype=torch.int64))
+def test_a_render_as_its_camera_shows_it() -> None:
+    """Without the photograph's own exposure; at every stride-th pixel the same as there of all."""
+    e = Exposure(random(2, 3).float(), torch.tensor([[-4.0, -1.0, 3.0, 0.0]]), torch.zeros(2, dtype=torch.int64))
+    image = np.random.default_rng(0).random((11, 8, 3), np.float32)
+    y, x = np.divmod(np.arange(88), 8)
     still = Exposure(torch.zeros(2, 3), e.cameras, e.camera_of)
-    y, x = np.divmod(np.arange(48), 8)
-    seen = exposed(torch.full((48, 3), 0.4), torch.zeros(48, dtype=torch.int64), torch.from_numpy(squared_radius(x, y, 8, 6)), still)
-    assert seen.std() > 0.01
-    np.testing.assert_allclose(unshaded_image(seen.numpy().reshape(6, 8, 3), 1, e), 0.4, atol=1e-5)
+    expected = exposed(torch.from_numpy(image.reshape(-1, 3)), torch.zeros(88, dtype=torch.int64), torch.from_numpy(squared_radius(x, y, 8, 11)), still)
+    whole = image_as_taken(image, 1, e, (8, 11))
+    np.testing.assert_allclose(whole, expected.clamp(0, 1).reshape(11, 8, 3), atol=1e-6)
+    assert np.abs(whole - image).max() > 0.05
+    np.testing.assert_allclose(image_as_taken(subsample(image, 3), 0, e, (8, 11), 3), subsample(whole, 3), atol=1e-6)
 
 
 def photographs(gains: np.ndarray) -> Pixels:
