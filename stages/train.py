@@ -1,8 +1,9 @@
 """The train stage: a scene in, a trained field out.
 
 field.safetensors  both fields, the density voxels, what they mean; the schedule; the exposure of photographs where it was learned
-cameras.json       the training cameras, where they were refined
+cameras.json       the training cameras, where they were refined or replaced, and the views that were left out
 choices.json       what training did otherwise than the scene and the settings state, where it learned nothing with them
+wrong_views.png    photographs and renders of these views
 report.json        steps and seconds
 log.jsonl          a line every few steps
 curve.png          PSNR over steps
@@ -36,6 +37,7 @@ from stages.training.log import TrainLog
 from stages.training.previews import Previews
 from stages.training.priors import Prior, mask_uncovered_cells
 from stages.training.watch import Watch
+from stages.training.wrong_views import cameras_of, draw_wrong_views, findings_of, left_out_of, train_and_check
 
 if TYPE_CHECKING:
     from efficientnerf.geometry.cameras import Camera
@@ -87,7 +89,7 @@ def trained(job: Job) -> bool:
         return False
 
     log.begin_step()
-    for done in loop.train(t, pixels, sparse_depth(job, folder, s, settings)):
+    for done in train_and_check(job, t, pixels, s, lambda scene_now: sparse_depth(job, folder, scene_now, settings)):
         log.end_step(done)
         if budget is not None:
             follow_budget(job, t, budget)
@@ -104,9 +106,9 @@ def trained(job: Job) -> bool:
         log.begin_step()
     log.flush()
     field_file.save_model(m, near, far, outputs.field, saved_exposure(t.exposure, s), t.schedule)
-    write_cameras(outputs.cameras, t, views)
+    write_cameras(outputs, t, views, folder, FieldRenderer(m, near, far))
     watch.write_choices(outputs.choices)
-    write_report(outputs.report, job, t, log.seconds, previews.figures | watch.report(), priors)
+    write_report(outputs.report, job, t, log.seconds, previews.figures | watch.report() | {"wrong_views": findings_of(t, views)}, priors)
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
     previews.publish(outputs.previews, job.warn)
@@ -152,18 +154,19 @@ def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
         job.say(f"{t.schedule.iterations} steps fit into the budget of {job.settings.time_budget} s{rest}")
 
 
-def write_cameras(path: Path, t: Trainer, views: tuple[View, ...]) -> None:
-    """The training cameras, where they were refined."""
-    if t.cameras is not None:
+def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
+    """The training cameras, where they were refined or replaced, the views that were left out, and what these two show; `folder` is the scene's."""
+    if (cameras := cameras_of(t)) is not None:
         from stages.io import refined_cameras
 
-        refined_cameras.write(views, t.cameras.cameras, path)
+        refined_cameras.write(views, cameras, outputs.cameras, left_out_of(t, views))
+        draw_wrong_views(outputs.wrong_views, t, views, folder, renderer)
 
 
 def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[str, Any], priors: Sequence[Prior]) -> None:
     """What was reached; the seconds differ from run to run.
 
-    found  figures of the last preview, and the early check's report
+    found  figures of the last preview, and what the checks found
     """
     settings = t.model.settings
     job.record("schedule", t.schedule.state())
@@ -196,7 +199,7 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
 
 STAGE = Stage(
     name="train",
-    version=9,
+    version=10,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,

@@ -37,6 +37,7 @@ from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.readback import AsyncReadback, StepCounts
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.sparse_depth import RAYS_PER_RAY, SparseDepthRays, sparse_depth_loss, sparse_depth_weight
+from efficientnerf.training.view_checks.checks import ViewChecks, follow_checks
 
 MAX_STEPS = 2**40  # of a run: more than anyone waits for
 
@@ -75,6 +76,7 @@ class Trainer:
     samples_per_ray  the running average that sets the number of rays
     exposure         of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
     cameras          corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
+    checks           of the training views (`efficientnerf.training.view_checks.checks`), or None
     """
 
     model: Model
@@ -84,6 +86,7 @@ class Trainer:
     samples_per_ray: float = 0.0
     exposure: Exposure | None = None
     cameras: CameraCorrections | None = None
+    checks: ViewChecks | None = None
 
 
 def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | None = None, cameras: Sequence[Camera] = ()) -> Trainer:
@@ -91,7 +94,7 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
 
     exposure  of the training images, that is learned; None: none is
     schedule  None: that of the model's settings
-    cameras   of the training images, needed where they are refined
+    cameras   of the training images, needed where they are refined or checked
     """
     schedule = schedule or schedule_of(m.settings)
     groups = parameter_groups(m)
@@ -100,7 +103,8 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
     # Until it is known better, every interval is sampled, and as many pivots as there may be.
     samples = float(m.max_intervals + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
     corrections = CameraCorrections.none(cameras) if m.settings.camera_refinement == "on" and cameras else None
-    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure, corrections)
+    checks = ViewChecks.none(cameras) if m.settings.wrong_views == "auto" and cameras else None
+    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure, corrections, checks)
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
@@ -109,7 +113,8 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
     progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
     exposure = {} if t.exposure is None else {name: values.detach() for name, values in t.exposure.parameters.items()}
     cameras = {} if t.cameras is None else {f"cameras.{name}": torch.from_numpy(values) for name, values in t.cameras.state.items()}
-    return models.state_of(t.model) | moments | exposure | cameras | {"progress": progress}
+    checks = {} if t.checks is None else {f"checks.{name}": torch.from_numpy(values) for name, values in t.checks.state.items()}
+    return models.state_of(t.model) | moments | exposure | cameras | checks | {"progress": progress}
 
 
 def restore(t: Trainer, state: dict[str, Tensor]) -> None:
@@ -122,6 +127,11 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     if t.cameras is not None:
         for name, values in t.cameras.state.items():
             values[...] = state[f"cameras.{name}"].numpy()
+    if t.checks is not None:
+        for name, values in t.checks.state.items():
+            values[...] = state[f"checks.{name}"].numpy()
+        if t.cameras is not None:
+            t.cameras.given = tuple(t.checks.cameras)
     for name, pair in t.adam.moments.items():
         for k in (0, 1):
             pair[k].copy_(state[f"adam.{k}.{name}"])
@@ -154,6 +164,8 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
     m, settings = t.model, t.model.settings
     if readback is None and dispatch.on_device(m.voxels.values):
         readback = AsyncReadback()
+    if t.checks is not None and t.checks.changed:
+        follow_checks(t.checks, pixels, t.cameras)
     source = DevicePixels(pixels, m.device) if m.device.type == "cuda" else pixels
     if t.cameras is not None and t.step:
         source.set_cameras(t.cameras.cameras)

@@ -37,8 +37,9 @@ class Pixels:
     """All training pixels, and the rays that they see.
 
     images    (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha; an array, or the rows that were given for it
-    usable    (P / 8,) uint8 or None: a bit for each pixel, set where masks allow it
-    listed    the pixels that masks allow, in order, where they are few; else None
+    allowed   (P / 8,) uint8 or None: a bit for each pixel, set where masks allow it
+    usable    the same, and set of no view that is left out
+    listed    the usable pixels, in order, where they are few; else None
     lookup    (K, 3) float32: unit directions in the camera at knots, `stride` pixels apart; one table for all views that share a lens
 
     Between knots 8 apart directions are interpolated: with a focal length of f pixels that is off by less than about 8 / f pixels.
@@ -67,14 +68,28 @@ class Pixels:
             if part.shape[1] < channels:
                 part = np.concatenate([part, np.full((len(part), channels - part.shape[1]), 255, np.uint8)], axis=1)
             self.images[at : at + len(part)] = part
-        self.usable = self._usable(masks)
+        self.allowed = self._usable(masks)
+        self._use(self.allowed)
+        self.set_cameras(cameras)
+
+    def _use(self, usable: np.ndarray | None) -> None:
+        self.usable = usable
         self.usable_count = len(self) if self.usable is None else sum(map(len, self._usable_parts()))
         if not self.usable_count:
             raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
         few = self.usable_count < LISTED_SHARE * len(self)
         kind = np.uint32 if len(self) <= 2**32 else np.int64
         self.listed = np.concatenate([part.astype(kind) for part in self._usable_parts()]) if few else None
-        self.set_cameras(cameras)
+
+    def leave_out(self, views: np.ndarray) -> None:
+        """Choose no pixels of these views, (C,) bool, and of the others as masks allow."""
+        if not views.any():
+            self._use(self.allowed)
+            return
+        keep = (None if not left_out else np.zeros((height, width), bool) for left_out, width, height in zip(views, self.width, self.height, strict=True))
+        bits = self._usable(keep)
+        assert bits is not None
+        self._use(bits if self.allowed is None else bits & self.allowed)
 
     def set_cameras(self, cameras: Sequence[Camera]) -> None:
         """Make the rays those of these cameras, of the same sizes."""
@@ -151,10 +166,12 @@ class Pixels:
         return found[:count]
 
     def usable_at(self, index: np.ndarray) -> np.ndarray:
-        """(R,) bool: whether masks allow these pixels."""
-        if self.usable is None:
-            return np.ones(len(index), bool)
-        return (self.usable[index >> 3] >> (7 - (index & 7)) & 1).astype(bool)
+        """(R,) bool: whether these pixels are usable."""
+        return _set_at(self.usable, index)
+
+    def allowed_at(self, index: np.ndarray) -> np.ndarray:
+        """(R,) bool: whether masks allow these pixels, those of views that are left out, too."""
+        return _set_at(self.allowed, index)
 
     def view_of(self, index: np.ndarray) -> np.ndarray:
         """(R,) the view of each pixel."""
@@ -184,3 +201,7 @@ class Pixels:
         )
         directions = dispatch.ray_directions(lookup, lens, knots, self.stride, pixel, width, rotation, of).numpy()
         return self.centre[view], directions, self.images[index].astype(np.float32) / np.float32(255)
+
+
+def _set_at(bits: np.ndarray | None, index: np.ndarray) -> np.ndarray:
+    return np.ones(len(index), bool) if bits is None else (bits[index >> 3] >> (7 - (index & 7)) & 1).astype(bool)

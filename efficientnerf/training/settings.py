@@ -97,6 +97,11 @@ class TrainSettings:
     camera_refinement: Literal["auto", "off", "on"] = setting(
         "auto", "Whether poses and the focal length of the training cameras are corrected in training (on), or left alone (off); auto: off.", advanced=True,
     )
+    wrong_views: Literal["auto", "off"] = setting(
+        "auto", "Whether training views whose cameras the field and other evidence contradict are left out, or get the pose that is found for them."
+        " auto: they are; off: all views are trained on.",
+        advanced=True,
+    )  # fmt: skip
     initial_density: Annotated[float, Meta(ge=1e-6, le=1e3)] = setting(
         0.1, "Density that the hash field begins with, per unit of the training frame.", advanced=True
     )

@@ -1,8 +1,11 @@
-"""cameras.json of the train stage: the training cameras as training left them, where it refined them. What comes after uses these."""
+"""cameras.json of the train stage: the training cameras as training left them, and the views that it left out, where it refined or left out any.
+
+This is the one place that says what views, with what cameras, a field was trained on: what comes after uses `load_scene`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,25 +24,31 @@ from stages.training import choices
 
 FORMAT = 1
 AGAIN = "Train again."
+LEFT_OUT = "left out"  # the split of a training view that was not trained on in the end
 
 
 class RefinedDocument(Struct):
     format: int
     cameras: dict[str, CameraDocument]  # by the image of the view
+    left_out: list[str] = []  # images
 
 
-def write(views: Sequence[View], cameras: Sequence[Camera], path: Path) -> None:
-    """The refined cameras of some views, in their order."""
-    write_json(path, {"format": FORMAT, "cameras": {view.image: camera_to_json(camera) for view, camera in zip(views, cameras, strict=True)}})
+def write(views: Sequence[View], cameras: Sequence[Camera], path: Path, left_out: Sequence[str] = ()) -> None:
+    """The cameras of some views, in their order, and the images of the views that were left out."""
+    document = {"format": FORMAT, "cameras": {view.image: camera_to_json(camera) for view, camera in zip(views, cameras, strict=True)}}
+    write_json(path, document | ({"left_out": list(left_out)} if left_out else {}))
 
 
 def load_scene(poses: Path, train: Path) -> Scene:
-    """The scene in the artifact of the poses stage as that of the train stage used it: with its choices and its training cameras. Raises as `scene.load`."""
+    """The scene in the artifact of the poses stage as that of the train stage used it: with its choices and its training cameras; what that left out is in no
+    split that others use. Raises as `scene.load`."""
     found, path = choices.load(train).scene(scene.load(poses)), TrainOutputs(train).cameras
     if not path.is_file():
         return found
     document = decoded(read_json(path, AGAIN), RefinedDocument, path, AGAIN)
     known = {view.image: view for view in found.views}
+    if not known.keys() >= set(document.left_out):
+        raise CorruptArtifact(f"{printable(path)}: views are left out that this scene has not. {AGAIN}")
     for image, camera in document.cameras.items():
         view = known.get(image)
         size = None if view is None else (view.camera.width, view.camera.height, view.camera.model)
@@ -49,7 +58,13 @@ def load_scene(poses: Path, train: Path) -> Scene:
         cameras = {image: camera_from(camera, image) for image, camera in document.cameras.items()}
     except ValueError as error:
         raise CorruptArtifact(f"{printable(path)}: {printable(error, 300)}. {AGAIN}") from error
-    return replace(found, views=tuple(_with_camera(found, view, cameras[view.image]) if view.image in cameras else view for view in found.views))
+    return as_trained(found, cameras, document.left_out)
+
+
+def as_trained(s: Scene, cameras: Mapping[str, Camera], left_out: Collection[str]) -> Scene:
+    """The scene with other cameras for some views, by their images, and without those in training that were left out."""
+    views = [_with_camera(s, view, cameras[view.image]) if view.image in cameras else view for view in s.views]
+    return replace(s, views=tuple(replace(view, split=LEFT_OUT) if view.image in left_out else view for view in views))
 
 
 def _with_camera(s: Scene, view: View, camera: Camera) -> View:

@@ -24,10 +24,11 @@ def captured_views(poses: Path, train: Path, background: tuple[float, float, flo
 
     Raises CorruptArtifact, and BadInput where there is no scene.
     """
-    from stages.io.refined_cameras import load_scene
+    from stages.io.refined_cameras import LEFT_OUT, load_scene
 
     scene = load_scene(poses, train)
-    views = [scene.views[n] for n in _spread(len(scene.views), CAMERAS)]
+    known = [view for view in scene.views if view.split != LEFT_OUT]
+    views = [known[n] for n in _spread(len(known), CAMERAS)]
     behind = background or scene.background or (1.0, 1.0, 1.0)
     shown = [views[n] for n in _spread(len(views), PHOTOGRAPHS)]
     return [_pinhole(view.camera) for view in views], {view.camera.name: photograph(scene, poses, view, behind) for view in shown}

@@ -364,3 +364,62 @@ def test_of_many_observations_some_are_drawn_with_all_views_of_their_points(tmp_
     half = len(drawn[0]) // 2
     known = {ray.tobytes() for ray in np.column_stack([every.origins, every.directions])[: len(every) // 2]}
     assert {ray.tobytes() for ray in np.column_stack([drawn[0].origins, drawn[0].directions])[:half]} <= known
+
+
+@pytest.fixture
+def early_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the training views, after few steps."""
+    from efficientnerf.training.view_checks import checks
+
+    monkeypatch.setattr(checks, "LOWEST", (40, 50, 60, 70))
+
+
+SWAPPED = QUICK | {"iterations": 140, "checkpoint_every": 1000, "preview_every": "off", "sample_batch_size": 4096, "occupancy_warmup_steps": 20}
+
+
+def swapped(folder: Path) -> tuple[Path, list[str]]:
+    """A scene in which one photograph is of something else; the image of it."""
+    from stages.io.png import write_png
+
+    scene = poses(folder, count=20)
+    rng = np.random.default_rng(0)
+    picture = 255 * rng.integers(0, 2, (4, 4, 4), np.uint8).repeat(4, axis=0).repeat(4, axis=1)
+    picture[..., 3] = 255
+    write_png(picture, scene / "images" / "v05.png")
+    return scene, ["images/v05.png"]
+
+
+def test_a_view_that_shows_something_else_is_left_out_here_and_after(tmp_path: Path, early_checks: None) -> None:
+    scene, wrong = swapped(tmp_path / "poses")
+    made = job(tmp_path / "a", settings(**SWAPPED), poses=scene)
+    digest = run(made)
+    assert json.loads((made.out / TrainOutputs.cameras).read_text())["left_out"] == wrong
+    found = json.loads((made.out / "report.json").read_text())["wrong_views"]
+    assert [(each["image"], each["outcome"]) for each in found] == [("v05.png", "left out")]
+    assert len(found[0]["witnesses"]) >= 2
+    assert (made.out / TrainOutputs.wrong_views).is_file()
+    later = load_scene(scene, made.out)
+    assert [view.image for view in scenes.views_of(later, "train")] == [f"images/v{n:02}.png" for n in range(19) if n != 5]
+    for calls in ((45,), (55, 65)):
+        again, stop = tmp_path / f"stopped{calls[0]}", StopAt(*calls)
+        for _ in calls:
+            with pytest.raises(Interrupted):
+                run(job(again, settings(**SWAPPED), poses=scene, stop=stop))
+        assert run(job(again, settings(**SWAPPED), poses=scene, stop=stop)) == digest
+        assert (again / "out" / TrainOutputs.cameras).read_bytes() == (made.out / TrainOutputs.cameras).read_bytes()
+        assert (again / "out" / TrainOutputs.wrong_views).read_bytes() == (made.out / TrainOutputs.wrong_views).read_bytes()
+    off = job(tmp_path / "off", settings(**SWAPPED, wrong_views="off"), poses=scene)
+    assert run(off) != digest
+    assert not (off.out / TrainOutputs.cameras).exists()
+
+
+def test_without_wrong_views_the_checks_change_nothing(tmp_path: Path, early_checks: None) -> None:
+    scene = poses(tmp_path / "poses", count=20)
+    on, off = (job(tmp_path / choice, settings(**SWAPPED, wrong_views=choice), poses=scene) for choice in ("auto", "off"))
+    run(on)
+    run(off)
+    models = [load_renderer(each.out).model for each in (on, off)]
+    assert all(np.array_equal(a, b) for a, b in zip(*[[p.detach().numpy() for p in m.fine.parameters()] for m in models], strict=True))
+    assert not (on.out / TrainOutputs.cameras).exists()
+    assert not (on.out / TrainOutputs.wrong_views).exists()
+    assert json.loads((on.out / "report.json").read_text())["wrong_views"] == []

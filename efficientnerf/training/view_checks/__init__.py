@@ -1,0 +1,1 @@
+"""Whether the training views' cameras are right, by what the field shows."""

@@ -1,0 +1,297 @@
+"""Cameras that are wrong are found by the field, photographs that merely look different are not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from efficientnerf.geometry.cameras import Camera, project, rays
+from efficientnerf.model import Model
+from efficientnerf.training import loop
+from efficientnerf.training.camera_refinement import rotation_matrix, rotation_vector
+from efficientnerf.training.loop import Trainer, restore, state_of, trainer
+from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.view_checks.checks import (
+    LOWEST,
+    MIN_VIEWS,
+    MOST,
+    SHARES,
+    Observations,
+    ViewChecks,
+    check,
+    follow_checks,
+    is_due,
+    point_evidence,
+)  # fmt: skip
+from efficientnerf.training.view_checks.pose_search import best_shift, turned
+from efficientnerf.training.view_checks.residuals import cells_of, global_error, local_error
+from tests.efficientnerf import balls
+
+COUNT, SIDE = 24, 32
+WAVES = np.array([[7.0, 2.0, -4.0], [-3.0, 8.0, 2.0], [4.0, -2.0, 7.0]])
+
+
+def camera(n: int, side: int = SIDE) -> Camera:
+    pose = balls.pose(2 * math.pi * n / COUNT, 0.35 + 0.3 * math.sin(5.0 * n), 2.2)
+    return Camera(f"v{n:02}.png", side, side, "SIMPLE_PINHOLE", (1.3 * side, side / 2, side / 2), pose)
+
+
+def picture(seen_by: Camera) -> np.ndarray:
+    """(H, W, 4) uint8: the ball with bright and dark spots."""
+    image = balls.picture(seen_by)
+    origins, directions = rays(seen_by)
+    middle = ((balls.CENTRE - origins) * directions).sum(-1)
+    chord = np.sqrt(np.maximum(balls.RADIUS**2 - ((balls.CENTRE - origins) ** 2).sum(-1) + middle**2, 0))
+    hit = origins + (middle - chord)[:, None] * directions
+    image[..., :3] = np.round(255 * (0.5 + 0.4 * np.sin(hit @ WAVES.T))).reshape(image[..., :3].shape)
+    return image
+
+
+CAMERAS = [camera(n) for n in range(COUNT)]
+PICTURES = [picture(each) for each in CAMERAS]
+
+
+def pixels_of(cameras: list[Camera], pictures: list[np.ndarray]) -> Pixels:
+    return Pixels(cameras, pictures, [None] * len(cameras), np.full(len(cameras), 0.6), np.full(len(cameras), 4.0))
+
+
+def rotated(n: int, degrees: float, axis: tuple[float, float, float] = (0.6, 0.7, 0.39)) -> Camera:
+    """The camera, turned about its own place."""
+    pose = CAMERAS[n].world_from_camera.copy()
+    pose[:3, :3] = pose[:3, :3] @ rotation_matrix(math.radians(degrees) * np.array(axis) / np.linalg.norm(axis))
+    return replace(CAMERAS[n], world_from_camera=pose)
+
+
+def trained(cameras: list[Camera], pictures: list[np.ndarray], steps: int = 300) -> tuple[Trainer, Pixels]:
+    """A trainer after some steps of 3000."""
+    t = trainer(balls.untrained(iterations=3000, num_levels=6, sample_batch_size=12288, finest_resolution=64), cameras=cameras)
+    pixels = pixels_of(cameras, pictures)
+    steps_of = loop.train(t, pixels)
+    for _ in range(steps):
+        next(steps_of)
+    return t, pixels
+
+
+@pytest.fixture(scope="module")
+def field() -> Model:
+    """A field of the true cameras."""
+    return trained(CAMERAS, PICTURES)[0].model
+
+
+def angle(a: Camera, b: Camera) -> float:
+    return math.degrees(np.linalg.norm(rotation_vector(a.world_from_camera[:3, :3].T @ b.world_from_camera[:3, :3])))
+
+
+def found(m: Model, cameras: list[Camera], pictures: list[np.ndarray], observed: Observations | None = None) -> ViewChecks:
+    """After one check."""
+    c = ViewChecks.none(cameras)
+    check(c, m, pixels_of(cameras, pictures), observed, 300)
+    return c
+
+
+def looks(n: int, direction: float, centre: np.ndarray) -> Camera:
+    """The lens of a camera at another place, looking at an azimuth."""
+    pose = balls.pose(direction, 0.0)
+    pose[:3, 3] = centre
+    return replace(CAMERAS[n], world_from_camera=pose)
+
+
+@pytest.mark.parametrize("degrees", [8, 15, 60])
+def test_turned_cameras_are_left_out_and_their_poses_found(field: Model, degrees: float) -> None:
+    cameras = list(CAMERAS)
+    for n in (3, 11, 18):
+        cameras[n] = rotated(n, degrees)
+    c = found(field, cameras, PICTURES)
+    assert np.flatnonzero(c.left_out).tolist() == [3, 11, 18]
+    for n in (3, 11, 18):
+        assert c.replaced[n]
+        assert angle(CAMERAS[n], replace(CAMERAS[n], world_from_camera=c.pose[n])) < 3
+        assert c.evidence[n, 3] < 0.3 < c.evidence[n, 1]
+
+
+def test_swapped_photographs_are_left_out_and_their_cameras_found(field: Model) -> None:
+    cameras = list(CAMERAS)
+    cameras[4], cameras[15] = (replace(CAMERAS[a], world_from_camera=CAMERAS[b].world_from_camera) for a, b in ((4, 15), (15, 4)))
+    c = found(field, cameras, PICTURES)
+    assert np.flatnonzero(c.left_out).tolist() == [4, 15]
+    for n in (4, 15):
+        assert angle(CAMERAS[n], replace(CAMERAS[n], world_from_camera=c.pose[n])) < 3
+
+
+def test_a_camera_inside_the_ring_of_the_others_is_left_out(field: Model) -> None:
+    cameras = [*CAMERAS[:7], looks(7, 0.3, np.array([0.2, 0.75, 0.5])), *CAMERAS[8:]]
+    assert np.flatnonzero(found(field, cameras, PICTURES).left_out).tolist() == [7]
+
+
+def test_a_photograph_of_something_else_is_left_out_and_no_pose_is_believed(field: Model) -> None:
+    other = PICTURES[6].copy()
+    other[..., :3] = np.random.default_rng(1).integers(0, 2, (8, 8, 3), np.uint8).repeat(4, axis=0).repeat(4, axis=1) * 255
+    other[..., 3] = 255
+    c = found(field, CAMERAS, [*PICTURES[:6], other, *PICTURES[7:]])
+    assert np.flatnonzero(c.left_out).tolist() == [6]
+
+
+def blurred(image: np.ndarray) -> np.ndarray:
+    import cv2
+
+    return cv2.GaussianBlur(image, (0, 0), 1.2)
+
+
+def exposed(image: np.ndarray, stops: float) -> np.ndarray:
+    out = image.copy()
+    out[..., :3] = np.clip(image[..., :3] * 2 ** (stops / 2.2), 0, 255)
+    return out
+
+
+def covered(image: np.ndarray) -> np.ndarray:
+    out = image.copy()
+    out[12:, 4:15] = [200, 30, 30, 255]
+    return out
+
+
+def warm(image: np.ndarray) -> np.ndarray:
+    out = image.copy()
+    out[..., :3] = image[..., :3] * [1.0, 0.8, 0.5]
+    return out
+
+
+@pytest.mark.parametrize(
+    "change", [lambda i: exposed(i, 1), lambda i: exposed(i, -1), warm, blurred, covered], ids=["+1 EV", "-1 EV", "warm", "blurred", "covered"]
+)
+def test_photographs_that_merely_look_different_stay(field: Model, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    pictures = [change(image) if n in (5, 16) else image for n, image in enumerate(PICTURES)]
+    assert not found(field, CAMERAS, pictures).left_out.any()
+
+
+def test_more_texture_in_a_third_of_the_views_is_no_error(field: Model) -> None:
+    rng = np.random.default_rng(0)
+    pictures = [image.copy() for image in PICTURES]
+    for image in pictures[:8]:
+        image[..., :3] = np.clip(image[..., :3] + rng.normal(0, 25, image[..., :3].shape), 0, 255)
+    assert not found(field, CAMERAS, pictures).left_out.any()
+
+
+def test_no_more_than_a_share_is_left_out_and_of_few_views_none(field: Model) -> None:
+    most = int(MOST * COUNT)
+    cameras = [rotated(n, 30) if n % 4 == 0 else each for n, each in enumerate(CAMERAS)]  # 6 of 24
+    assert 0 < found(field, cameras, PICTURES).left_out.sum() <= most
+    few = ViewChecks.none([rotated(0, 30), *CAMERAS[1:MIN_VIEWS]])
+    assert not any(is_due(few, number, 0.3) for number in range(5000))
+    barely = [rotated(n, 30) if n < 3 else each for n, each in enumerate(CAMERAS[: MIN_VIEWS + 1])]
+    assert found(field, barely, PICTURES[: MIN_VIEWS + 1]).left_out.sum() <= 1
+
+
+def observations() -> Observations:
+    """Points on the ball, as the true cameras observe them."""
+    side = np.random.default_rng(2).normal(size=(400, 3))
+    xyz = balls.CENTRE + balls.RADIUS * side / np.linalg.norm(side, axis=1, keepdims=True)
+    view, point = np.nonzero([((each.centre - xyz) * (xyz - balls.CENTRE)).sum(1) > 0.4 for each in CAMERAS])
+    return Observations(xyz[point], 0.5 + 0.4 * np.sin(xyz[point] @ WAVES.T), view)
+
+
+def test_sparse_points_speak_for_true_cameras_and_against_wrong_ones() -> None:
+    cameras = list(CAMERAS)
+    for n, degrees in ((3, 8), (11, 60)):
+        cameras[n] = rotated(n, degrees)
+    cells = cells_of(pixels_of(cameras, PICTURES), np.ones(3))
+    speak_for, against = point_evidence(cameras, cells, observations(), np.ones(COUNT, bool))
+    assert np.flatnonzero(against).tolist() == [3, 11]
+    assert not speak_for[[3, 11]].any()
+    assert speak_for.mean() > 0.6
+    few = observations()
+    some = (few.view != 7) | (np.cumsum(few.view == 7) <= 25)  # enough to look at, fewer than others
+    few = Observations(few.xyz[some], few.rgb[some], few.view[some])
+    cells = cells_of(pixels_of(CAMERAS, PICTURES), np.ones(3))
+    speak_for, against = point_evidence(CAMERAS, cells, few, np.ones(COUNT, bool))
+    assert not against.any()
+    assert not speak_for[7]
+    assert not any(evidence.any() for evidence in point_evidence(CAMERAS, cells, None, np.ones(COUNT, bool)))
+
+
+def test_a_view_that_its_points_speak_for_stays(field: Model) -> None:
+    """The turned cameras of a scene whose points agree with all of them: what the field says against them is an error of the field."""
+    c = ViewChecks.none([*CAMERAS[:9], rotated(9, 12), *CAMERAS[10:]])
+    pixels = pixels_of(list(c.given), PICTURES)
+    observed = observations()
+    own = observed.view == 9
+    at, _ = project(CAMERAS[9], observed.xyz[own])
+    xyz = observed.xyz.copy()
+    _, directions = rays(c.given[9], at)
+    xyz[own] = c.given[9].centre + 2.0 * directions
+    check(c, field, pixels, replace(observed, xyz=xyz), 300)
+    assert not c.left_out.any()
+
+
+def test_the_field_takes_back_what_it_left_out_wrongly(field: Model) -> None:
+    c = ViewChecks.none(CAMERAS)
+    c.left_out[8] = c.left_out[20] = c.replaced[20] = True
+    c.pose[20] = rotated(20, 40).world_from_camera  # which is worse than its own
+    assert check(c, field, pixels_of(CAMERAS, PICTURES), None, 500)
+    assert not c.left_out.any()
+    assert not c.replaced.any()
+    assert np.array_equal(c.pose, np.stack([each.world_from_camera for each in CAMERAS]))
+
+
+def test_a_pose_that_was_found_is_trained_on_once_the_field_that_has_not_seen_it_agrees(field: Model) -> None:
+    cameras = [*CAMERAS[:5], rotated(5, 20), *CAMERAS[6:]]
+    c, pixels = ViewChecks.none(cameras), pixels_of(cameras, PICTURES)
+    assert check(c, field, pixels, None, 300)
+    assert c.left_out[5]
+    assert np.array_equal(c.cameras[5].world_from_camera, cameras[5].world_from_camera)  # not before
+    assert check(c, field, pixels, None, 500)
+    assert not c.left_out.any()
+    assert angle(c.cameras[5], CAMERAS[5]) < 2
+
+
+def test_checks_are_due_once_each_and_never_late() -> None:
+    for iterations in (500, 1000, 4000, 30000):
+        c, steps = ViewChecks.none(CAMERAS), []
+        for number in range(1, iterations + 1):
+            if is_due(c, number, number / iterations):
+                steps.append(number)
+                c.done += 1
+        assert len(steps) <= len(SHARES)
+        assert all(number >= low and number <= 0.6 * iterations for number, low in zip(steps, LOWEST, strict=False))
+        assert (len(steps) == len(SHARES)) == (iterations >= 2000)
+
+
+def test_training_with_wrong_cameras_finds_them_and_draws_none_of_their_pixels() -> None:
+    """The field has seen them from its first step on."""
+    cameras = list(CAMERAS)
+    for n, degrees in ((2, 10), (13, 45)):
+        cameras[n] = rotated(n, degrees)
+    t, pixels = trained(cameras, PICTURES)
+    assert t.checks is not None
+    assert check(t.checks, t.model, pixels, None, 300)
+    assert np.flatnonzero(t.checks.left_out).tolist() == [2, 13]
+    follow_checks(t.checks, pixels, None)
+    drawn = pixels.view_of(pixels.choose(20000, np.random.default_rng(0)))
+    assert sorted(set(drawn)) == [n for n in range(COUNT) if n not in (2, 13)]
+    again = trainer(t.model, cameras=cameras)
+    restore(again, state_of(t))
+    assert again.checks is not None
+    assert all(np.array_equal(getattr(again.checks, name), values) for name, values in t.checks.state.items())
+    pixels.leave_out(np.zeros(COUNT, bool))
+    assert pixels.usable_count == len(pixels)
+
+
+def test_errors_do_not_depend_on_exposure_and_shifts_are_found() -> None:
+    rng = np.random.default_rng(3)
+    image = np.cumsum(np.cumsum(rng.normal(size=(30, 40, 3)), axis=0), axis=1)
+    image = (image - image.min()) / np.ptp(image)
+    weight = np.ones((30, 40))
+    for other in (image, 0.4 * image + 0.1, image * [0.9, 0.7, 0.5]):
+        left, variance = global_error(image, other, weight)
+        assert left < 0.1 * variance
+        assert local_error(image, other, weight) < 0.3
+    assert global_error(image, 1 - image, weight)[0] == pytest.approx(global_error(image, 1 - image, weight)[1])
+    value, shift = best_shift(image[5:25, 8:33], weight[5:25, 8:33], image[2:22, 4:29])
+    assert shift.tolist() == [4, 3]
+    assert value > 0.95
+    moved = turned(CAMERAS[0], np.array([5.0, -3.0]))
+    at, _ = project(CAMERAS[0], (moved.centre + moved.forward)[None])
+    np.testing.assert_allclose(at[0], [SIDE / 2 + 5, SIDE / 2 - 3], atol=1e-4)
