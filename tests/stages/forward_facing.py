@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, rays
 from stages.framing.forward_facing import detect_forward_facing
-from stages.io.scene import Scene, View
+from stages.io.png import write_png
+from stages.io.scene import Scene, View, save
 from tests.efficientnerf.balls import BOUNDS
 from tests.stages.balls import ORBIT, SIMILARITY
 
@@ -37,6 +39,22 @@ def forward_facing(side: int) -> Scene:
     assert not isinstance(found, str), found
     views = tuple(View(f"images/{c.name}", None, "train", c, c, 3.0, 40.0) for c in cameras)
     return Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found)
+
+
+def painted_wall(folder: Path) -> Path:
+    """The poses artifact of a painted wall before nine cameras, the first of them a test view."""
+    cameras = [_resized(camera, 32) for camera in row()]
+    found = detect_forward_facing(cameras, depths(cameras))
+    assert not isinstance(found, str), found
+    (folder / "images").mkdir(parents=True)
+    for camera in cameras:
+        origins, directions = rays(camera)
+        at = origins + directions * ((6.0 - origins[:, 1]) / directions[:, 1])[:, None]
+        colour = 0.5 + 0.4 * np.sin(at[:, [0, 2, 0]] * (1.0, 1.5, 2.0))
+        write_png(np.round(255 * colour).astype(np.uint8).reshape(camera.height, camera.width, 3), folder / "images" / camera.name)
+    views = tuple(View(f"images/{c.name}", None, "test" if k == 0 else "train", c, c, 3.0, 40.0) for k, c in enumerate(cameras))
+    save(Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found), folder)
+    return folder
 
 
 def _resized(camera, side: int):  # type: ignore[no-untyped-def]

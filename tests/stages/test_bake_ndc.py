@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +12,17 @@ import torch
 from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.geometry.cameras import rays
 from efficientnerf.geometry.spaces import NdcSpace
 from stages import bake, train
 from stages.artifacts import BakeOutputs
 from stages.bake import BakeSettings
 from stages.baking.pruning import NDC_RAYS_PER_VOXEL
 from stages.baking.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, budget_of, finest_resolution, ndc_pixel
-from stages.framing.forward_facing import detect_forward_facing
 from stages.io.field_file import load_renderer
-from stages.io.png import write_png
-from stages.io.scene import Scene, View, load, save
-from tests.efficientnerf.balls import BOUNDS, settings
-from tests.stages.balls import ORBIT, SIMILARITY, job, poses
-from tests.stages.forward_facing import depths, forward_facing, row
+from stages.io.scene import load
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import job, poses
+from tests.stages.forward_facing import forward_facing, painted_wall
 
 QUICK: dict[str, Any] = {"resolution": 64, "visibility_rays": 4000, "weight_threshold": 0.0, "max_mib": 8, "samples_per_voxel": 4, "refine_steps": 0}
 
@@ -35,17 +31,7 @@ QUICK: dict[str, Any] = {"resolution": 64, "visibility_rays": 4000, "weight_thre
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A painted wall before nine cameras, and a network that has seen a little of it."""
     folder = tmp_path_factory.mktemp("ndc")
-    cameras = [dataclasses.replace(c, width=32, height=24, params=tuple(p * 32 / c.width for p in c.params)) for c in row()]
-    found = detect_forward_facing(cameras, depths(cameras))
-    assert not isinstance(found, str), found
-    (folder / "poses" / "images").mkdir(parents=True)
-    for camera in cameras:
-        origins, directions = rays(camera)
-        at = origins + directions * ((6.0 - origins[:, 1]) / directions[:, 1])[:, None]
-        colour = 0.5 + 0.4 * np.sin(at[:, [0, 2, 0]] * (1.0, 1.5, 2.0))
-        write_png(np.round(255 * colour).astype(np.uint8).reshape(camera.height, camera.width, 3), folder / "poses" / "images" / camera.name)
-    views = tuple(View(f"images/{c.name}", None, "test" if k == 0 else "train", c, c, 3.0, 40.0) for k, c in enumerate(cameras))
-    save(Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found), folder / "poses")
+    painted_wall(folder / "poses")
     train.run(job(folder / "train", settings(iterations=80, sample_batch_size=4096, occupancy_warmup_steps=10), poses=folder / "poses"))
     return {"poses": folder / "poses", "train": folder / "train" / "out"}
 
