@@ -164,7 +164,7 @@ def test_a_forward_facing_training_that_learns_is_left_alone(tmp_path: Path) -> 
     found = report(tmp_path)
     assert [check["learning"] for check in found["early_check"]] == [True]
     # Near planes and views are no priors of this space.
-    assert list(second_chances.candidates(scenes.load(folder), settings())) == [second_chances.AS_STATED, "exposure gains", "camera refinement"]
+    assert list(second_chances.candidates(scenes.load(folder), settings())) == [second_chances.AS_STATED, "exposure", "camera refinement"]
 
 
 def test_every_second_chance_of_a_contracted_scene_comes_to_a_figure(tmp_path: Path) -> None:
