@@ -137,7 +137,7 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
             features=features,
             matching=settings.matching,
             seed=settings.seed,
-            threads=feature_threads(job, sizes, settings.feature_image_size, features, count_cores()),
+            threads=feature_threads(job, sizes, settings.feature_image_size, features, count_cores(), networks=networks is not None),
             masks=masks,
             lens="perspective" if settings.lens == "equirectangular" else settings.lens,
             networks=networks,

@@ -69,7 +69,8 @@ def _poses(own: Any, sources: Sequence[Path]) -> Need:
             films.append(video.stored)
     count = len(pictures) or own.frames
     largest = max([*sizes, *films], key=lambda size: size[0] * size[1], default=(0, 0))
-    finding = features_needed([largest] * count, own.feature_image_size, given(own.max_features) or features_for(count), count_cores())
+    most, networks = given(own.max_features) or features_for(count), own.features_model != "off"
+    finding = features_needed([largest] * count, own.feature_image_size, most, count_cores(), networks=networks)
     needs = [finding, video_needed(films)]
     if own.mask_from == FOREGROUND:
         needs.append(first_training_needed(count, SIDE, FIRST, RAYS))

@@ -12,6 +12,7 @@ from stages.memory.need import IMAGING, MIB, Need, refuse_what_does_not_fit
 # Bytes. Of a pixel of the photograph that is decoded, turned, reduced and written; of a pixel of a photograph in which features are detected, on a thread
 # of its own (SIFT's first octave), four times as many where that is twice as large; of an image's descriptors while they are matched.
 DECODED, SIFT, DESCRIPTOR = 26, 80, 640
+NETWORK = 2400  # of a pixel of a picture in a network that detects features: ALIKED-T16 took 1,200, and the larger ones have twice its channels
 FRAME = 60  # of a pixel of a video: what its decoder keeps, 16 frames of 10 bits, and the frame that is looked at or written
 COLMAP = 200 * MIB  # the process in which structure from motion runs
 REMEDY = "Lower poses.feature_image_size, or reduce the largest photographs."
@@ -27,12 +28,15 @@ def video_needed(sizes: Sequence[tuple[int, int]]) -> Need:
     return Need({"frames of a video": FRAME * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
 
 
-def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int) -> Need:
+def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int, *, networks: bool = False) -> Need:
     """What it takes to find the cameras of photographs of these sizes.
 
     max_side  of the photographs in which features are detected, pixels
     features  of a photograph, at most
+    networks  whether photographs without a camera are matched by networks
     """
+    from stages.sfm.learned.matches import AT_ONCE
+    from stages.sfm.learned.networks import LONGEST
     from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
     from stages.sfm.pairs import BLOCK_SIZE
 
@@ -41,8 +45,9 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     decoded = decoding_needed(sizes).terms
     workers = min(threads, MAX_WORKERS)
     matching = workers * (COLMAP + 4 * BLOCK_SIZE * DESCRIPTOR * features) if workers > 1 and len(sizes) > 2 * BLOCK_SIZE else 0
+    in_networks = min(threads, AT_ONCE) * NETWORK * LONGEST**2 if networks else 0
     return Need({
-        "a photograph, or features, on each thread": max(decoded["a photograph"] * threads, SIFT * most * threads, matching),
+        "a photograph, or features, on each thread": max(decoded["a photograph"] * threads, SIFT * most * threads, matching, in_networks),
         "descriptors": DESCRIPTOR * features * len(sizes),
         "libraries": decoded["libraries"] + COLMAP,
     })  # fmt: skip
@@ -67,15 +72,15 @@ def reading_threads(job: Job, sizes: Sequence[tuple[int, int]], threads: int) ->
     return int(min(threads, max(1, room // max(1, needed["a photograph"]))))
 
 
-def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int) -> int:
+def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int, *, networks: bool = False) -> int:
     """On how many of the threads features are detected: as many as fit. Each image's features depend on that image alone. UsageError where one does not fit."""
     now = available_now()
     fewer = threads
     if job.memory is not None:
         room = job.memory.bytes if now is None else min(job.memory.bytes, now)
-        while fewer > 1 and features_needed(sizes, max_side, features, fewer).total > room:
+        while fewer > 1 and features_needed(sizes, max_side, features, fewer, networks=networks).total > room:
             fewer -= 1
-    refuse_what_does_not_fit(job, features_needed(sizes, max_side, features, fewer), REMEDY)
+    refuse_what_does_not_fit(job, features_needed(sizes, max_side, features, fewer, networks=networks), REMEDY)
     if fewer < threads:
         job.warn(
             f"features are detected on {fewer} of {threads} threads: more do not fit into memory. Give more by --memory, or lower poses.feature_image_size."

@@ -305,7 +305,7 @@ def forecast(
     if posed:
         seconds = {"poses_seconds": round(reading, 1), "poses_seconds_at_most": round(reading, 1)}
         return {**seconds, "poses_bytes": max(memory, int(decoding_needed(sizes).total)), "pairs": 0}
-    memory = max(memory, features_needed(sizes * -(-count // len(sizes)), side, features, threads).total)
+    memory = max(memory, features_needed(sizes * -(-count // len(sizes)), side, features, threads, networks=settings.features_model != "off").total)
     reduced = [working_size(*size, side) for size in sizes]
     pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
     how = ladder.matching_for(count) if settings.matching == "auto" else settings.matching

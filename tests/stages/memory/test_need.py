@@ -165,6 +165,9 @@ def test_features_are_detected_on_as_many_threads_as_fit(tmp_path: Path) -> None
     assert feature_threads(job(tmp_path, None), sizes, 4000, 4096, 16) == 16
     assert feature_threads(limited(job(tmp_path, None), room, events), sizes, 4000, 4096, 16) == 3
     assert "3 of 16 threads" in events[-1]["text"]
+    small = [(400, 300)] * 20
+    assert features_needed(small, 400, 256, 2, networks=True).total > features_needed(small, 400, 256, 1, networks=True).total > 2 * 2**30
+    assert features_needed(small, 400, 256, 8).total < 2 * 2**30
     assert features_needed([(900, 600)], 1600, 4096, 1).total > features_needed([(1000, 600)], 1600, 4096, 1).total  # detected at twice the size
 
 
