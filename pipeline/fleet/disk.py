@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline.links import WORK
 
-RESERVE = 64 * 2**20  # bytes that stay free: for fleet.json and its pages
+RESERVE, SCENE = 4 * 2**20, 4096  # bytes that stay free: for fleet.json and its pages, and of these for each scene, while they are replaced
 
 
 def free_space(fleet: Path) -> int:

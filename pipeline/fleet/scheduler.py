@@ -188,7 +188,8 @@ class Scheduler:
         if not need:
             return True
         running = [(self.fleet / other.state.run, other.space.get(str(other.task.request.get("stage")), 0)) for other in self._tasks.values() if other.task]
-        return disk.has_room(disk.free_space(self.fleet), (self.fleet / each.state.run, need), running)
+        free = disk.free_space(self.fleet) - disk.SCENE * len(self._all)
+        return disk.has_room(free, (self.fleet / each.state.run, need), running)
 
     def _order(self, each: Progress) -> tuple[bool, bool, int]:
         uses = each.what in self.stages and self.stages[each.what].uses_device

@@ -390,7 +390,7 @@ def test_stages_are_admitted_by_what_they_write(tmp_path: Path, monkeypatch: pyt
     found = run(tmp_path, workers, scenes(5))
     assert max(together) == 1
     assert [scene.state for scene in found.scenes] == ["done", "done", "failed", "done", "done"]
-    assert state_of(found, "s2").reason == f"train: writes about 6.0 GiB; 5.1 GiB are free in {tmp_path}. Make room, and go on."
+    assert state_of(found, "s2").reason == f"train: writes about 6.0 GiB; 5.0 GiB are free in {tmp_path}. Make room, and go on."
     monkeypatch.setattr(disk, "free_space", lambda fleet: disk.RESERVE + 7 * GIB)
     assert run(tmp_path, Simulated([Worker("a", 2)], answer), scenes(5), former=found).state == "done"
 

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Camera
+from pipeline.fleet import disk
 from stages.io.exporters.exr import write_exr
 from stages.io.png import write_png
 from stages.memory.disk import LEAST, space_needed
+from tests.workflows.cli.test_bad_input import blender
 from workflows.asset import STAGES
 
 DEFAULTS: dict[str, Any] = {stage.name: stage.settings() for stage in STAGES}
@@ -48,6 +50,32 @@ def test_a_video_needs_the_room_of_its_frames(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(bytes(10))
     assert space_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS) == one, "a folder with a video and its notes"
     assert space_needed("poses", tmp_path / "run", (clip,), {**DEFAULTS, "poses": dataclasses.replace(DEFAULTS["poses"], lens="equirectangular")}) > 6 * one
+
+
+def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
+    """No features are looked for, and none of the pictures is enlarged: a fleet of such scenes fits on a disk of 60 MB."""
+    blender(tmp_path / "source", 8)
+    needed = space_needed("poses", tmp_path / "run", (tmp_path / "source",), DEFAULTS)
+    pixels = 8 * 48 * 36
+    assert pixels < needed - LEAST < 4 * pixels
+    taken = {**DEFAULTS, "poses": dataclasses.replace(DEFAULTS["poses"], format="photographs", max_features=512)}
+    assert space_needed("poses", tmp_path / "run", (tmp_path / "source",), taken) >= needed + 8 * 512 * 300, "asked to find the cameras it looks for features"
+    assert disk.has_room(60 * 10**6, (tmp_path, needed), [(tmp_path, needed)], written=lambda _: 0)
+
+
+def test_points_and_gaussians_are_foretold_by_how_many_are_asked_for(tmp_path: Path) -> None:
+    for stage, setting, few, many in (("points", "num_points", 500, 10**6), ("splats", "count", 300, 10**6)):
+        needs = [space_needed(stage, tmp_path, (), {stage: dataclasses.replace(DEFAULTS[stage], **{setting: count})}) for count in (few, many)]
+        assert needs[0] < 2 * 2**20
+        assert 20 * (many - few) < needs[1] - needs[0] < 400 * (many - few)
+
+
+def test_a_checkpoint_that_no_step_reaches_is_not_foretold_but_for_an_interruption(tmp_path: Path) -> None:
+    short, long = (
+        space_needed("train", tmp_path, (), {"train": dataclasses.replace(DEFAULTS["train"], iterations=count, checkpoint_every=1000, log2_hashmap_size=12)})
+        for count in (500, 10_000)
+    )
+    assert 1.5 * short < long < 3 * short
 
 
 @pytest.mark.parametrize(("background", "channels"), [("auto", 3), ("transparent", 4)])
