@@ -20,7 +20,7 @@ from stages.evaluation.views import constant_background, evenly_spaced, ground_t
 from stages.io.scene import Scene, View, views_of
 from stages.verdict.result import ResultVerdict, camera_verdict_of, verdict_on_result
 
-TRAINING_VIEWS = 4  # that the asset is compared with, evenly spaced: enough to tell learned by heart from not learned
+TRAINING_VIEWS = 4  # that the asset is compared with, evenly spaced: enough to tell an overfit asset
 
 
 def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ MAX_CONTRADICTED of them; masks are the word of the user, or of a stage that has
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,8 +46,8 @@ class Prior:
     applied: bool
 
 
-def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job, without: Collection[str] = ()) -> tuple[Prior, ...]:
-    """Mask the density voxels of a scene's model by the priors that hold, but those of these names; a warning says which the sparse points refute."""
+def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> tuple[Prior, ...]:
+    """Mask the density voxels of a scene's model by the priors that hold; a warning says which the sparse points refute."""
     from stages.framing.view_coverage import kept_pixels
 
     if not m.space.contracted and all(view.mask is None for view in views):
@@ -55,7 +55,7 @@ def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job, without: C
     job.progress(0, m.settings.iterations, "computing view coverage")
     folder = job.inputs[PosesOutputs.stage]
     near, cameras = [view.near for view in views], [view.camera for view in views]
-    found = mask_cells_by(m, cameras, near, kept_pixels(folder, views), filled_points(folder, len(views)), without)
+    found = mask_cells_by(m, cameras, near, kept_pixels(folder, views), filled_points(folder, len(views)))
     for prior in found:
         if prior.contradicted > MAX_CONTRADICTED:
             job.warn(
@@ -66,7 +66,7 @@ def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job, without: C
 
 
 def mask_cells_by(
-    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None = None, without: Collection[str] = ()
+    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None = None
 ) -> tuple[Prior, ...]:
     """The same by the views' cameras and near planes, what their masks keep, and the reliable sparse points (F, 3)."""
     import torch
@@ -75,7 +75,7 @@ def mask_cells_by(
     from stages.framing.view_coverage import contradicted
 
     found = []
-    for name, cells in _cells_of_priors(m, cameras, near, masks, filled, without):
+    for name, cells in _cells_of_priors(m, cameras, near, masks, filled):
         against = 0.0 if name == MASKS or filled is None else contradicted(cells, m.space, filled)
         found.append(Prior(name, float(cells.mean()), against, against <= MAX_CONTRADICTED))
         if found[-1].applied:
@@ -84,17 +84,17 @@ def mask_cells_by(
 
 
 def _cells_of_priors(
-    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None, without: Collection[str]
+    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None
 ) -> Iterator[tuple[str, np.ndarray]]:
     """The names of the priors that a scene calls for, and the density voxels (D, D, D) bool that each masks."""
     from stages.framing.view_coverage import cells_before_near, cells_below_min_views, cells_without_view
 
     few, side = given(m.settings.min_views) if m.space.contracted else None, m.voxels.side
-    if few is not None and MIN_VIEWS not in without:
+    if few is not None:
         yield MIN_VIEWS, cells_below_min_views(m.space, cameras, few, side, masks)
-    if m.space.contracted and NEAR_PLANES not in without:
+    if m.space.contracted:
         yield NEAR_PLANES, cells_before_near(m.space, cameras, near, side, filled)
-    if masks is not None and MASKS not in without:
+    if masks is not None:
         yield MASKS, cells_without_view(m.space, cameras, side, masks)
 
 

@@ -32,7 +32,7 @@ FLOATERS, MANY_FLOATERS = 0.02, 0.15  # share of the asset's opacity, more than 
 SHORT = 0.5  # of the steps that are usual: a refinement with fewer comes before other causes
 AGREEING, LEAST_AGREEING = 0.6, 0.3  # share of the sparse points that the asset's depth agrees with
 MISSING, MOST_MISSING = 0.3, 0.6  # share of the subject's sparse points that the asset lies behind
-LEARNED_BY_HEART = 5.0  # dB of views that training saw over those it did not
+OVERFIT = 5.0  # dB of views that training saw over those it did not
 
 RUN = EvaluateOutputs.stage
 SHEET = f"{RUN}/{EvaluateOutputs.contact_sheet}"
@@ -228,7 +228,7 @@ def _cause(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: Came
     if cameras is not None and cameras.grade in ("poor", "failed"):
         return f"The cameras are {cameras.grade}: {cameras.sentence}", cameras.remedy, f"{PosesOutputs.stage}/{PosesOutputs.cameras}"
     train = figures["train_psnr"]
-    if train is not None and train - figures["psnr"] > LEARNED_BY_HEART:
+    if train is not None and train - figures["psnr"] > OVERFIT:
         cause = f"Views that training saw are right ({train:.1f} dB), and others not: too few photographs, cameras that are off, or something that moved."
         return cause, "Take more photographs between those that are there; try train.camera_refinement=on.", SHEET
     if points is not None and points["farther"] > MISSING:
