@@ -27,6 +27,7 @@ SAME = 1.5  # of 255, root mean square between two small pictures that are the s
 NOISY = 12.0  # of 255, standard deviation of noise that hides weak features; docs/experiments/sfm.md
 LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # their difference: of edges hardly anything is left
 BLOCK, LEAST_BLOCKS = 16, 9  # px; of a picture of fewer nothing is told
+LEAST_POINTS = 30  # that a photograph's exposure is judged by
 FLAT = 4.0  # of 255, standard deviation of a small picture that all others of its kind would be the same as
 
 
@@ -41,6 +42,7 @@ class Look:
     longest     px of the longest side, as far as it was looked at
     small       (16, 24) float32 levels
     compressed  whether it was compressed so strongly that its blocks show
+    over_points  `over_points`; None where that is not known
     """
 
     sharpness: float
@@ -50,6 +52,7 @@ class Look:
     longest: int
     small: np.ndarray
     compressed: bool = False
+    over_points: float | None = None
 
     def figures(self) -> dict[str, float | bool]:
         """As JSON has them."""
@@ -154,12 +157,31 @@ def blurred(looks: Mapping[str, Look]) -> list[str]:
     return sorted(name for name, each in looks.items() if each.sharpness < least)
 
 
+def over_points(grey: np.ndarray, pixels: np.ndarray, light: np.ndarray) -> float | None:
+    """Stops that a photograph is exposed longer than others are, by what it shows of points; None of fewer than LEAST_POINTS.
+
+    grey    (H, W) uint8, sRGB
+    pixels  (N, 2) where it shows the points
+    light   (N,) what photographs show of each on average, linear
+    """
+    height, width = grey.shape
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1) & (light > 0)
+    x, y = pixels[inside].astype(np.int64).T
+    own = grey[y, x]
+    tells = (own > CLIPPED[0]) & (own < CLIPPED[1])
+    if tells.sum() < LEAST_POINTS:
+        return None
+    return float(np.median(np.log2((own[tells] / 255.0) ** 2.2) - np.log2(light[inside][tells])))
+
+
 def of_other_exposure(looks: Mapping[str, Look]) -> list[str]:
-    """The names of those that are brighter or darker than the others."""
-    if not looks:
-        return []
-    middle = float(np.median([each.brightness for each in looks.values()]))
-    return sorted(name for name, each in looks.items() if abs(each.brightness - middle) > STEP)
+    """The names of those that are exposed longer or shorter than the others: by the points that they show, where half of them show enough; else by how bright
+    they are, which depends on what is in them, too."""
+    stops = {name: each.over_points for name, each in looks.items() if each.over_points is not None}
+    if 2 * len(stops) < len(looks):
+        stops = {name: each.brightness for name, each in looks.items()}
+    middle = float(np.median(list(stops.values()))) if stops else 0.0
+    return sorted(name for name, each in stops.items() if abs(each - middle) > STEP)
 
 
 def dark(looks: Mapping[str, Look]) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.geometry.cameras import project, resized
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
@@ -16,10 +17,12 @@ from stages.framing.captured import coverage
 from stages.io.capture import Capture
 from stages.io.importers.photographs import photographs
 from stages.io.importers.source import Source
+from stages.io.pictures import UnreadableImage, read_quality
 from stages.io.scene import Scene
 from stages.verdict import looks, pictures
 from stages.verdict.verdict import Verdict, verdict_on
 
+GREY = np.array([0.299, 0.587, 0.114])
 NOT_SAID = ("not registered", "folded", "parallax", "few")  # problems that the search for cameras has warned of, or that the user knows of
 
 
@@ -31,11 +34,15 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
     outputs = PosesOutputs(job.out)
     files = {view.name: job.out / view.image for view in scene.views} | {name: capture.rejected_files[name] for name in sorted(capture.rejected_files)}
     sources = {photo.camera.name: photo.image for photo in capture.photos}
+    points = _Points(capture)
     seen: dict[str, looks.Look] = {}
     for done, (name, path) in enumerate(files.items()):
         job.safe_point()
         job.progress(done, len(files), "looking at images")
-        seen |= looks.look_at_all({name: path}, sources)
+        with contextlib.suppress(UnreadableImage):
+            grey = looks.grey_of(path)
+            own = looks.look(grey, read_quality(sources.get(name, path)))
+            seen[name] = replace(own, over_points=points.stops_over(name, grey))
     found = verdict_on(capture, seen, in_folder=None if capture.kind == "photographs" or renders else _photographs_in_folder(job))
     found = replace(found, figures={**found.figures, "coverage": _coverage(scene)})
     write_json(outputs.verdict, found.document())
@@ -49,6 +56,30 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
         if problem.grade != "good" and problem.what not in NOT_SAID:
             warn(f"{problem.sentence} {problem.remedy}")
     return found
+
+
+class _Points:
+    """What the sparse points of a capture tell of its photographs' exposure: where each shows those that it observes, and how light they are on average."""
+
+    def __init__(self, capture: Capture) -> None:
+        self._numbers = {photo.camera.name: n for n, photo in enumerate(capture.photos)}
+        self._cameras = [photo.camera for photo in capture.photos]
+        self._observed: list[list[int]] = [[] for _ in capture.photos]
+        self._xyz, self._light = np.zeros((0, 3)), np.zeros(0)
+        if capture.points is not None and len(capture.points.rgb) and np.ptp(capture.points.rgb) > 0:  # else nobody knows their colours
+            self._xyz, self._light = capture.points.xyz, ((capture.points.rgb @ GREY) / 255.0) ** 2.2
+            for point, track in enumerate(capture.points.tracks):
+                for view in track:
+                    self._observed[view].append(point)
+
+    def stops_over(self, name: str, grey: np.ndarray) -> float | None:
+        """`looks.over_points` of a photograph (H, W) uint8; None where it has no camera, or no points."""
+        if name not in self._numbers or not len(self._xyz):
+            return None
+        number = self._numbers[name]
+        at = self._observed[number]
+        pixels = project(resized(self._cameras[number], grey.shape[1], grey.shape[0]), self._xyz[at])[0]
+        return looks.over_points(grey, np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0), self._light[at])
 
 
 def _coverage(scene: Scene) -> dict[str, float]:
