@@ -109,23 +109,27 @@ def open_checkpoint(folder: Path) -> Opened:
 
 
 def field_seeds() -> list[bytes]:
+    import torch
+
+    from efficientnerf.training.exposure.model import Exposure
     from stages.io.field_file import save_model
 
     t = _trainer()
+    exposure = Exposure(torch.zeros(2, 3), torch.zeros(1, 4), torch.zeros(2, dtype=torch.int64))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "field.safetensors"
-        save_model(t.model, 1.0, 5.0, path, {"images/a.png": np.ones(3), "images/b.png": np.ones(3)}, t.schedule)
+        save_model(t.model, 1.0, 5.0, path, (["images/a.png", "images/b.png"], exposure), t.schedule)
         return [path.read_bytes()]
 
 
 def open_field(folder: Path) -> Opened:
     from stages.artifacts import TrainOutputs
-    from stages.io.field_file import load_gains, load_renderer
+    from stages.io.field_file import load_exposure, load_renderer
 
     def read(data: bytes) -> None:
         TrainOutputs(folder).field.write_bytes(data)
         load_renderer(folder)
-        load_gains(folder)
+        load_exposure(folder)
 
     return Opened(read)
 
