@@ -24,6 +24,7 @@ TILE = 6  # cells along a side of a tile, whose colours are fitted by themselves
 NOISE = 0.02  # standard deviation of colours that means nothing
 LOW_CONTRAST = 0.5  # of the median contrast, which a photograph counts as having at least: a plain wall's noise is no error
 NEIGHBOURS = 8
+ROWS_AT_A_TIME = 256  # of a photograph
 RAYS_AT_A_TIME, SAMPLES_AT_A_TIME = 4096, 2**19  # the latter where nothing is pruned
 SPREAD = 0.2  # of the logarithm of neighbours' errors, at least: photographs of one thing differ by as much
 
@@ -42,9 +43,12 @@ class Cells:
     weight: tuple[np.ndarray, ...]
 
 
-def photograph(pixels: Pixels, view: int, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A training photograph (H, W, 3) in 0-1, float32, over the background (3,) where it has alpha, and (H, W) 1 where masks allow it, 0 elsewhere."""
-    begin, end, shape = int(pixels.offsets[view]), int(pixels.offsets[view + 1]), (int(pixels.height[view]), int(pixels.width[view]))
+def photograph(pixels: Pixels, view: int, background: np.ndarray, rows: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """A training photograph (H, W, 3) in 0-1, float32, over the background (3,) where it has alpha, and (H, W) 1 where masks allow it, 0 elsewhere; or some
+    rows of both, from the first to before the last."""
+    width, (first, last) = int(pixels.width[view]), rows or (0, int(pixels.height[view]))
+    begin, end = (int(pixels.offsets[view]) + row * width for row in (first, last))
+    shape = last - first, width
     image = np.asarray(pixels.images[begin:end], np.float32).reshape(*shape, -1) / 255
     usable = pixels.allowed_at(np.arange(begin, end)).reshape(shape).astype(np.float32)
     if image.shape[-1] == 4:
@@ -64,8 +68,16 @@ def cells_of(pixels: Pixels, background: np.ndarray) -> Cells:
     """The cells of training photographs, one of which is held at a time; `background` (3,) shows behind those with alpha."""
     count = int(np.clip(RAYS // len(pixels.width), MIN_CELLS, MAX_CELLS))
     size = tuple(max(1, int(np.ceil(np.sqrt(w * h / count)))) for w, h in zip(pixels.width.tolist(), pixels.height.tolist(), strict=True))
-    found = [averaged(*photograph(pixels, view, background), side) for view, side in enumerate(size)]
+    found = [_averaged_in_bands(pixels, view, background, side) for view, side in enumerate(size)]
     return Cells(size, tuple(colour for colour, _ in found), tuple(weight for _, weight in found))
+
+
+def _averaged_in_bands(pixels: Pixels, view: int, background: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """`averaged` of a photograph, of which some rows at a time are held as numbers: as bytes it may be large already."""
+    height, rows = int(pixels.height[view]), max(1, ROWS_AT_A_TIME // side) * side
+    last = height // side * side or height  # the rest fills no cell
+    bands = [averaged(*photograph(pixels, view, background, (row, min(row + rows, last))), side) for row in range(0, last, rows)]
+    return np.concatenate([colour for colour, _ in bands]), np.concatenate([weight for _, weight in bands])
 
 
 @torch.no_grad()

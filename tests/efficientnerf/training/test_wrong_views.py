@@ -15,6 +15,7 @@ from efficientnerf.training import loop
 from efficientnerf.training.camera_refinement import rotation_matrix, rotation_vector
 from efficientnerf.training.loop import Trainer, restore, state_of, trainer
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.view_checks import residuals
 from efficientnerf.training.view_checks.checks import (
     LOWEST,
     MIN_VIEWS,
@@ -295,3 +296,21 @@ def test_errors_do_not_depend_on_exposure_and_shifts_are_found() -> None:
     moved = turned(CAMERAS[0], np.array([5.0, -3.0]))
     at, _ = project(CAMERAS[0], (moved.centre + moved.forward)[None])
     np.testing.assert_allclose(at[0], [SIDE / 2 + 5, SIDE / 2 - 3], atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(300, 7), (5, 70), (64, 48)])
+def test_cells_are_the_same_of_a_photograph_as_of_bands_of_it(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    height, width = size
+    image = np.random.default_rng(0).integers(0, 255, (height, width, 4), np.uint8)
+    seen_by = Camera("a.png", width, height, "SIMPLE_PINHOLE", (50.0, width / 2, height / 2), np.eye(4))
+    pixels = Pixels([seen_by], [image], [image[..., 0] > 40], np.ones(1), np.full(1, 2.0))
+    monkeypatch.setattr(residuals, "MAX_CELLS", 100)
+    monkeypatch.setattr(residuals, "MIN_CELLS", 50)
+    every = residuals.cells_of(pixels, np.ones(3))
+    monkeypatch.setattr(residuals, "ROWS_AT_A_TIME", 1)
+    bands = residuals.cells_of(pixels, np.ones(3))
+    assert every.size == bands.size
+    assert every.size[0] > 1
+    for a, b in ((every.colour, bands.colour), (every.weight, bands.weight)):
+        np.testing.assert_array_equal(a[0], b[0])
+    assert every.weight[0].shape == residuals.middles(seen_by, every.size[0])[1]
