@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from efficientnerf.backends import kernel_cache
 from pipeline.errors import UsageError
 from workflows.asset import WORKFLOW
 from workflows.budget import MIN_BAKE, MIN_TRAIN, PHOTOGRAPHS_TRAIN_SHARE, TRAIN_SHARE, share_budget
@@ -89,3 +90,20 @@ def test_steps_that_a_budget_takes_the_place_of_are_told(source: Path, tmp_path:
     (one,) = told("train.iterations=5", "train.time_budget=40")
     assert one == "train.iterations has no effect: train.time_budget=40 s decides how many steps are taken. Give train.time_budget=off to use it."
     assert told("train.iterations=5", "bake.time_budget=40") == []
+
+
+@pytest.mark.parametrize(("memory", "compiled", "expected"), [("700m", False, 1), ("700m", True, 0), ("150m", False, 2), ("150m", True, 1), ("2g", False, 0)])
+def test_what_a_run_takes_whatever_its_limit_is_said_as_it_begins(
+    memory: str, compiled: bool, expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compiling kernels, and writing pages."""
+    source = tmp_path / "source"
+    source.mkdir()
+    (source / "a.jpg").write_bytes(b"x")
+    cache = tmp_path / "cache" / "kernels" / kernel_cache.key()
+    cache.mkdir(parents=True)
+    for number in range(kernel_cache.USUAL if compiled else 3):
+        (cache / f"{number}.nbi").touch()
+    monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr("pipeline.executors.memory.usable_memory", lambda *_: None)
+    assert len(plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny", memory=memory)).warnings) == expected

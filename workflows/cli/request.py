@@ -12,11 +12,15 @@ from pipeline.artifact import listed
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit, limit_for, parse_size, size_text
 from pipeline.run import MOST_SOURCES, NAME, Run
+from pipeline.stage import Stage
 from workflows.asset import Workflow
 from workflows.budget import share_budget
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, Table, read_config, read_preset, seconds_of, table_of
 from workflows.cli.target import check_names, open_run, resume_command
+
+# Bytes of a process beside what stages say: docs/experiments/memory.md
+COMPILING, PAGES = 1600 * 2**20, 300 * 2**20
 
 
 @dataclass(frozen=True)
@@ -127,6 +131,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
     warnings += _without_effect(settings, config, options)
     memory, limit = _memory(options.memory, standing, warnings)
+    warnings += _beyond(limit, workflow.stages)
     run = Run(
         path,
         sources[0] if sources else None,
@@ -194,6 +199,23 @@ def _memory(given: str | None, standing: Run | None, warnings: list[str]) -> tup
     if asked is not None and here is not None and asked > here.bytes:
         warnings.append(f"--memory {given}: {here.whose} leaves {size_text(here.bytes)}; what takes more may be ended by the system")
     return asked or recorded, limit
+
+
+def _beyond(limit: Limit | None, stages: Sequence[Stage]) -> list[str]:
+    """Warnings of what a run takes whatever its limit: to compile kernels, once for a machine, and to write its pages."""
+    from efficientnerf.backends.kernel_cache import are_compiled
+
+    if limit is None or not any(stage.uses_device for stage in stages):
+        return []
+    found = []
+    if limit.bytes < COMPILING and not are_compiled():
+        found.append(
+            f"{limit.whose}: {size_text(limit.bytes)}, and kernels are compiled in this run, once for this machine, which takes up to {size_text(COMPILING)}."
+            " Where that is too much, run a small scene (--preset tiny) with more memory first."
+        )
+    if limit.bytes < PAGES:
+        found.append(f"{limit.whose}: {size_text(limit.bytes)}, and writing the pages of a run takes up to {size_text(PAGES)}")
+    return found
 
 
 def _standing(path: Path) -> Run | None:
