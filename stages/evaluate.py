@@ -41,7 +41,7 @@ from stages.evaluation.judging import judge, training_figures
 from stages.evaluation.lpips_weights import find_weights, load_lpips
 from stages.evaluation.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
 from stages.evaluation.refinement import refinement_of
-from stages.evaluation.sparse_points import COUNTS, sure_points
+from stages.evaluation.sparse_points import COUNTS, observed_points
 from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
 from stages.evaluation.splats import EvaluatedSplats, load_splats
 from stages.evaluation.strips import STRIP_RAYS, strip_views, write_strips
@@ -163,7 +163,7 @@ def evaluate(
     rest = None if surrounded else stride_for([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
     composited = surrounded and constant_background(scene) is None
     perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in networks_of(settings)}
-    points = sure_points(job.inputs[PosesOutputs.stage], scene, asset.reach)
+    points = observed_points(job.inputs[PosesOutputs.stage], scene, asset.reach)
     taken = as_taken(job.inputs[TrainOutputs.stage])
     figures, others = [], [name for name, known in (("splats", splats), ("sparse_points", points)) if known is not None]
     for k, view in enumerate(views):
@@ -182,7 +182,7 @@ def evaluate(
         figures.append(measured)
     job.progress(len(views), len(views))
     strips = write_strips(asset, mesh, load_field, scene, views, strip_views(figures), job, warn, taken) if settings.strips == "on" else []
-    train = None if split == "train" else training_figures(asset, scene, job)
+    train = None if split == "train" else training_figures(asset, scene, job, taken)
     metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips, mesh=mesh.facts,
                       splats=None if splats is None else splats.facts, refinement=refinement, train=train)  # fmt: skip
     write_json(EvaluateOutputs(job.out).metrics, metrics)

@@ -27,7 +27,7 @@ from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.evaluation.asset import EvaluatedAsset, over_field, render_asset
 from stages.evaluation.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
-from stages.evaluation.sparse_points import SurePoints, counts_of, judged
+from stages.evaluation.sparse_points import ReliablePoints, counts_of, judged
 from stages.evaluation.splats import EvaluatedSplats, splats_image, splats_metrics
 from stages.evaluation.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluation.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
@@ -47,7 +47,7 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 def evaluate_view(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
-    perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: SurePoints | None = None,
+    perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: ReliablePoints | None = None,
     taken: Taken | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
@@ -132,7 +132,7 @@ def counting(truth: GroundTruth) -> np.ndarray:
     return used if truth.inside is None else used & truth.inside
 
 
-def against_points(points: SurePoints, scene: Scene, view: View, depth: np.ndarray, truth: GroundTruth) -> dict[str, int]:
+def against_points(points: ReliablePoints, scene: Scene, view: View, depth: np.ndarray, truth: GroundTruth) -> dict[str, int]:
     """COUNTS of the view's sparse points."""
     _, kinds, subject = judged(points, scene.views.index(view), view.camera, depth, counting(truth))
     return counts_of(kinds, subject)

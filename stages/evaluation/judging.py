@@ -12,20 +12,24 @@ from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs, PosesOutputs
 from stages.evaluation import sparse_points
 from stages.evaluation.asset import EvaluatedAsset, render_asset
-from stages.evaluation.comparison import clipped, compare, counting, trivial
-from stages.evaluation.sparse_points import SurePoints
+from stages.evaluation.comparison import as_shown, compare, counting, trivial
+from stages.evaluation.sparse_points import ReliablePoints
 from stages.evaluation.summary import means
 from stages.evaluation.trivial import equivalent_blur
 from stages.evaluation.views import constant_background, evenly_spaced, ground_truth
 from stages.io.scene import Scene, View, views_of
+from stages.training.averaged import Taken
 from stages.verdict.result import ResultVerdict, camera_verdict_of, verdict_on_result
 
 TRAINING_VIEWS = 4  # that the asset is compared with, evenly spaced: enough to tell an overfit asset
 
 
-def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job) -> dict[str, Any] | None:
+def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job, taken: Taken | None = None) -> dict[str, Any] | None:
     """The asset on some views that training saw: means of PSNR, SSIM and PSNR with fitted colours, and the median of `equivalent_blur`. None where it does not
-    show by itself all that a photograph shows, and where there are no such views."""
+    show by itself all that a photograph shows, and where there are no such views.
+
+    taken  `stages.training.averaged.as_taken`
+    """
     views = views_of(scene, "train")
     if constant_background(scene) is None and asset.inner is None:
         return None
@@ -36,7 +40,7 @@ def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job) -> dict[str,
         flat = trivial(truth)
         if flat is None:
             continue
-        image = clipped(render_asset(asset, scene, views[k], None, 1)[0], job, f"{views[k].name}: the asset")
+        image = as_shown(job, views[k], taken, render_asset(asset, scene, views[k], None, 1)[0], "the asset")
         found = compare(image, truth, None)
         figures.append(found)
         blurs.append(equivalent_blur(found["psnr_colour_fitted"] or -math.inf, flat["blurred"]))
@@ -44,7 +48,7 @@ def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job) -> dict[str,
     return {**means(figures, names), "blur": statistics.median(blurs), "views": len(figures)} if figures else None
 
 
-def judge(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: SurePoints | None, metrics: Mapping[str, Any], job: Job) -> ResultVerdict:
+def judge(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints | None, metrics: Mapping[str, Any], job: Job) -> ResultVerdict:
     """Write the verdict on a result and the picture of its sparse points; say it, and warn of what stands against it."""
     outputs = EvaluateOutputs(job.out)
     if points is not None:
@@ -66,7 +70,7 @@ def _read(job: Job) -> Any:
         return None
 
 
-def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: SurePoints, metrics: Mapping[str, Any], job: Job) -> None:
+def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints, metrics: Mapping[str, Any], job: Job) -> None:
     """Of the view whose points agree least with the asset's depth."""
     from stages.io.png import write_png
 

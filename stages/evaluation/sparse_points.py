@@ -20,7 +20,6 @@ from efficientnerf.geometry.cameras import Camera, project
 from stages.io.scene import Scene
 
 TOLERANCE = 0.05  # of a point's depth; docs/experiments/verdict.md
-MIN_OBSERVERS, MAX_ERROR = 3, 1.0  # photographs; px of reprojection error: points that are where they are said to be
 FEW = 30  # points of all views together, below which nothing is said
 NEARER, AGREES, FARTHER = -1, 0, 1
 COUNTS = ("points", "nearer", "farther", "subject_points", "subject_farther")  # of a view
@@ -29,8 +28,8 @@ DOT = 2  # px, radius of a point in the picture
 
 
 @dataclass(frozen=True, eq=False)
-class SurePoints:
-    """Points that are sure, and who sees them.
+class ReliablePoints:
+    """Reliable points (`stages.framing.near_planes.reliable_points`), and who sees them.
 
     xyz        (P, 3) training frame
     counts     (P,) how many views see each
@@ -51,29 +50,30 @@ class SurePoints:
         return found
 
 
-def sure_points(folder: Path, scene: Scene, reach: np.ndarray | None) -> SurePoints | None:
+def observed_points(folder: Path, scene: Scene, reach: np.ndarray | None) -> ReliablePoints | None:
     """Those of a scene; None where there are none, or nobody knows who sees them.
 
     reach  (2, 3) beyond which the asset has no density; None: the scene bounds, or of a forward-facing scene nothing
     """
+    from stages.framing.near_planes import reliable_points
     from stages.io.scene import read_points
 
-    if not scene.points:
+    points = read_points(folder) if scene.points else None
+    if points is None or not any(points.tracks):
         return None
-    points = read_points(folder)
-    counts = np.array([len(set(track)) for track in points.tracks], np.int64)
     inside = ((points.xyz >= scene.bounds[0]) & (points.xyz <= scene.bounds[1])).all(1)
     reached = np.ones(len(inside), bool) if scene.forward is not None else inside
     if reach is not None and scene.forward is None:
         reached = ((points.xyz >= reach[0]) & (points.xyz <= reach[1])).all(1)
-    sure = (counts >= MIN_OBSERVERS) & ~(points.error > MAX_ERROR) & reached  # an error that nobody knows is none
-    if not sure.any():
+    kept = np.flatnonzero(reliable_points(points, len(scene.views)) & reached)
+    if not len(kept):
         return None
-    observers = np.array([view for track, kept in zip(points.tracks, sure, strict=True) if kept for view in sorted(set(track))], np.int64)
-    return SurePoints(points.xyz[sure], counts[sure], observers, inside[sure])
+    tracks = [sorted(set(points.tracks[n])) for n in kept]
+    observers = np.array([view for track in tracks for view in track], np.int64)
+    return ReliablePoints(points.xyz[kept], np.array([len(track) for track in tracks], np.int64), observers, inside[kept])
 
 
-def judged(points: SurePoints, view: int, camera: Camera, depth: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def judged(points: ReliablePoints, view: int, camera: Camera, depth: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the points that a view sees in pixels that count: (N, 2) their pixels, (N,) NEARER, AGREES or FARTHER, (N,) bool whether they are of the subject.
 
     view   its place in the scene

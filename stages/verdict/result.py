@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
-from stages.evaluation.trivial import equivalent_blur
+from stages.evaluation.trivial import BLURS, equivalent_blur
 from stages.io.importers.source import abbreviated
 from stages.verdict.grades import GRADES
 
@@ -102,7 +102,8 @@ class ResultVerdict:
 
 def blur_in_words(blur: float) -> str:
     """What a PSNR amounts to."""
-    return f"as near to the photographs as these are after a blur of {100 * blur:.1f} % of their longest side"
+    at_most = "at most " if blur <= BLURS[0] else ""
+    return f"as near to the photographs as these are after a blur of {at_most}{100 * blur:.2f} % of their longest side"
 
 
 def verdict_on_result(metrics: Mapping[str, Any], cameras: CameraVerdict | None = None) -> ResultVerdict:
@@ -205,7 +206,7 @@ def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras
             sentence += f" {figures['mean_colour']:.1f} dB."
         else:
             sentence = f"The asset's pictures are {'strongly ' if grade == 'poor' else ''}blurred: {figures['psnr']:.1f} dB on {figures['views']},"
-            sentence += f" {blur_in_words(blur)}."
+            sentence += f" {blur_in_words(blur)}, where captures that went well have {100 * USABLE_BLUR:.2f} % at most."
         found.append(ResultProblem("pictures", grade, sentence, *_cause(metrics, figures, cameras, strip)))
     off = figures["psnr_colour_fitted"] - figures["psnr"]
     if grade in ("good", "usable") and off > COLOURS_OFF:
