@@ -14,7 +14,7 @@ from pipeline.fleet import disk
 from stages.io.exporters.exr import write_exr
 from stages.io.png import write_png
 from stages.memory.disk import LEAST, space_needed
-from tests.workflows.cli.test_bad_input import blender
+from tests.stages.captures import HEIGHT, WIDTH, cameras, nerfstudio
 from workflows.asset import STAGES
 
 DEFAULTS: dict[str, Any] = {stage.name: stage.settings() for stage in STAGES}
@@ -54,9 +54,9 @@ def test_a_video_needs_the_room_of_its_frames(tmp_path: Path) -> None:
 
 def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
     """No features are looked for, and none of the pictures is enlarged: a fleet of such scenes fits on a disk of 60 MB."""
-    blender(tmp_path / "source", 8)
+    nerfstudio(tmp_path / "source", cameras(8))
     needed = space_needed("poses", tmp_path / "run", (tmp_path / "source",), DEFAULTS)
-    pixels = 8 * 48 * 36
+    pixels = 8 * WIDTH * HEIGHT
     assert pixels < needed - LEAST < 4 * pixels
     taken = {**DEFAULTS, "poses": dataclasses.replace(DEFAULTS["poses"], format="photographs", max_features=512)}
     assert space_needed("poses", tmp_path / "run", (tmp_path / "source",), taken) >= needed + 8 * 512 * 300, "asked to find the cameras it looks for features"
