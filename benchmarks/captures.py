@@ -46,8 +46,8 @@ KINDS = ("network", "asset", "mesh", "splats")
 WORSE = 0.1  # dB, that an asset may lose by a change of a default
 PANELS = (0, 2, 3)  # photograph, asset and mesh of a strip's four pictures
 LONGEST, MOST_BYTES = 300, 44_000  # px of a picture's longest side; of the file: all thirteen stay under 600 kB
-COLUMNS = ("set", "cameras", "photographs", "off the reference %", "result", "network dB", "asset dB", "SSIM", "mesh dB", "splats dB", "holes %", "floaters %",
-           "minutes", "peak MiB", "asset MB", "preset", "steps")  # fmt: skip
+COLUMNS = ("set", "cameras", "photographs", "off the reference %", "training", "result", "network dB", "asset dB", "SSIM", "mesh dB", "splats dB", "holes %",
+           "floaters %", "minutes", "peak MiB", "asset MB", "preset", "steps")  # fmt: skip
 
 
 def sources_of(sets: Sequence[str], paths: Sequence[Path], data: Path) -> dict[str, Path]:
@@ -79,6 +79,8 @@ def row_of(run: Path, reference: Path | None = None) -> dict[str, Any]:
     return {
         "preset": read_where_there(run / RUN_FILE).get("preset"),
         "iterations": train.get("iterations"),
+        "refuted_priors": sorted(name for name, prior in train.get("priors", {}).items() if not prior["applied"]),
+        "second_chance": train.get("chosen"),
         "missing": [stage for stage in STAGES if stage not in manifests],
         "cameras": cameras,
         "photographs": len(read_where_there(PosesOutputs.of_run(run).report).get("registered", ())) or None,
@@ -106,7 +108,12 @@ def verdict_of(run: Path, stage: str) -> dict[str, Any] | None:
         return None
     verdict = read_json(found[0])
     counts = {key: verdict[key] for key in ("registered", "photographs") if isinstance(verdict.get(key), int)}
-    return {"grade": verdict["grade"], "problems": [problem["what"] for problem in verdict.get("problems", ())], **counts}
+    return {
+        "grade": verdict["grade"],
+        "summary": verdict.get("summary", ""),
+        "problems": [problem["what"] for problem in verdict.get("problems", ())],
+        **counts,
+    }
 
 
 def percent_off(run: Path, reference: Path) -> float | None:
@@ -167,6 +174,7 @@ def cells_of(name: str, row: Mapping[str, Any]) -> list[str]:
         _graded(cameras),
         "" if registered is None else f"{registered}" if given is None else f"{registered} of {given}",
         shown(row["percent_off_reference"], 2),
+        ", ".join([*(f"{name} refuted" for name in row["refuted_priors"]), *([f"second chance: {row['second_chance']}"] if row["second_chance"] else [])]),
         f"**{row['error']}**".replace("|", "/").replace("\n", " ") if row.get("error") else _graded(result),
         shown(row["network"]["psnr"], 2),
         shown(row["asset"]["psnr"], 2),

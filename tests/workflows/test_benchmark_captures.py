@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,53 +15,93 @@ from benchmarks import captures as benchmark
 from stages.figures.plots import contact_sheet
 from tests.stages import captures
 
-TINY = ["--preset", "tiny", "--iterations", "8", "--set", "bake.refine_steps=1", "--set", "evaluate.captured_path_frames=2"]
+TINY = ["--preset", "tiny", "--iterations", "8", "--set", "bake.refine_steps=1", "--set", "evaluate.captured_path_frames=2", "--set", "turntable.frames=1"]
 
 
-def test_runs_a_failure_and_what_is_not_run_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source, empty, out, runs = captures.nerfstudio(tmp_path / "source"), tmp_path / "empty", tmp_path / "out", tmp_path / "runs"
-    empty.mkdir()
-    where = ["--out", str(out), "--data", str(tmp_path)]
-    one_frame = [*TINY, "--set", "turntable.frames=1"]
-    assert benchmark.main([str(source), str(empty), "--runs", str(runs), *where, *one_frame]) == 1
-    rows = json.loads((out / "captures.json").read_text())["rows"]
-    metrics = json.loads((runs / "source/evaluate/metrics.json").read_text())
-    good, bad = rows["source"], rows["empty"]
-    assert (good["error"], good["missing"], good["preset"], good["iterations"]) == (None, [], "tiny", 8)
-    assert [good[kind]["psnr"] for kind in ("network", "asset", "mesh")] == [metrics[kind]["psnr"] for kind in ("network", "asset", "mesh")]
-    assert (good["holes"], good["floaters"]) == (metrics["holes"], metrics["floaters"])
-    assert set(good["seconds"]) == set(good["peak_mib"]) == set(benchmark.STAGES)
-    assert good["asset_bytes"] == (runs / "source/bake/asset.nerftree").stat().st_size
-    assert good["cameras"]["grade"]
-    assert benchmark.percent_off(runs / "source", source / "transforms.json") == pytest.approx(0, abs=0.01)
-    assert bad["error"].startswith("exit code 2")
-    assert bad["asset"]["psnr"] is None
-    lines = [line for line in (out / "captures.md").read_text().splitlines() if line.startswith("|")]
+def rows_of(out: Path) -> dict[str, Any]:
+    rows: dict[str, Any] = json.loads((out / "captures.json").read_text())["rows"]
+    return rows
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run of a source, whose table is in out/."""
+    folder = tmp_path_factory.mktemp("captures")
+    captures.nerfstudio(folder / "source")
+    assert benchmark.main([str(folder / "source"), "--runs", str(folder / "runs"), "--out", str(folder / "out"), "--data", str(folder), *TINY]) == 0
+    return folder
+
+
+def test_a_row_is_what_the_run_says(made: Path) -> None:
+    row, run = rows_of(made / "out")["source"], made / "runs/source"
+    metrics = json.loads((run / "evaluate/metrics.json").read_text())
+    assert (row["error"], row["missing"], row["preset"], row["iterations"]) == (None, [], "tiny", 8)
+    assert [row[kind]["psnr"] for kind in ("network", "asset", "mesh")] == [metrics[kind]["psnr"] for kind in ("network", "asset", "mesh")]
+    assert (row["holes"], row["floaters"]) == (metrics["holes"], metrics["floaters"])
+    assert set(row["seconds"]) == set(row["peak_mib"]) == set(benchmark.STAGES)
+    assert row["asset_bytes"] == (run / "bake/asset.nerftree").stat().st_size
+    for grade, stage in ((row["cameras"]["grade"], "poses"), (row["result"]["grade"], "evaluate")):
+        assert grade == json.loads((run / stage / "verdict.json").read_text())["grade"]
+    assert benchmark.percent_off(run, made / "source/transforms.json") == pytest.approx(0, abs=0.01)
+    assert (made / "out" / row["picture"]).stat().st_size <= benchmark.MOST_BYTES
+
+
+def test_a_source_that_fails_has_a_row_and_the_others_stay(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / "out", tmp_path / "out")
+    (tmp_path / "empty").mkdir()
+    assert benchmark.main([str(tmp_path / "empty"), "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), *TINY]) == 1
+    rows = rows_of(tmp_path / "out")
+    assert rows["source"] == rows_of(made / "out")["source"]
+    assert rows["empty"]["error"].startswith("exit code 2")
+    assert rows["empty"]["asset"]["psnr"] is None
+    lines = [line for line in (tmp_path / "out/captures.md").read_text().splitlines() if line.startswith("|")]
     assert len(lines) == 4
     assert {line.count("|") for line in lines} == {len(benchmark.COLUMNS) + 1}
-    assert (out / good["picture"]).stat().st_size <= benchmark.MOST_BYTES
 
-    capsys.readouterr()
-    shutil.rmtree(source)
-    assert benchmark.main([str(source), "--runs", str(runs), *where, *one_frame]) == 0  # its row is of this code and these options
-    assert "measured before" in capsys.readouterr().out
-    assert json.loads((out / "captures.json").read_text())["rows"] == rows
-    assert benchmark.main([str(source), "--runs", str(runs), *where, *TINY, "--set", "turntable.frames=2"]) == 0  # goes on from the poses
-    again = json.loads((out / "captures.json").read_text())["rows"]
-    assert again["source"]["options"] != good["options"]
-    assert again["empty"] == bad
 
-    verdict = {"grade": "poor", "problems": [{"what": "fog"}]}
-    (runs / "source/evaluate/verdict.json").write_text(json.dumps(verdict))
-    tabulated = tmp_path / "tabulated"
-    assert benchmark.main([str(source), "--from", str(runs), "--out", str(tabulated), "--before", str(out / "captures.json")]) == 0
-    row = json.loads((tabulated / "captures.json").read_text())["rows"]["source"]
-    assert row["asset"] == good["asset"]
-    assert row["result"] == {"grade": "poor", "problems": ["fog"]}
-    assert "poor (fog)" in (tabulated / "captures.md").read_text()
-    again["source"]["asset"]["psnr"] += 0.2
-    (out / "captures.json").write_text(json.dumps({"rows": again}))
-    assert benchmark.main([str(source), "--from", str(runs), "--out", str(tabulated), "--before", str(out / "captures.json")]) == 1
+def test_what_is_measured_before_is_not_run_again(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[tuple[str, ...]] = []
+    monkeypatch.setattr(benchmark, "run_capture", lambda source, run, options: ran.append(tuple(options)))
+    where = [str(made / "source"), "--runs", str(made / "runs"), "--data", str(made)]
+    shutil.copytree(made / "out", made / "again")
+    assert benchmark.main([*where, "--out", str(made / "again"), *TINY]) == 0
+    assert not ran
+    assert benchmark.main([*where, "--out", str(made / "again"), *TINY, "--set", "turntable.frames=2"]) == 0
+    assert [options[-1] for options in ran] == ["turntable.frames=2"]
+    assert rows_of(made / "again")["source"]["options"] != rows_of(made / "out")["source"]["options"]
+
+
+def test_a_run_goes_on_from_its_poses_without_the_photographs(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / "runs/source", tmp_path / "source")
+    settings = json.loads((tmp_path / "source/run.json").read_text())
+    assert str(made / "source") in json.dumps(settings)
+    (made / "source").rename(made / "elsewhere")
+    try:
+        assert benchmark.run_capture(made / "source", tmp_path / "source", ["--set", "turntable.frames=2"]) is None
+    finally:
+        (made / "elsewhere").rename(made / "source")
+    assert len(list((tmp_path / "source/turntable").glob("frame_*.png"))) == 2
+
+
+def test_existing_runs_are_tabulated_and_compared(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / "runs", tmp_path / "runs")
+    run, before = tmp_path / "runs/source", tmp_path / "before.json"
+    (run / "evaluate/verdict.json").write_text(json.dumps({"grade": "poor", "summary": "Fog.", "problems": [{"what": "fog"}]}))
+    report = json.loads((run / "train/report.json").read_text())
+    report |= {"priors": {"near_planes": {"applied": False}, "min_views": {"applied": True}}, "chosen": "exposure"}
+    (run / "train/report.json").write_text(json.dumps(report))
+    rows = rows_of(made / "out")
+    arguments = [str(made / "source"), "--from", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), "--before", str(before)]
+    for gain, code in ((0.05, 0), (0.2, 1)):
+        worse = json.loads(json.dumps(rows))
+        worse["source"]["asset"]["psnr"] += gain
+        before.write_text(json.dumps({"rows": worse}))
+        assert benchmark.main(arguments) == code
+    row = rows_of(tmp_path / "out")["source"]
+    assert row["asset"] == rows["source"]["asset"]
+    assert row["result"] == {"grade": "poor", "summary": "Fog.", "problems": ["fog"]}
+    assert (row["refuted_priors"], row["second_chance"]) == (["near_planes"], "exposure")
+    assert "poor (fog)" in (tmp_path / "out/captures.md").read_text()
 
 
 def test_a_picture_is_photograph_asset_and_mesh_of_the_median_view(tmp_path: Path) -> None:
