@@ -123,13 +123,14 @@ def check(c: ViewChecks, m: Model, pixels: Pixels, observed: Observations | None
     c.done += 1
     if last and not c.left_out.any():
         return False
-    before = c.left_out.copy(), c.replaced.copy(), c.pose.copy()
+    before = c.left_out.copy(), c.cameras
     now = _Look.at(c, m, pixels)
     for view in np.flatnonzero(c.left_out):
         _judge_again(c, now, int(view), pixels)
     if not last:
         _leave_out(c, now, pixels, observed, number)
-    return not all(np.array_equal(a, b) for a, b in zip(before, (c.left_out, c.replaced, c.pose), strict=True))
+    same = all(np.array_equal(a.world_from_camera, b.world_from_camera) for a, b in zip(before[1], c.cameras, strict=True))
+    return not (same and np.array_equal(before[0], c.left_out))
 
 
 def follow_checks(c: ViewChecks, pixels: Pixels, corrections: CameraCorrections | None) -> None:
