@@ -266,4 +266,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=8, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True, check=check)
+STAGE = Stage(name="evaluate", version=9, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True, check=check)

@@ -58,5 +58,5 @@ def test_the_wheel_makes_an_asset_where_it_is_installed(wheel: Path, tmp_path: P
     assert all(name.startswith(str(packages)) for name in where.split())
     run = tmp_path / "run"
     call(place / "bin" / "enerf", "run", ROOT / "examples" / "still_life", "--preset", "tiny", "--out", run, cwd=tmp_path, env=environment)
-    for name in ("bake/asset.nerftree", "mesh/mesh.glb", "points/points.ply", "turntable/turntable.mp4", "report.html"):
+    for name in ("bake/asset.nerftree", "mesh/mesh.glb", "points/points.ply", "turntable/turntable.mp4", "evaluate/verdict.json", "report.html"):
         assert (run / name).stat().st_size > 0

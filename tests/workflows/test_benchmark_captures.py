@@ -42,6 +42,8 @@ def test_a_row_is_what_the_run_says(made: Path) -> None:
     assert row["asset_bytes"] == (run / "bake/asset.nerftree").stat().st_size
     for grade, stage in ((row["cameras"]["grade"], "poses"), (row["result"]["grade"], "evaluate")):
         assert grade == json.loads((run / stage / "verdict.json").read_text())["grade"]
+    assert row["result"]["grade"] in ("poor", "failed"), "after eight steps"
+    assert all((run / problem["picture"]).is_file() for problem in json.loads((run / "evaluate/verdict.json").read_text())["problems"])
     assert benchmark.percent_off(run, made / "source/transforms.json") == pytest.approx(0, abs=0.01)
     assert (made / "out" / row["picture"]).stat().st_size <= benchmark.MOST_BYTES
 
