@@ -7,7 +7,9 @@ other maps confirm it. Their number is bounded, whatever the number of maps. C p
 
 from __future__ import annotations
 
+import contextlib
 import io
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +30,7 @@ MAX_LOOKUPS = 4_000_000  # points times maps that they are looked up in
 MAX_MAPS = 1000  # that are used, evenly over the photos
 MAX_EXR = 4096  # pixels a side
 LARGEST_EXR = 64 << 20  # bytes
+MOST_CHANNELS, MOST_DECODED = 16, 4 * 4 * MAX_EXR**2  # a pass of depth, beside colour and others; bytes of all
 MAX_SIDE = 512  # pixels of a map; larger ones are thinned
 MIN_TRACK = 3  # photos that agree; fewer and training does not use the point
 MAX_TRACK = 16  # photos that a point is registered in: neighbours in a video see it alike
@@ -114,17 +117,25 @@ def _exr(path: Path) -> np.ndarray:
     """(H, W) float32, the one channel of an OpenEXR file, or its R, Y or Z. Raises UnreadableImage."""
     import OpenEXR
 
-    data = read_bytes(path, LARGEST_EXR)
+    data, said = read_bytes(path, LARGEST_EXR), io.StringIO()
     try:
-        low, high = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()["dataWindow"]
-        width, height = (int(end) - int(begin) + 1 for begin, end in zip(low, high, strict=True))
-        if not (0 < width <= MAX_EXR and 0 < height <= MAX_EXR):
-            raise UnreadableImage(f"{width}x{height} pixels; at most {MAX_EXR} a side are read")
-        channels = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0).channels()
+        with contextlib.redirect_stdout(said):  # it prints what is wrong with a file
+            file = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0)
+            low, high = file.header()["dataWindow"]
+            width, height = (int(end) - int(begin) + 1 for begin, end in zip(low, high, strict=True))
+            if not (0 < width <= MAX_EXR and 0 < height <= MAX_EXR):
+                raise UnreadableImage(f"{width}x{height} pixels; at most {MAX_EXR} a side are read")
+            parts, count = len(file.parts), len(file.header()["channels"])  # all are decoded, and next to nothing of a file can stand for each
+            if parts > 1 or count > MOST_CHANNELS or 4 * count * width * height > MOST_DECODED:
+                raise UnreadableImage(f"{width}x{height} pixels in {count} channels and {parts} parts; at most {MOST_CHANNELS} channels of one part are read")
+            channels = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0).channels()
         name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
         pixels = np.asarray(channels[name].pixels)
     except (RuntimeError, ValueError, TypeError, KeyError, StopIteration) as error:
         raise UnreadableImage(f"unreadable: no OpenEXR file, or damaged ({printable(error, 80)})") from error
+    finally:
+        if said.getvalue():
+            logging.getLogger("OpenEXR").warning(printable(said.getvalue(), 300))
     if pixels.shape != (height, width) or pixels.dtype.kind not in "fiu":
         raise UnreadableImage("unreadable: no channel of as many pixels as the file has")
     return pixels

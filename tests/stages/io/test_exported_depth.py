@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from efficientnerf.geometry.cameras import Camera, project
 from pipeline.stage import Job
 from stages import poses
 from stages.io import importers, scene
+from stages.io.importers import depth
+from stages.io.pictures import UnreadableImage
 from stages.training.data import sparse_depth_of
 from tests.stages import captures, exports
 from tests.stages.captures import Settings
@@ -115,6 +118,31 @@ def test_record3ds_depth(tmp_path: Path) -> None:
     assert found.points is not None
     assert all(3 not in track for track in found.points.tracks)
     assert any("1 of 6 depth maps are not used, e.g. 3.exr: unreadable" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize(("channels", "side"), [(60, 40), (12, 3000), (1, 5000)])
+def test_an_exr_of_many_pixels_is_refused_before_they_are_decoded(channels: int, side: int, tmp_path: Path) -> None:
+    """60 channels of nothing were 550 kB, 570 MB of memory and five seconds."""
+    openexr = pytest.importorskip("OpenEXR")
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    empty = np.zeros((side, side), np.float16)
+    openexr.File(header, {f"c{number:02}": empty for number in range(channels)}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(UnreadableImage, match="pixels"):
+        depth._exr(tmp_path / "a.exr")
+
+
+def test_an_exr_that_is_cut_short_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The library prints to standard output, where --json has objects alone."""
+    openexr = pytest.importorskip("OpenEXR")
+    path = tmp_path / "a.exr"
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    openexr.File(header, {"R": np.random.default_rng(0).random((64, 64), np.float32)}).write(str(path))
+    data = path.read_bytes()
+    for end in range(300, len(data), len(data) // 7):
+        path.write_bytes(data[:end])
+        with contextlib.suppress(UnreadableImage):
+            depth._exr(path)
+    assert not capfd.readouterr().out
 
 
 def test_points_of_depth_supervise_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -211,6 +211,8 @@ HOSTILE: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "no Gaussian": (".spz", lambda whole: spz(3, 0, 0, b""), "hold none"),
     "four thousand million": (".spz", lambda whole: spz(3, 2**32 - 1, 0, bytes(20)), "4294967295 Gaussians"),
     "a bomb": (".spz", lambda whole: spz(3, 1, 0, bytes(10_000_000)), "goes on after"),
+    "a bomb behind the Gaussians": (".spz", lambda whole: spz(3, 1, 0, bytes(20_000_000), flags=2), "goes on after"),
+    "two million Gaussians of nothing": (".spz", lambda whole: spz(3, 2_000_000, 0, bytes(40_000_000)), "not as many"),
     "a wrong checksum": (".spz", lambda whole: whole[:-8] + b"abcd" + whole[-4:], "gzip"),
     "no room for the table": (".spz", lambda whole: spz4(table=2**31), "table of 6 streams"),
     "too few streams": (".spz", lambda whole: spz4(streams=1), "table of 1 streams"),

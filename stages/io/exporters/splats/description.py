@@ -28,6 +28,7 @@ from stages.io.meshes.ply import MAX_HEADER, TYPES
 
 MAX_GLTF_JSON = 2**24  # bytes; of Gaussians it takes a few thousand
 DENSEST = 1032  # bytes that one byte of deflate, or of a zstd frame as SPZ writes them, can stand for
+FEW, USUAL = 2**20, 64  # Gaussians that any file may hold; and bytes that one byte stands for in larger ones at most: those of scenes have 3
 SPZ_DEGREES = range(5)
 STREAMS = 6  # of SPZ 4, at least: places, opacities, colours, scales, rotations, harmonics
 _PLY_NAMES = {*"xyz", *(f"{name}_{k}" for name, count in (("f_dc", 3), ("scale", 3), ("rot", 4)) for k in range(count)), "opacity"}
@@ -196,7 +197,7 @@ def _spz4(file: BinaryIO, size: int) -> _Found:
 def _spz_header(version: int, count: int, degree: int, bits: int, flags: int, size: int) -> _Found:
     if degree not in SPZ_DEGREES or bits > 24:
         raise Damaged(f"harmonics of degree {degree} and {bits} fractional bits; expected a degree of 0 to 4 and at most 24 bits")
-    if count < 1 or 9 * count > DENSEST * size:
+    if count < 1 or 9 * count > (DENSEST if count <= FEW else USUAL) * size:
         raise Damaged(f"its header names {count} Gaussians, and {size} bytes hold none, or not as many")
     return _Found(f"SPZ {version}", count, degree, notes=["antialiased"] if flags & 1 else [])
 
@@ -236,9 +237,11 @@ class _Inflated:
             count -= some
 
     def finish(self, more: bool) -> None:
-        """To the end, where gzip's checksum is; only if `more` may something come before it."""
+        """To the end, where gzip's checksum is; only if `more` may something come before it, and not much."""
+        left = FEW if more else 0
         while not self.stream.eof:
-            if self._part(AT_ONCE) and not more:
+            left -= len(self._part(AT_ONCE))
+            if left < 0:
                 raise Damaged("it goes on after its last Gaussian")
 
 

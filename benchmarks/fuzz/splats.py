@@ -1,0 +1,78 @@
+"""3D Gaussians that `inspect` describes: SPZ, and the PLY of 3DGS."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+from benchmarks.fuzz.binary import changed_bytes
+from benchmarks.fuzz.meshes import ply_changed
+from benchmarks.fuzz.reader import Opened, Reader
+
+HEADER = 16  # bytes of SPZ: magic, version, number, degree, bits, flags, 0
+
+
+def seeds(suffix: str) -> Callable[[], list[bytes]]:
+    def made() -> list[bytes]:
+        from stages.io.exporters import SPLAT_EXPORTERS
+        from stages.io.exporters.writing import CAPTURE_IS_Z_UP
+        from tests.stages.io.gaussians import scattered
+
+        found = []
+        with tempfile.TemporaryDirectory() as folder:
+            for degree in (0, 1, 3):
+                path = Path(folder) / f"a{suffix}"
+                SPLAT_EXPORTERS[suffix](scattered(40, degree), path, CAPTURE_IS_Z_UP)
+                found.append(path.read_bytes())
+        return found
+
+    return made
+
+
+def spz_changed(rng: Random, data: bytes) -> bytes:
+    """What is stored, or what it unpacks to: its header, its rows, or how many there are."""
+    try:
+        inside = zlib.decompress(data, 16 + zlib.MAX_WBITS)
+    except zlib.error:
+        return changed_bytes(rng, data)
+    kind = rng.random()
+    if kind < 0.3:
+        return changed_bytes(rng, data)
+    if kind < 0.6:
+        inside = changed_bytes(rng, inside[:HEADER]) + inside[HEADER:]
+    elif kind < 0.8:
+        count, flags = rng.choice((0, 1, 39, 41, 2**20, 2**31, 2**32 - 1)), rng.choice((0, 1, 2, 128, 255))
+        inside = inside[:8] + struct.pack("<I", count) + inside[12:14] + bytes([flags]) + inside[15:] + bytes(rng.choice((0, 1, 2**16, 2**24)))
+    else:
+        inside = changed_bytes(rng, inside, begin=HEADER)
+    packed = zlib.compressobj(6, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
+    return packed.compress(inside) + packed.flush()
+
+
+def open_splats(suffix: str) -> Callable[[Path], Opened]:
+    def opened(folder: Path) -> Opened:
+        from workflows.inspection.describe import describe
+
+        path = folder / f"a{suffix}"
+
+        def read(data: bytes) -> None:
+            path.write_bytes(data)
+            json.dumps(describe(path), allow_nan=False)
+
+        return Opened(read, (("inspect", str(path)), ("inspect", str(path), "--json")), lambda data: path.write_bytes(data) and None)
+
+    return opened
+
+
+READERS = {
+    reader.name: reader
+    for reader in (
+        Reader("spz", "SPZ of 3D Gaussians", seeds(".spz"), spz_changed, open_splats(".spz")),
+        Reader("splats_ply", "PLY of 3D Gaussians", seeds(".ply"), ply_changed, open_splats(".ply"), share=0.25),
+    )
+}
