@@ -31,7 +31,7 @@ BLUR = 0.04  # standard deviation of the blurred photograph, of its longest side
 MIN_PIXELS = 16  # of a view that are compared
 MIN_KEPT = 0.1  # of a subject, that masks have to keep to be believed
 # docs/experiments/early-check.md
-MIN_PROGRESS = 0.45
+MIN_PROGRESS = 0.5
 MAX_GAIN = 2.0  # that a render is fitted by, or its inverse: one stop
 GOOD_PSNR = 25.0  # dB: from here on what is better than one colour is no failure, for photographs of plain things are hardly better themselves
 PLAIN_PSNR = 30.0  # dB: from here on nothing is
