@@ -140,12 +140,13 @@ def _small(settings: TrainSettings) -> TrainSettings:
 
 
 def _with_views(pixels: Pixels, views: Sequence[View]) -> Pixels:
-    """The same pixels with the near planes, masks and cameras of these views; the bytes are shared."""
+    """The same pixels with the near planes, masks and cameras of these views, whatever the training that failed made of them; the bytes are shared."""
     own = copy.copy(pixels)
     own.near = np.array([view.near for view in views], np.float32)
     if all(view.mask is None for view in views):
-        own.usable, own.listed, own.usable_count = None, None, len(own)
-    cameras = [view.camera for view in views]
-    if not np.array_equal(own.centre, np.array([camera.centre for camera in cameras], np.float32)):  # they were refined
-        own.set_cameras(cameras)
+        own.allowed = None
+    own.leave_out(np.zeros(len(views), bool))
+    poses = np.array([view.camera.world_from_camera for view in views], np.float32)
+    if not (np.array_equal(own.rotation, poses[:, :3, :3]) and np.array_equal(own.centre, poses[:, :3, 3])):
+        own.set_cameras([view.camera for view in views])
     return own

@@ -23,6 +23,7 @@ from stages.io.scene import View
 from stages.training import choices as training_choices
 from stages.training import early_check, second_chances, watch
 from stages.training.choices import TrainingChoices
+from stages.training.data import pixels_of
 from stages.training.early_check import HeldOutView, check_step, judge
 from tests.efficientnerf import balls
 from tests.efficientnerf.balls import settings
@@ -272,6 +273,23 @@ def test_candidates_are_what_would_change_anything(tmp_path: Path) -> None:
     assert second_chances.candidates(odd, settings())["near planes at most their median"].scene(odd).views[-2].near == photographs.views[-2].near
     own = TrainingChoices(near="off", masks=False, min_views=False, exposure=True, camera_refinement=True).settings(settings())
     assert (own.min_views, own.exposure, own.camera_refinement) == ("off", "on", "on")
+
+
+def test_a_trial_begins_with_what_is_stated_whatever_training_made_of_it(tmp_path: Path) -> None:
+    folder = ball(tmp_path / "poses", inverted)
+    views = scenes.views_of(scenes.load(folder), "train")
+    stated, changed = (pixels_of(folder, views) for _ in range(2))
+    changed.leave_out(np.arange(len(views)) == 2)
+    changed.set_cameras([views[0].camera for _ in views])
+    index = np.arange(len(stated))
+    own = second_chances._with_views(changed, views)
+    for mine, other in zip(own.rays(index), stated.rays(index), strict=True):
+        np.testing.assert_array_equal(mine, other)
+    np.testing.assert_array_equal(own.usable_at(index), stated.usable_at(index))
+    assert own.usable_count == stated.usable_count > changed.usable_count
+    unmasked = second_chances._with_views(changed, tuple(replace(view, mask=None) for view in views))
+    assert unmasked.usable_at(index).all()
+    assert not changed.usable_at(index).all()
 
 
 @pytest.mark.parametrize("spoiled", [{"format": 2}, {"choices": {"near": "nowhere"}}, {"choices": {"masks": 3}}])
