@@ -138,12 +138,13 @@ def write_picture(run: Path, path: Path) -> bool:
     from PIL import Image
 
     from stages.figures.plots import LABEL_HEIGHT, MARGIN
+    from stages.io.pictures import opened
 
     strips = [strip for which in ("median", "worst", "best") if (strip := EvaluateOutputs.of_run(run).strip(which)).exists()]
     if not strips:
         return False
-    with Image.open(strips[0]) as opened:
-        strip = opened.convert("RGB")
+    with opened(strips[0], ("PNG",)) as picture:
+        strip = picture.convert("RGB")
     width, height = (strip.width - MARGIN) // 4 - MARGIN, strip.height - 2 * MARGIN - LABEL_HEIGHT
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
