@@ -11,9 +11,11 @@ from pathlib import Path
 
 from workflows.asset import NAMES as STAGES
 
-# What may stay: the lock's file and the digests that are remembered; and for a day a temporary file of the pages, which are written without a lock, that may be
-# of another process. Which previews of a refinement are drawn depends on the time that they take.
-KEPT = re.compile(r"\.lock|\.lease/.*|\.work/|\.cache/hashes\.json|\.(?:report|viewer)\.html\.[0-9a-f]+\.part|bake/previews/preview_[0-9]+\.png")
+# What may stay: the lock's file, the digests that are remembered, what libraries printed; and for a day a temporary file of the pages, which are written
+# without a lock, that may be of another process. Which previews of a refinement are drawn depends on the time that they take.
+KEPT = re.compile(
+    r"\.lock|\.lease/.*|\.work/|\.cache/(?:hashes\.json|libraries\.log)?|\.(?:report|viewer)\.html\.[0-9a-f]+\.part|bake/previews/preview_[0-9]+\.png"
+)
 
 
 @dataclass(frozen=True)
