@@ -7,7 +7,7 @@ time followed by the same command, until it is done; then its artifacts are comp
     signal   SIGKILL to the process alone or to its children too; SIGTERM; SIGINT once or twice; SIGSTOP, then SIGCONT
     code     SIGTERM gives 143, SIGINT 130; a second run beside a stopped one gives 5
 
-Only SIGKILL counts as a kill; every fourth hit is another signal.
+Only SIGKILL counts as a kill; every fourth hit is another signal, of a stage that was killed before.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ class Rounds:
         self.random = random.Random(seed)
         self.kills = self.rounds = 0
         self.hits: Counter[str] = Counter()
+        self.killed: set[str] = set()
         self.groups: list[Child] = []
         folder.mkdir(parents=True)
 
@@ -124,7 +125,7 @@ class Rounds:
         return [ENGINE, *aims]
 
     def _hit(self, prepared: Prepared, run: Path, aim: str, *, fresh: bool) -> None:
-        name = self.random.choice(METHODS)
+        name = self.random.choice(METHODS if aim in self.killed else METHODS[:1])  # killed before it meets anything else
         moment = "time" if name == "STOP" or self.random.random() < 0.4 else "call"
         whom = "leader" if name == "TERM" or (name == "KILL" and self.random.random() < 0.3) else "group"
         hit = Hit(self.rounds, prepared.source.kind, aim, name, moment, whom, fresh=fresh)
@@ -194,6 +195,8 @@ class Rounds:
         wrong += _judged(hit, child, began, prepared.stages[-1])
         self._note(hit, child, wrong)
         self.kills += child.code == -signal.SIGKILL
+        if child.code == -signal.SIGKILL:
+            self.killed.add(hit.stage)
         if hit.signal != "KILL" and child.leftover():
             hit.wrong.append("a child process lives on")
         self.hits[hit.stage] += 1

@@ -98,7 +98,7 @@ class TrainSettings:
         "auto", "Whether poses and the focal length of the training cameras are corrected in training (on), or left alone (off); auto: off.", advanced=True,
     )
     wrong_views: Literal["auto", "off"] = setting(
-        "auto", "Whether training views whose cameras the field and other evidence contradict are left out, or get the pose that is found for them."
+        "auto", "Whether training views whose cameras the field and other evidence contradict are left out, or get the pose that is found for them;"
         " auto: they are; off: all views are trained on.",
         advanced=True,
     )  # fmt: skip
@@ -148,6 +148,7 @@ class TrainSettings:
         "retry",
         "What follows where a tenth of the steps have taught nothing by the held-out views: short trainings without near planes, masks or min_views, or with"
         " exposure or camera_refinement, the best of which training begins again with (retry); a warning alone (continue); or an error (stop).",
+        advanced=True,
     )
     checkpoint_every: PositiveInt = setting(250, "Steps between checkpoints.", advanced=True)
     preview_every: PositiveInt | Off = setting(500, "Steps between preview renders of a validation view; off: none.", advanced=True)

@@ -117,6 +117,7 @@ def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
     some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, "psnr_colour_fitted": 21.0, **figures}
     network = {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0, "floaters": None}
     against = {"asset_with_network_background": None, "gap": dict.fromkeys(GAP), **dict.fromkeys(AGAINST_NETWORK)}
+    against |= {"trivial": None, "sparse_points": None}
     views = [{"name": "a", "network": network, "asset": {**some, "lpips_alex": None}, "mesh": dict.fromkeys(FIGURES), **against}]
     found = summary(views, split="test", stride=1, background=None, mesh={"faces": 2}, perceptual=("lpips_alex",))
     assert found["network"]["lpips_alex"] == figures["lpips_alex"]

@@ -21,8 +21,10 @@ def write_pages(run: Run, stages: Sequence[Stage]) -> None:
 
 
 def has_pages(run: Run, stages: Sequence[Stage]) -> bool:
-    """Whether the report is there and no artifact was published after it (that is a rename of its folder, which sets ctime), and no page is another's."""
+    """Whether the report is there and no artifact was published after it (that is a rename of its folder, which sets ctime), no page is missing, and none is
+    another's."""
     from workflows.report.signature import PAGES, is_own
+    from workflows.report.viewer import is_missing
 
     try:
         written = os.stat(run.path / "report.html", follow_symlinks=False).st_mtime_ns
@@ -30,4 +32,4 @@ def has_pages(run: Run, stages: Sequence[Stage]) -> bool:
         return False
     folders = (run.folder(stage.name) for stage in stages)
     newest = all(os.stat(folder, follow_symlinks=False).st_ctime_ns <= written for folder in folders if os.path.lexists(folder))
-    return newest and all(is_own(run.path / name) for name in PAGES if os.path.lexists(run.path / name))
+    return newest and not is_missing(run) and all(is_own(run.path / name) for name in PAGES if os.path.lexists(run.path / name))

@@ -45,6 +45,14 @@ def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
     return path
 
 
+def is_missing(run: Run) -> bool:
+    """Whether the run has no page though its asset is one that gets a page: it could not be read, or nobody has written the page yet."""
+    from stages.viewer.page import LARGEST
+
+    size = _size(BakeOutputs.of_run(run.path).asset)
+    return size is not None and size <= LARGEST and not os.path.lexists(run.path / NAME)
+
+
 def write_viewer_of(run: Path, asset: Path, target: Path) -> None:
     """Write the page of a run's asset, signed. Raises FormatError and OSError."""
     from stages.viewer.page import compact_bytes, viewer_page
