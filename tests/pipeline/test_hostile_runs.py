@@ -38,7 +38,7 @@ VALUES: list[Any] = [
 ]  # fmt: skip
 
 
-TEXTS = [b'{"a": 1e999}', b"[" * 50_000, b'{"a":' * 50_000, b"9" * 400, b"9" * 5000, b"\xff", b'"\\ud800"', b"\0", b"-", b"{}{}"]
+TEXTS = [b'{"a": 1e999}', b"[" * 50_000, b"9" * 5000, b"\xff", b'"\\ud800"', b"\0", b"{}{}"]
 
 
 def mutants(value: Any) -> Iterator[Any]:
@@ -164,18 +164,12 @@ def test_settings_of_any_value(run: Run, name: str) -> None:
         with contextlib.suppress(UsageError):
             assert abs(settings_from(CountSettings, {name: value}, where="count").steps) < 2**63
         assert refused([lambda value=value: settings_from(CountSettings, {name: value}, where="count")]) <= {2}  # type: ignore[misc]
-    with pytest.raises(UsageError, match="whole number"):
-        settings_from(CountSettings, {"steps": 10**400})
     with pytest.raises(UsageError):
         settings_from(CountSettings, {"\x1b[31m\ud800" * 1000: 1})
-
-
-def test_recorded_settings_of_any_value_end_as_a_usage_error(run: Run) -> None:
     run.update(settings={**run.settings, "count": {"steps": "many"}})
-    with pytest.raises(UsageError, match=r"count\.steps"):
-        decide(COUNT, Run.open(run.path))
-    with pytest.raises(UsageError, match=r"count\.steps"):
-        run_stages(Run.open(run.path), STAGES)
+    for action in (decide, lambda _, run: run_stages(run, STAGES)):
+        with pytest.raises(UsageError, match=r"count\.steps"):
+            action(COUNT, Run.open(run.path))  # type: ignore[operator]
 
 
 def test_a_file_larger_than_any_is_not_read(run: Run) -> None:
