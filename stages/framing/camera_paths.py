@@ -17,7 +17,8 @@ from efficientnerf.asset.cascades import Cascade, cascades_of
 from efficientnerf.asset.region import inside_share
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
-from stages.framing.captured import captured_of, coverage
+from stages.framing.captured import captured_of
+from stages.framing.coverage import coverage
 from stages.io.scene import Orbit
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ import numpy as np
 
 from efficientnerf.asset.region import Region, inside_distance
 from efficientnerf.geometry.cameras import Camera
-from stages.framing.captured import meeting_point
+from stages.framing.coverage import meeting_point
 from stages.framing.cells import CENTRAL, CONNECTED, Cells, connected_parts, observed_cells
 from stages.framing.supports import Plane, find_supports, rays_that_end, with_feet
 

@@ -13,7 +13,7 @@ from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
-from stages.framing.captured import coverage
+from stages.framing.coverage import coverage
 from stages.io.capture import Capture
 from stages.io.importers.photographs import photographs
 from stages.io.importers.source import Source

@@ -20,7 +20,8 @@ from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose,
 from pipeline.errors import BadInput, UsageError
 from stages.figures.frames import RenderOptions, render_path
 from stages.framing.camera_paths import PATHS, orbit_of, pose_on_sphere, similarity_of, turntable_cameras
-from stages.framing.captured import captured_metadata, captured_of, coverage
+from stages.framing.captured import captured_metadata, captured_of
+from stages.framing.coverage import coverage
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
 from stages.turntable import TurntableSettings, cameras_of
