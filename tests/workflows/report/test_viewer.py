@@ -36,6 +36,10 @@ def test_a_run_gets_a_page_with_its_cameras_and_photographs(run: Run) -> None:
     text = path.read_text(encoding="utf-8")
     assert text.count("data:image/jpeg;base64,") == 8
     assert "<title>run</title>" in text
+    (run.path / "poses/scene.json").write_text("{")
+    path = write_run_viewer(run, anew=True)
+    assert path is not None
+    assert "data:image/jpeg" not in path.read_text(encoding="utf-8"), "without cameras, too"
 
 
 def test_a_page_is_made_again_when_the_asset_is_another(run: Run) -> None:
@@ -87,13 +91,6 @@ def test_a_page_that_could_not_be_made_is_missing_until_it_is(run: Run, monkeypa
         assert has_pages(run, ())  # it gets none
     (run.path / "bake/asset.nerftree").unlink()
     assert has_pages(run, ())
-
-
-def test_a_run_without_cameras_gets_its_page(run: Run) -> None:
-    (run.path / "poses/scene.json").write_text("{")
-    path = write_run_viewer(run)
-    assert path is not None
-    assert "data:image/jpeg" not in path.read_text(encoding="utf-8")
 
 
 def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Path) -> None:
