@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.scenes.__main__ import write_scene
 from benchmarks.scenes.catalogue import cameras, recipes
-from benchmarks.scenes.rendering import image, nearest
+from benchmarks.scenes.rendering import nearest
 from benchmarks.scenes.shapes import Box, Capsule, Ground, Material, Shape, Sphere
 from efficientnerf.geometry.cameras import rays
 from pipeline.stage import Job
@@ -69,13 +69,6 @@ def test_culling_changes_no_hit(kind: str) -> None:
     every = np.stack([shape.hit(origins, directions) for shape in recipe.shapes])
     np.testing.assert_array_equal(found.distance, every.min(0))
     np.testing.assert_array_equal(found.shape >= 0, np.isfinite(every.min(0)))
-
-
-def test_wires_are_thinner_than_a_pixel() -> None:
-    recipe = recipes()["gloss"]
-    drawn = image(recipe.shapes, cameras(recipe, "test", 3, 64)[0], alpha=True)
-    partly = (drawn[..., 3] > 0) & (drawn[..., 3] < 255)
-    assert partly.sum() > 0.2 * (drawn[..., 3] > 0).sum()
 
 
 def scene_of(source: Path, settings: PosesSettings) -> scene.Scene:
