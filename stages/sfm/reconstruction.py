@@ -29,7 +29,7 @@ from stages.sfm import ladder, mapping, matches, process
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
 from stages.sfm.images import Callables, Masks, WorkImage, prepare_images
-from stages.sfm.own_intrinsics import with_own_intrinsics
+from stages.sfm.intrinsics.own import with_own_intrinsics
 from stages.verdict.looks import look_at_all
 from stages.verdict.parallax import parallax
 from stages.verdict.verdict import CROPPED, LENS, MOVING, OWN_INTRINSICS, WITHOUT_TEXTURE, ZOOMED, failed

@@ -23,7 +23,7 @@ from stages.verdict.looks import Look
 from stages.verdict.parallax import Parallax, parallax
 
 LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose photographs have focal lengths, or principal points, of their own
-OWN_INTRINSICS = "own_intrinsics"  # fact: which of them each photograph has of its own (`stages.sfm.own_intrinsics`), or None
+OWN_INTRINSICS = "own_intrinsics"  # fact: which of them each photograph has of its own (`stages.sfm.intrinsics.own`), or None
 MOVING = "moving_parts"  # fact: name of a photograph -> share of it that moves
 # Facts of a capture that stand among the figures.
 FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, OWN_INTRINSICS, "gps", "stated_cameras", BACKGROUND)

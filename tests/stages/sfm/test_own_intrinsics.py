@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.poses import aligned_errors
-from stages.sfm import own_intrinsics
 from stages.sfm.colmap import import_pycolmap
 from stages.sfm.images import WorkImage
-from stages.sfm.own_intrinsics import FOCAL_LENGTH, PRINCIPAL_POINT, with_own_intrinsics
+from stages.sfm.intrinsics import own as own_intrinsics
+from stages.sfm.intrinsics.own import FOCAL_LENGTH, PRINCIPAL_POINT, with_own_intrinsics
 
 FOCAL, MIDDLE = 1280.0, np.array([512.0, 384.0])
 
