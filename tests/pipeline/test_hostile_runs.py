@@ -22,7 +22,7 @@ from pipeline.locks.lock import holder_of
 from pipeline.run import Run
 from pipeline.runner import run_stages, verify
 from pipeline.stage import settings_from
-from tests.pipeline.toy import COUNT, STAGES, CountSettings, actions, make_run
+from tests.pipeline.toy import COUNT, STAGES, CountSettings, make_run
 
 
 def nested(depth: int) -> Any:
@@ -145,16 +145,6 @@ def test_any_holder(run: Run) -> None:
             assert len(holder.text()) < 1000
     with run.locked():
         pass
-
-
-def test_any_memory_of_hashes(run: Run) -> None:
-    good = {"format": "enerf-hashes-2", "files": {"k": [1, 2, 3, 4, "a" * 64]}}
-    for value in [*mutants(good), *({**good, "files": {"k": [1, 2, 3, each, "a" * 64]}} for each in VALUES)]:
-        run.cache.write_text(json.dumps(value))
-        hashes = Hashes(run.cache)
-        assert hashes.digest("k", run.path / "list" / "list.txt") == hashlib.sha256((run.path / "list" / "list.txt").read_bytes()).hexdigest()
-        hashes.forget("x")
-    assert set(actions(run_stages(run, STAGES)).values()) == {"skipped"}
 
 
 @pytest.mark.parametrize("name", ["steps", "rate", "name"])

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import pytest
 
 from pipeline.interrupt import _GRACE, stopping
 from pipeline.run import Run
-from pipeline.runner import run_stages, verify
+from pipeline.runner import run_stages
 from tests.pipeline.toy import STAGES, make_run
 
 # Runs the toy workflow, slowed down so that signals meet it at work, as a command line would.
@@ -139,18 +138,3 @@ def test_a_second_ctrl_c_ends_at_once_even_within_a_foreign_call(tmp_path: Path,
         process.send_signal(signal.SIGINT)
         assert process.wait(10) in (-signal.SIGINT, 130)
     assert [outcome.action for outcome in run_stages(run, STAGES)] == ["skipped", "ran", "ran", "ran"]
-
-
-def test_killed_at_random_moments_the_end_is_the_same(tmp_path: Path) -> None:
-    undisturbed = run_stages(make_run(tmp_path / "undisturbed", count={"steps": 12}), STAGES)
-    run = make_run(tmp_path / "killed", count={"steps": 12})
-    chance = random.Random(4)
-    for _ in range(4):
-        with start(run, "slow") as process:
-            try:
-                process.wait(chance.uniform(0.15, 0.5))
-            except subprocess.TimeoutExpired:
-                process.kill()
-    outcomes = run_stages(run, STAGES)
-    assert [outcome.digest for outcome in outcomes] == [outcome.digest for outcome in undisturbed]
-    verify(run, STAGES)

@@ -7,12 +7,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks import captures as benchmark
-from stages.figures.plots import contact_sheet
 from tests.stages import captures
 
 TINY = ["--preset", "tiny", "--iterations", "8", "--set", "bake.refine_steps=1", "--set", "evaluate.captured_path_frames=2", "--set", "turntable.frames=1"]
@@ -66,38 +63,3 @@ def test_what_is_measured_before_is_not_run_again(made: Path, monkeypatch: pytes
     assert benchmark.main([*where, "--out", str(made / "again"), *TINY, "--set", "turntable.frames=2"]) == 0
     assert [options[-1] for options in ran] == ["turntable.frames=2"]
     assert rows_of(made / "again")["source"]["options"] != rows_of(made / "out")["source"]["options"]
-
-
-def test_existing_runs_are_tabulated_and_compared(made: Path, tmp_path: Path) -> None:
-    shutil.copytree(made / "runs", tmp_path / "runs")
-    run, before = tmp_path / "runs/source", tmp_path / "before.json"
-    (run / "evaluate/verdict.json").write_text(json.dumps({"grade": "poor", "summary": "Fog.", "problems": [{"what": "fog"}]}))
-    report = json.loads((run / "train/report.json").read_text())
-    report |= {"priors": {"near_planes": {"applied": False}, "min_views": {"applied": True}}, "chosen": "exposure"}
-    (run / "train/report.json").write_text(json.dumps(report))
-    rows = rows_of(made / "out")
-    arguments = [str(made / "source"), "--from", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), "--before", str(before)]
-    for gain, code in ((0.05, 0), (0.2, 1)):
-        worse = json.loads(json.dumps(rows))
-        worse["source"]["asset"]["psnr"] += gain
-        before.write_text(json.dumps({"rows": worse}))
-        assert benchmark.main(arguments) == code
-    row = rows_of(tmp_path / "out")["source"]
-    assert row["asset"] == rows["source"]["asset"]
-    assert row["result"] == {"grade": "poor", "summary": "Fog.", "problems": ["fog"]}
-    assert (row["refuted_priors"], row["second_chance"]) == (["near_planes"], "exposure")
-    assert "poor (fog)" in (tmp_path / "out/captures.md").read_text()
-
-
-def test_a_picture_is_photograph_asset_and_mesh_of_the_median_view(tmp_path: Path) -> None:
-    colours = [(200, 0, 0), (0, 0, 0), (0, 200, 0), (0, 0, 200)]  # photograph, network, asset, mesh
-    (tmp_path / "evaluate").mkdir()
-    for name, shift in (("median", 0), ("worst", 40)):
-        panels = [np.full((450, 600, 3), np.add(colour, shift), np.uint8) for colour in colours]
-        contact_sheet([panels], [["label"] * 4], tmp_path / f"evaluate/strip_{name}.png", thumbnail=600)
-    assert benchmark.write_picture(tmp_path, tmp_path / "out/picture.webp")
-    with Image.open(tmp_path / "out/picture.webp") as picture:
-        assert picture.height == 225
-        found = [picture.convert("RGB").getpixel((x, 112)) for x in (150, 454, 758)]
-    np.testing.assert_allclose(found, [colours[0], colours[2], colours[3]], atol=6)
-    assert not benchmark.write_picture(tmp_path / "out", tmp_path / "out/none.webp")

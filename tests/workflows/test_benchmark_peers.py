@@ -15,8 +15,6 @@ from benchmarks.minutes import read_rows
 from benchmarks.peers import __main__ as peers
 from benchmarks.scenes.__main__ import write_scene
 from benchmarks.scenes.catalogue import recipes
-from stages.formats.importers import IMPORTERS, detect
-from stages.poses.run import PosesSettings
 
 COUNTS = {"train": 3, "val": 1, "test": 2}
 # Renders the test images on white, of the pixels asked for, each a tenth nearer to grey than it is.
@@ -45,18 +43,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
     write_scene(recipes()["object"], folder / "object", COUNTS, 32, supersample=1)
     return folder / "object"
-
-
-def test_a_made_scene_becomes_a_data_set_as_blenders_with_the_same_cameras(scene: Path, tmp_path: Path) -> None:
-    made = peers.as_blender(scene, tmp_path / "data")
-    assert peers.as_blender(made, tmp_path / "other") == made
-    ours, theirs = (IMPORTERS[detect(folder)].read(folder, PosesSettings()) for folder in (scene, made))
-    here = {photo.camera.name: photo.camera for photo in ours.photos if photo.camera.name in {other.camera.name for other in theirs.photos}}
-    assert len(here) == len(theirs.photos) == COUNTS["train"] + COUNTS["test"]
-    for photo in theirs.photos:
-        camera = here[photo.camera.name]
-        np.testing.assert_allclose(photo.camera.world_from_camera, camera.world_from_camera, atol=1e-9)
-        assert photo.camera.intrinsics["fx"] == pytest.approx(camera.intrinsics["fx"])
 
 
 @pytest.mark.parametrize("stride", [1, 3])

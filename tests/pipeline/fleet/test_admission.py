@@ -75,15 +75,6 @@ def test_a_large_stage_does_not_wait_for_all_small_ones(tmp_path: Path, slots: i
     assert begun - ready <= 4 * slots, "it began as soon as what ran then had ended"
 
 
-def test_several_that_are_large_have_their_turns(tmp_path: Path) -> None:
-    large = {(f"s{number}", stage): 14 * GIB for number in range(0, 30, 5) for stage in STAGES}
-    workers = Simulated([Worker("a", 8, 16 * GIB, slots=4), Worker("b", 8, 16 * GIB, slots=4)], taking(large, others=2 * GIB))
-    assert run(tmp_path, workers, scenes(30)).state == "done"
-    order = trainings(workers)
-    assert order.index("s25") < len(order) - 1
-    assert max(order.index(f"s{number}") - number for number in range(0, 30, 5)) <= 10
-
-
 def test_what_fits_nowhere_runs_alone_with_what_there_is_and_that_is_told(tmp_path: Path) -> None:
     workers = Simulated([Worker("small", 8, 4 * GIB, slots=2), Worker("large", 8, 16 * GIB, slots=4)], taking({("s3", "train"): 20 * GIB}, others=GIB))
     beside: list[int] = []

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -294,10 +292,3 @@ def test_pipes_among_photographs_are_not_waited_for(tmp_path: Path) -> None:
     )  # fmt: skip
     assert images == []
     assert [name for name, _ in rejected] == names
-
-
-def test_help_answers_within_a_second() -> None:
-    done = subprocess.run([sys.executable, "-X", "importtime", "-m", "workflows.cli.main", "--help"], capture_output=True, text=True, check=True)
-    lines = [line.split("|") for line in done.stderr.splitlines() if line.startswith("import time:") and line.split("|")[1].strip().isdigit()]
-    assert sum(int(line[0].removeprefix("import time:")) for line in lines) < 1e6  # microseconds
-    assert "Exit codes" in done.stdout

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import types
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from efficientnerf.asset import format
-from stages.io.scene import load, save
 from tests.efficientnerf.balls import cameras, picture
 from tests.stages.captures import write_picture
 from workflows.cli.main import main
@@ -110,33 +105,3 @@ def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path, capsys: p
     assert field.stat().st_mtime_ns == made
     (tmp_path / "none").mkdir()
     assert main([*command, "--data", str(tmp_path / "none")]) == 2
-
-
-def test_a_tree_is_measured_on_as_many_views_as_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the requested device, without the copy back to the host."""
-    import numpy as np
-
-    from efficientnerf.asset.tree import NerfTree
-    from tests.efficientnerf.trees import random_tree
-    from tests.stages.balls import poses
-    from workflows.paper import runs
-
-    folder = poses(tmp_path / "poses")
-    s = load(folder)
-    save(dataclasses.replace(s, views=tuple(dataclasses.replace(view, split="test" if n < 3 else "train") for n, view in enumerate(s.views))), folder)
-    (tmp_path / "bake").mkdir()
-    format.save(dataclasses.replace(random_tree(2, brick=4, degree=1, share=0.6), bounds_min=np.array([-0.6] * 3)), tmp_path / "bake" / "asset.nerftree")
-    run: Any = types.SimpleNamespace(path=tmp_path, folder=lambda name: tmp_path / name)
-    sent: list[str] = []
-    monkeypatch.setattr(NerfTree, "to", lambda self, device: sent.append(device) or self)
-    drawn: list[str] = []
-    seconds = runs._frame_seconds
-    monkeypatch.setattr(runs, "_frame_seconds", lambda tree, camera, background: drawn.append(camera.name) or seconds(tree, camera, background))
-    for wanted, count in ((2, 2), (None, 3)):
-        drawn.clear()
-        figures = runs._tree_figures(run, wanted, "cuda")
-        assert len(drawn) == 1 + count  # the first, which compiles, is not counted
-        assert 3 < figures["psnr"] < 40
-        assert figures["fps"] > 0
-        assert figures["frame"] == "16x16"
-    assert sent == ["cuda", "cuda"]
