@@ -77,7 +77,7 @@ def test_who_has_this_machines_lock_takes_over_from_a_dead_process_at_once(tmp_p
     dead.release()
 
 
-def test_who_saw_an_old_lease_and_was_slow_does_not_get_a_number_that_was_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_taker_of_an_old_lease_gets_no_number_that_was_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between its look and its link others take over twice, and remove the lower numbers: its own link succeeds, and counts for nothing."""
     with on("a"):
         acquire(tmp_path, decisive=True).release()

@@ -30,7 +30,7 @@ def holding(run: Run) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_second_writer_is_told_who_holds_the_run_and_a_dead_one_does_not_stand_in_the_way(tmp_path: Path) -> None:
+def test_a_second_writer_is_told_the_holder_and_a_dead_one_blocks_nobody(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "run")
     with holding(run) as process:
         with pytest.raises(RunLocked, match=rf"process {process.pid} on ") as caught, run.locked():

@@ -38,7 +38,7 @@ def test_a_ball_too_large_is_as_far_off_as_it_is_larger() -> None:
     np.testing.assert_allclose(aligned(ball(0.5).vertices, moved).points(ball(0.5).vertices), moved, atol=1e-9)
 
 
-def test_what_is_missing_costs_completeness_alone_and_what_nobody_sees_nothing() -> None:
+def test_missing_parts_cost_completeness_and_unseen_ones_nothing() -> None:
     truth, inner = ball(0.5), ball(0.2)
     half = Surface(truth.vertices, truth.faces[truth.vertices[truth.faces].mean(1)[:, 2] > 0])
     found = scores(half, truth, CAMERAS, (0.005,), samples=3000)

@@ -38,7 +38,7 @@ def trainings(workers: Simulated) -> list[str]:
     return [name for name, stage, _ in workers.log if stage == "train"]
 
 
-def test_no_worker_ever_has_more_than_its_memory_and_every_scene_comes_to_its_end(tmp_path: Path) -> None:
+def test_no_worker_exceeds_its_memory_and_every_scene_ends(tmp_path: Path) -> None:
     for seed in range(20):
         chance = random.Random(seed)
         limits = [chance.choice([4, 8, 16, 32]) * GIB for _ in range(chance.randint(1, 4))]

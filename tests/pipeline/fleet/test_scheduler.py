@@ -35,7 +35,7 @@ def at(scene: str, stage: str, times: int = 10**6, **result: Any) -> Answer:
     return answer
 
 
-def test_every_scene_is_prepared_then_its_stages_run_in_order_then_it_is_finished(tmp_path: Path) -> None:
+def test_scenes_are_prepared_run_in_order_and_finished(tmp_path: Path) -> None:
     workers = Simulated([Worker("a", 4, slots=2), Worker("b", 4, slots=1)])
     found = run(tmp_path / "one", workers, scenes(7))
     assert read_fleet(tmp_path / "one") == found
@@ -62,7 +62,7 @@ def test_stages_of_different_scenes_share_a_machine_with_a_device(tmp_path: Path
     assert workers.most["a"][1] == 2
 
 
-def test_stages_are_admitted_by_memory_and_a_large_one_is_not_kept_waiting_for_ever(tmp_path: Path) -> None:
+def test_stages_are_admitted_by_memory_and_a_large_one_has_its_turn(tmp_path: Path) -> None:
     workers = Simulated([Worker("a", 8, 8 * GIB, slots=4)], at("s0", "train", 1, kind="refused", text="needs 7.0 GiB.", needed=7 * GIB))
     assert run(tmp_path / "one", workers, scenes(12)).totals.done == 12
     assert workers.most["a"] == (8 * GIB, 4)
@@ -86,7 +86,7 @@ def test_what_ran_out_of_memory_is_tried_once_in_half(tmp_path: Path, result: di
     assert (scene.stages["train"].state, scene.stages["bake"].state) == ("done", "failed")
 
 
-def test_a_stage_whose_worker_died_goes_to_another_and_is_given_up_when_that_dies_too(tmp_path: Path) -> None:
+def test_a_stage_whose_worker_died_is_tried_once_elsewhere(tmp_path: Path) -> None:
     workers = Simulated([Worker("a", 1), Worker("b", 1), Worker("c", 1)], lambda task: None if what(task.request) == "train" else done(task))
 
     def lose() -> None:

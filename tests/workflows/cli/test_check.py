@@ -20,7 +20,7 @@ def noise(folder: Path, count: int) -> Path:
     return folder
 
 
-def test_check_says_what_is_wrong_and_exits_with_2_where_nothing_can_come_of_it(enerf: Enerf, tmp_path: Path) -> None:
+def test_check_names_problems_and_exits_with_2_where_it_is_hopeless(enerf: Enerf, tmp_path: Path) -> None:
     folder = noise(tmp_path / "photos", 4)
     told = enerf("check", folder, "--json", "--memory", "1m").object
     assert (told["ok"], told["grade"], told["exit_code"]) == (False, "failed", 2)

@@ -245,7 +245,7 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path, number: i
     assert json.loads(out.splitlines()[-1])["exit_code"] == code
 
 
-def test_another_ctrl_c_while_an_interrupted_process_ends_prints_no_traceback(tmp_path: Path) -> None:
+def test_a_second_ctrl_c_at_the_end_prints_no_traceback(tmp_path: Path) -> None:
     program = (
         "import atexit, os, signal, sys, time; from workflows.cli import main, state\n"
         "def interrupted(*_, **__): raise KeyboardInterrupt\n"

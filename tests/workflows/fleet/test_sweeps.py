@@ -35,7 +35,7 @@ def test_values_are_those_of_set() -> None:
         swept([CHAIR], [Sweep("train", "iterations", values), Sweep("train", "seed", values)], STAGES)
 
 
-def test_each_scene_with_each_combination_shares_what_comes_before_the_swept_stage() -> None:
+def test_combinations_share_what_comes_before_the_swept_stage() -> None:
     sweeps = [Sweep("train", "iterations", (2000, 4000)), Sweep("bake", "max_mib", (8.0, 24.5))]
     made = swept([CHAIR, TABLE], sweeps, STAGES)
     check_scenes(made)
@@ -56,7 +56,7 @@ def test_scenes_of_different_sources_presets_or_seeds_share_nothing() -> None:
     assert shared([CHAIR, replace(CHAIR, name="x")], STAGES)[1].shares == {stage.name: "chair" for stage in STAGES}
 
 
-def test_long_names_are_numbered_and_the_scene_that_was_swept_is_known_whatever_its_name() -> None:
+def test_long_names_are_numbered_and_the_swept_scene_is_known() -> None:
     for name, values in (("c" * 100, ("x" * 50, "x" * 51)), ("a--" + "c" * 80, ("x" * 50, "x" * 51)), ("chair", ("a b", "a_b", "", "é/../")),
                          ("椅" * 66, ("a", "b")), ("a--b", ("-1", "0")), ("a--0001x", ("1",))):  # fmt: skip
         made = swept([Scene(name, ("/c",))], [Sweep("bake", "licence", values)], STAGES)
