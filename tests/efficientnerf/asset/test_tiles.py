@@ -11,7 +11,6 @@ from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import pose
-from tests.efficientnerf.trees import random_cascades
 
 SIDE = 4
 
@@ -58,7 +57,3 @@ def test_rays_along_the_axes_and_past_the_box() -> None:
     found = np.empty(len(origins), bool)
     come_near(origins, directions / np.linalg.norm(directions, axis=1, keepdims=True), leap, found)
     np.testing.assert_array_equal(found, [True, False, True, True, False, True])
-
-
-def test_all_tiles_of_nested_trees() -> None:
-    assert tiles_met(random_cascades(1), PatchGrid(pixels([pose(0.0, 0.3)]), SIDE)) is None

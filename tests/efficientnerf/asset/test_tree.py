@@ -62,14 +62,6 @@ def test_a_point_in_an_empty_cell_has_no_density_whatever_its_neighbours_hold() 
     np.testing.assert_allclose(density_at(tree, points), [8 * 0.51, 0, 8, 8 * 0.51, 0], rtol=1e-4)
 
 
-def test_points_that_are_nowhere_have_no_density() -> None:
-    tree = random_tree(0, shape=(9, 11, 13), brick=5)
-    nowhere = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf, 0, 0], [1e30, 0, 0], [0, -1e30, 0], [0, 0, 1e18]])
-    assert (density_at(tree, nowhere) == 0).all()
-    assert (normal_at(tree, nowhere) == 0).all()
-    assert colour_at(tree, nowhere).shape == (6, 3)
-
-
 @pytest.mark.parametrize(("brick", "degree"), TREES)
 def test_blocks_hold_the_stored_values(brick: int, degree: int) -> None:
     tree = random_tree(brick, brick=brick, degree=degree)
@@ -84,14 +76,6 @@ def test_blocks_hold_the_stored_values(brick: int, degree: int) -> None:
     assert np.array_equal(block, expected)
     centres = tree.bounds_min + (np.argwhere(expected[2:-2, 1:-2, :-2] > 0) + 0.5) * tree.voxel
     np.testing.assert_allclose(np.sort(density_at(tree, centres)), np.sort(expected[expected > 0]), rtol=1e-3, atol=1e-3)
-
-
-def test_blocks_may_be_empty_or_far_outside_and_not_inside_out() -> None:
-    tree = random_tree(0)
-    assert density_block(tree, (2, 2, 2), (2, 5, 5)).shape == (0, 3, 3)
-    assert not density_block(tree, (100, 0, 0), (103, 2, 2)).any()
-    with pytest.raises(ValueError, match="upper corner lies below"):
-        density_block(tree, (2, 2, 2), (1, 5, 5))
 
 
 def test_the_order_of_the_list_does_not_matter() -> None:

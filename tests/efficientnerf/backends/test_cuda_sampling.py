@@ -88,12 +88,6 @@ def test_pivotal_samples_are_those_of_torch_cut_off_or_padded(contracted: bool, 
         assert not a[kept:].any()
 
 
-def test_padding_is_never_pivotal() -> None:
-    weight = torch.tensor([0.1, 0.5, 0.4, 0.6, *[1.0] * 9]).to(DEVICE)  # the last nine belong to no ray
-    chosen = cuda.select_pivots(weight, torch.tensor([0, 3, 4]).to(DEVICE), 0.3, 1)
-    assert chosen.tolist() == [False, True, False, True, *[False] * 9]
-
-
 def test_no_rays_no_slots_and_no_samples_are_fine() -> None:
     voxels = voxels_of().to(DEVICE)
     none = there(Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), torch.zeros(0)))

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.queries import density_block
 from efficientnerf.asset.rendering import Rendering, render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
-from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering import environment
-from tests import reference
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.trees import LOW, looking, nested_rays, random_cascades, random_tree, rays_at, tensors, uniform_tree
+from tests.efficientnerf.trees import LOW, looking, nested_rays, random_cascades, random_tree, rays_at, tensors
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.tree")
 
@@ -107,22 +105,6 @@ def test_supersampling() -> None:
         device_image(tree, camera, supersample=0)
 
 
-def test_one_colour_everywhere_gives_that_colour_however_thin() -> None:
-    for sigma in (0.02, 2.0):
-        tree = uniform_tree((6, 6, 6), brick=2, sigma=sigma, logit=0.7)
-        found = device_rays(tree, *rays_at(tree, 40))
-        np.testing.assert_allclose(found.colour, found.opacity[:, None] * reference.sigmoid(0.7) * np.ones(3), atol=3e-4)
-
-
-def test_normals_face_the_ray() -> None:
-    tree = uniform_tree(sigma=60.0)
-    middle = (tree.bounds_min + tree.bounds_max) / 2
-    directions = np.concatenate([np.eye(3), -np.eye(3)])
-    found = device_rays(tree, middle - 3 * directions, directions)
-    np.testing.assert_allclose(found.normal, -directions, atol=2e-3)
-    np.testing.assert_allclose(found.depth, 3 - 0.8, atol=0.05)
-
-
 def test_an_empty_tree_and_no_rays() -> None:
     tree = tree_from_voxels((2, 3, 1), 0.1, LOW, np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
     found = device_image(tree, looking(tree), background=(0.2, 0.4, 0.6))
@@ -147,26 +129,6 @@ def test_palettes_are_decoded() -> None:
     origins, directions = rays_at(tree, 40)
     for name in ("colour", "opacity"):
         assert np.array_equal(getattr(device_rays(coded, origins, directions), name), getattr(device_rays(plain, origins, directions), name))
-
-
-def test_bricks_carry_a_border_of_their_neighbours() -> None:
-    tree = random_tree(2, brick=3, share=0.6)
-    on_device = cuda.device_tree(tree, DEVICE)
-    edge = tree.brick + 2
-    for cell in np.argwhere(tree.brick_index >= 0):
-        low = cell * tree.brick - 1
-        block = density_block(tree, tuple(low), tuple(low + edge))
-        held = on_device.density[tree.brick_index[tuple(cell)]].reshape(edge, edge, edge).float().cpu().numpy()
-        np.testing.assert_allclose(held, block, rtol=1e-3)
-    assert on_device.bytes > 0
-    assert torch.equal(on_device.grid.cpu() < 0, torch.from_numpy(tree.brick_index < 0))
-
-
-def test_an_image_is_its_rays() -> None:
-    tree = random_tree(0, share=0.7)
-    camera = looking(tree)
-    image, flat = device_image(tree, camera), device_rays(tree, *rays(camera))
-    assert (np.abs(image.colour.reshape(-1, 3) - flat.colour) < 1e-3).mean() > 0.99
 
 
 def test_rays_of_another_frame_have_the_colours_along_those_of_the_world() -> None:

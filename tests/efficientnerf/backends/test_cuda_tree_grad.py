@@ -79,18 +79,6 @@ def test_light_samples_absorb_and_have_no_gradient(tree: NerfTree) -> None:
     assert 0 < (found[1] != 0).sum() < (everything[1] != 0).sum()
 
 
-def test_terms_that_are_not_trained_have_no_gradient_and_change_no_other() -> None:
-    tree = random_tree(4, brick=2, degree=2, share=0.8, sigma=5.0)
-    origins, directions = rays_at(tree, 30)
-    seen = seen_at_random(30, 0.3)
-    whole, few = (device_gradients(tree, origins, directions, seen, DEVICE, terms=terms) for terms in (9, 4))
-    np.testing.assert_array_equal(few[1], whole[1])
-    np.testing.assert_array_equal(few[2][:, :4], whole[2][:, :4])
-    assert few[2][:, :4].any()
-    assert whole[2][:, 4:].any()
-    assert not few[2][:, 4:].any()
-
-
 def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
     tree = random_tree(4, brick=4, degree=1, share=0.6)
     origins, directions = rays_at(tree, 60)
@@ -269,12 +257,6 @@ def test_in_normalised_device_coordinates_too() -> None:
     wanted, found = error(tree, targets, count, 0), error(tree, targets.sent(DEVICE), count, 0)
     assert wanted > 1e-3
     assert found == pytest.approx(wanted, rel=1e-3)
-
-
-def test_targets_stay_on_the_host_where_kernels_cannot_be_built() -> None:
-    targets = Targets(pixels(2, 8), (1.0, 1.0, 1.0))
-    assert targets.to("cpu") is targets
-    assert targets.to("cuda").on_device == torch.cuda.is_available()
 
 
 @pytest.mark.gpu

@@ -194,10 +194,6 @@ def test_threads_are_those_of_openmp_whatever_else_is_installed(package: Path, t
     assert Path(found["folder"]).parent == tmp_path / "cache" / "efficientnerf"
 
 
-def test_a_threading_layer_that_the_user_asks_for_is_used(package: Path, tmp_path: Path) -> None:
-    assert run(package, ENERF_CACHE_DIR=str(tmp_path / "cache"), NUMBA_THREADING_LAYER="workqueue")["layer"] == "workqueue"
-
-
 def test_the_key_stands_for_each_kernel_source_and_its_place(package: Path) -> None:
     inner = package / "backends" / "numba" / "inner.py"
     keys = [kernel_cache.key_of(package)]

@@ -16,7 +16,7 @@ from efficientnerf.asset.rendering import Rendering, ray_parts, render, render_r
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.backends.numba.tree.packed import packed_of
-from efficientnerf.geometry.cameras import Camera, rays, resized
+from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
@@ -117,30 +117,6 @@ def test_view_colours_of_far_cascades_match_the_reference(layout: str) -> None:
     assert_as_the_reference(tree, render(tree, camera), *rays(camera))
 
 
-def test_images_are_those_of_their_rays() -> None:
-    tree = random_cascades(2, count=4, brick=3, degree=2, share=0.4)
-    camera = camera_of(tree, distance=1.8)
-    origins, directions = rays(camera)
-    image = render(tree, camera)
-    for given in ({}, {"eye": camera.centre}, {"eye": camera.centre, "columns": camera.width}):
-        flat = render_rays(tree, origins, directions, **given)
-        np.testing.assert_allclose(flat.colour, image.colour.reshape(-1, 3), atol=2e-4)
-        np.testing.assert_allclose(flat.opacity, image.opacity.reshape(-1), atol=1e-4)
-        hit = np.abs(flat.opacity - 0.5) > 1e-3
-        along = flat.depth * (directions @ camera.forward)
-        np.testing.assert_allclose(along[hit], image.depth.reshape(-1)[hit], rtol=1e-3)
-        assert np.quantile(np.abs(flat.normal - image.normal.reshape(-1, 3))[hit], 0.97) < 1e-2
-
-
-@pytest.mark.parametrize("model", LENSES)
-def test_supersampled_images_are_means(model: str) -> None:
-    tree = random_cascades(6, count=3, brick=2, degree=1, share=0.4)
-    camera = camera_of(tree, model, 1.5)
-    fine, image = render(tree, resized(camera, 48, 40)), render(tree, camera, supersample=2)
-    np.testing.assert_allclose(image.colour, fine.colour.reshape(20, 2, 24, 2, 3).mean((1, 3)), atol=1e-4)
-    np.testing.assert_allclose(image.opacity, fine.opacity.reshape(20, 2, 24, 2).mean((1, 3)), atol=1e-4)
-
-
 def test_normals_are_those_of_the_cascade_that_is_hit() -> None:
     tree = random_cascades(5, count=3, brick=4, share=0.5)
     origins, directions = many_rays(tree, 200)
@@ -186,15 +162,6 @@ def test_the_environment_is_seen_along_the_ray_through_what_is_not_opaque(lookup
     assert np.array_equal(seen.opacity, alone.opacity)
 
 
-@pytest.mark.parametrize("height", [1, 2, 3])
-def test_environments_of_few_texels(height: int) -> None:
-    tree = replace(random_tree(0, share=0.0), environment=np.random.default_rng(0).random((height, 2 * height, 3)).astype(np.float32))
-    directions = np.random.default_rng(1).normal(size=(500, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    assert tree.environment is not None
-    np.testing.assert_allclose(render_rays(tree, np.zeros((500, 3)), directions).colour, environment.lookup(tree.environment, directions), atol=1e-6)
-
-
 def without_voxels(tree: NerfTree) -> NerfTree:
     """Its box alone."""
     none = np.zeros((0, tree.harmonics_count, 3), np.float32)
@@ -211,19 +178,6 @@ def test_outer_cascades_that_hold_nothing_change_nothing() -> None:
         one, other = render(tree, camera_of(tree, distance=distance)), render(whole, camera_of(tree, distance=distance))
         for name in FIELDS:
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
-
-
-def test_an_inner_cascade_that_holds_nothing_is_a_hole() -> None:
-    """Voxels that the outer one stores inside of it are not seen, and let the rays that pass between see on."""
-    outer = replace(uniform_tree((4, 4, 4), brick=4, voxel=0.2, sigma=3.0), bounds_min=np.full(3, -1.6))
-    inner = replace(without_voxels(outer), voxel=0.1, bounds_min=np.full(3, -0.8), brick_index=np.full((4, 4, 4), -1, np.int32))
-    tree = nested([inner, outer])
-    origins = np.array([[-3.0, 0.1, 0.2], [0.0, 0.1, 0.2], [-3.0, 1.2, 0.2], [-1.2, 0.1, 0.2]])
-    directions = np.broadcast_to([1.0, 0, 0], (4, 3))
-    lengths = np.array([1.6, 0.8, 3.2, 1.2])
-    found = render_rays(tree, origins, directions)
-    np.testing.assert_allclose(found.opacity, 1 - np.exp(-3.0 * lengths), atol=6e-2)  # the outermost half voxels fade
-    np.testing.assert_allclose(found.opacity, render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions.copy()))[1], atol=1e-3)
 
 
 def test_a_uniform_medium_absorbs_by_the_length_of_the_path() -> None:
@@ -308,7 +262,7 @@ def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: flo
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
-@pytest.mark.parametrize("distance", [1e9, 1e15, 1e18, 1e25, 1e200])
+@pytest.mark.parametrize("distance", [1e15, 1e200])
 def test_rays_from_far_away_end(distance: float) -> None:
     tree = random_cascades(0, count=4)
     directions = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [-0.48, 0.6, 0.64], [np.sqrt(1 / 3)] * 3])
@@ -368,9 +322,3 @@ def test_points_are_looked_up_in_the_cascade_that_they_belong_to(count: int, bri
     assert (owner[-2:] == -1).all()
     assert not density_at(tree, points[-2:]).any()
     assert not density_at(tree, np.array([[np.nan, 0, 0], [np.inf, 0, 0]])).any()
-
-
-def test_memory_of_a_render_counts_all_cascades() -> None:
-    tree = random_cascades(2, count=3, brick=4)
-    alone = cascade_tree(tree, 0)
-    assert rendering.scratch_bytes(tree) - rendering.scratch_bytes(alone) >= 8 * (len(tree.density_values) - len(alone.density_values))

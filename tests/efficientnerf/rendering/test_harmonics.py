@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.rendering.harmonics import basis, basis_numpy, harmonics_count
+from efficientnerf.rendering.harmonics import basis, basis_numpy
 from tests import reference
 
 
@@ -28,10 +28,3 @@ def test_they_are_those_of_the_definition(degree: int) -> None:
     expected = np.array([reference.harmonics(d, degree) for d in directions])
     np.testing.assert_allclose(basis_numpy(directions, degree), expected, atol=1e-12)
     np.testing.assert_allclose(basis(torch.from_numpy(directions), degree).numpy(), expected, atol=1e-12)
-
-
-def test_their_number() -> None:
-    assert [harmonics_count(degree) for degree in range(5)] == [1, 4, 9, 16, 25]
-    for degree in (-1, 5):
-        with pytest.raises(ValueError, match="expected 0 to 4"):
-            harmonics_count(degree)

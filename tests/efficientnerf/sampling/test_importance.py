@@ -227,19 +227,6 @@ def test_counts_are_those_of_the_strategies() -> None:
         model(ContractedSpace(BOUNDS), settings(near_plane=1.0, far_plane=5.0), None, "cpu", (1.0, 5.0))
 
 
-def test_some_rays_are_not_pruned_in_training_only() -> None:
-    m = untrained(occupancy_update_ray_fraction=0.25)
-    m.voxels.values.fill_(-1.0)
-    some = pixels()
-    bundle = [torch.from_numpy(a) for a in some.bundle(np.arange(100, 140))[:4]]
-    offset, behind = torch.full((40,), 0.5), torch.ones(40, 3)
-    seen = render_rays(m, *bundle, offset, behind, rng=np.random.default_rng(0))
-    per_ray = seen.coarse.first.diff()
-    assert (per_ray[:10] > 0).all()
-    assert (per_ray[10:] == 0).all()
-    assert len(render_rays(m, *bundle, offset, behind).coarse.start) == 0
-
-
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
 def test_valid_samples_of_what_is_not_pruned_are_those_that_the_voxels_would_keep(rule: str) -> None:
     """Equation 5 on a trained NeRF: density above zero, read as the voxels read it."""

@@ -79,12 +79,6 @@ def test_a_voxel_of_raw_density_minus_five_is_pruned_at_its_eleventh_visit() -> 
     assert visits == 11
 
 
-def test_momentum_does_not_fade() -> None:
-    voxels = density_voxels(SIDE, "momentum")
-    apply_decay(voxels)
-    assert (voxels.values == 10).all()
-
-
 def test_maximum_keeps_the_largest_and_forgets() -> None:
     voxels = density_voxels(SIDE, "maximum", decay=0.5, threshold=1.0)
     assert (voxels.values == 2).all()
@@ -93,14 +87,6 @@ def test_maximum_keeps_the_largest_and_forgets() -> None:
     apply_decay(voxels)
     expected = [max([2.0, *density[cell == n].tolist()]) / 2 for n in range(SIDE**3)]
     np.testing.assert_allclose(voxels.values.reshape(-1), expected, rtol=1e-6)
-
-
-def test_fresh_voxels_are_all_valid_and_those_at_the_threshold_are_not() -> None:
-    for rule, threshold in (("momentum", 0.0), ("maximum", 0.7)):
-        voxels = density_voxels(SIDE, rule, threshold=threshold)
-        assert voxels.occupied == 1.0
-        voxels.values[0] = threshold
-        assert voxels.occupied == pytest.approx(2 / 3)
 
 
 @pytest.mark.parametrize("padded", [False, True])
@@ -133,11 +119,6 @@ def test_a_reset_leaves_masked_voxels_masked() -> None:
         reset_cells(voxels, wanted)
         assert (voxels.values[~masked] == voxels.start).all()
         assert torch.isneginf(voxels.values[masked]).all()
-
-
-def test_an_unknown_rule_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected 'momentum' or 'maximum'"):
-        density_voxels(SIDE, "average")
 
 
 def test_cells_hold_their_points_and_the_borders_belong_to_the_grid() -> None:

@@ -54,13 +54,3 @@ def test_covariances_are_those_of_the_own_axes() -> None:
     gaussians = some()
     found, axes = covariances(gaussians), rotation_matrices(gaussians.rotations)
     np.testing.assert_allclose(np.einsum("nij,njk->nik", found, axes), axes * np.square(gaussians.scales)[:, None], rtol=1e-5, atol=1e-7)
-
-
-def test_a_subset_keeps_what_belongs_together() -> None:
-    gaussians = some()
-    chosen = gaussians.subset(gaussians.opacities > 0.5)
-    assert 0 < len(chosen) < len(gaussians)
-    assert chosen.degree == 1
-    at = np.flatnonzero(gaussians.opacities > 0.5)[3]
-    assert (chosen.means[3] == gaussians.means[at]).all()
-    assert (chosen.harmonics[3] == gaussians.harmonics[at]).all()

@@ -15,7 +15,7 @@ from efficientnerf.backends.numba.tree.queries import density_at, distance_back
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface import fusion as module
 from efficientnerf.surface.agreement import AssetView, asset_view
-from efficientnerf.surface.fusion import Fusion, front_depth, fused_opacity, fusion_of
+from efficientnerf.surface.fusion import Fusion, front_depth, fused_opacity
 from efficientnerf.surface.mesh import face_vectors, topology
 from efficientnerf.surface.nested import scene_surface
 
@@ -235,13 +235,3 @@ def test_a_region_cuts_cleanly() -> None:
         lid = lid[lid[:, 2] > 0]
         assert topology(mesh.vertices, mesh.faces).watertight
         np.testing.assert_allclose(lid[:, 2], 0.2 - 0.02, atol=0.15 * VOXEL)
-
-
-def test_what_tick_raises_stops_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "RADIUS", 1)
-
-    def stop() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fusion_of(soft_ball(), [ball_view(camera((1, 0, 0)))], stop)

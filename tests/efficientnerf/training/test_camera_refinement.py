@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from efficientnerf.geometry.cameras import Camera, project, rays
-from efficientnerf.training.alignment import EVERY, _choose, is_due, refine_cameras
+from efficientnerf.training.alignment import EVERY, _choose, refine_cameras
 from efficientnerf.training.camera_refinement import (
     Alignment,
     CameraCorrections,
@@ -201,10 +201,3 @@ def test_a_resumed_run_refines_as_an_uninterrupted_one() -> None:
         states.append(state_of(t))
     assert np.abs(states[0]["cameras.pose"].numpy()).max() > 0
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
-
-
-def test_refinement_begins_after_the_first_steps_and_ends_before_the_last() -> None:
-    due = [n for n in range(1, 4001) if is_due(n, n / 4000)]
-    assert due[0] == 600
-    assert due[-1] == 3600
-    assert not is_due(650, 0.2)

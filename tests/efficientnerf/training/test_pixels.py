@@ -17,17 +17,6 @@ def masks_of(share: float) -> list[np.ndarray | None]:
     return found
 
 
-class Counting:
-    """A generator that counts the numbers that are drawn."""
-
-    def __init__(self) -> None:
-        self.rng, self.drawn = np.random.default_rng(0), 0
-
-    def integers(self, most: int, size: int) -> np.ndarray:
-        self.drawn += size
-        return self.rng.integers(most, size=size)
-
-
 @pytest.mark.parametrize("share", [0.0, 0.6])
 def test_usable_pixels_are_chosen_alike(share: float) -> None:
     some = views(masks_of(share))
@@ -41,19 +30,6 @@ def test_usable_pixels_are_chosen_alike(share: float) -> None:
         assert set(index) <= set(usable)
     counts = np.bincount(some.choose(4000, np.random.default_rng(2)), minlength=len(some))[usable]
     assert np.abs(counts * len(usable) / 4000 - 1).max() < 0.3
-
-
-def test_few_pixels_are_drawn_at_once() -> None:
-    some, rng = views(masks_of(0.0)), Counting()
-    some.choose(1000, rng)  # type: ignore[arg-type]
-    assert rng.drawn == 1000
-
-
-def test_without_masks_pixels_are_chosen_as_ever() -> None:
-    some = views()
-    assert some.usable_count == len(some)
-    assert some.listed is None
-    np.testing.assert_array_equal(some.choose(50, np.random.default_rng(0)), np.random.default_rng(0).integers(len(some), size=50))
 
 
 @pytest.mark.parametrize("part", [8, 16, 2**24])

@@ -53,11 +53,3 @@ def test_counts_that_jump_end_in_a_resolution_for_which_there_is_room() -> None:
     choice = affordable_resolution(Choice(400, "pixels"), count, lambda resolution: 9_000)
     assert count(choice.resolution) <= 9_000
     assert choice.resolution >= 200
-
-
-def test_without_room_for_the_coarsest_it_is_taken_all_the_same() -> None:
-    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: resolution**2, lambda resolution: 10).resolution == MIN_RESOLUTION
-
-
-def test_nothing_at_all_is_looked_for_on_the_finest_grid() -> None:
-    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: 0, lambda resolution: 1000).resolution == 400

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
-from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, error_map, grid_sheet, to_uint8, with_palette
+from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, grid_sheet, with_palette
 from stages.io.png import read_png
 
 
@@ -36,26 +35,6 @@ def test_sheets_and_curves_are_the_same_bytes_twice(tmp_path: Path) -> None:
         curve(tmp_path / f"{name}_curve.png", {"loss": ([1, 2, 3], [3.0, float("nan"), 1.0])}, x_label="iteration", y_label="loss", log_y=True)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert (tmp_path / "a_curve.png").read_bytes() == (tmp_path / "b_curve.png").read_bytes()
-
-
-def test_no_images_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no images"):
-        contact_sheet([[]], None, tmp_path / "sheet.png")
-
-
-def test_eight_bits_clips_and_rounds() -> None:
-    assert to_uint8(np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan])).tolist() == [0, 0, 128, 255, 255, 0]
-    with pytest.raises(ValueError, match="int64"):
-        to_uint8(np.array([1]))
-
-
-def test_error_picture_is_black_where_equal_and_bright_where_not() -> None:
-    truth = np.zeros((2, 2, 3))
-    image = truth.copy()
-    image[0, 0] = 0.25
-    picture = error_map(image, truth)
-    assert picture[1, 1].max() < 10
-    assert picture[0, 0].min() > 150
 
 
 def test_a_palette_halves_a_plot_and_shows_the_same(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import typing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,16 @@ import av
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import REGIONS, Region
+from efficientnerf.asset.region import Region
 from efficientnerf.asset.rendering import MOST_PIXELS, Rendering
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
-from pipeline.errors import BadInput, UsageError
+from pipeline.errors import BadInput
 from stages.figures.frames import RenderOptions, render_path
-from stages.framing.camera_paths import PATHS, orbit_of, pose_on_sphere, similarity_of, turntable_cameras
-from stages.framing.captured import captured_metadata, captured_of, coverage
+from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
+from stages.framing.captured import captured_metadata, captured_of
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
-from stages.turntable import TurntableSettings, cameras_of
 from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree
@@ -98,22 +96,6 @@ def test_turntable_of_a_capture_from_one_side_stays_near_the_heading() -> None:
     assert steps.max() < 3 * steps.min(), "the path closes without a jump"
 
 
-def test_strays_at_the_edge_do_not_shrink_the_subject() -> None:
-    class Speckled(BallTree):
-        @property
-        def brick_index(self) -> np.ndarray:
-            index = super().brick_index
-            index[0, 0, 0] = index[-1, -1, -1] = index.max() + 1
-            return index
-
-    clean, speckled = (turntable_cameras(tree, frames=6, width=64, height=48)[0] for tree in (BallTree(), Speckled()))
-    assert speckled.params[0] == pytest.approx(clean.params[0], rel=0.05)
-
-
-def test_an_empty_asset_has_a_turntable() -> None:
-    assert len(turntable_cameras(BallTree(radius=-1.0), frames=3, width=64, height=48)) == 3
-
-
 def test_turntable_takes_elevation_radius_in_capture_units_and_fov() -> None:
     tree = BallTree(similarity=SIMILARITY)
     camera = turntable_cameras(tree, frames=1, width=64, height=48, elevation=0.0, radius=5.0, fov=60.0)[0]
@@ -162,13 +144,6 @@ def test_nerfstudio_path_is_taken_to_the_training_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(project(camera, SIMILARITY.points(np.zeros((1, 3))))[0], [[50.0, 40.0]], atol=1e-6)
 
 
-def test_size_of_a_path_can_be_set(tmp_path: Path) -> None:
-    path = path_file(tmp_path)
-    for given, expected in [({"width": 50}, (50, 40)), ({"height": 40}, (50, 40)), ({"width": 7, "height": 9}, (7, 9))]:
-        camera = read_camera_path(path, SIMILARITY, **given).cameras[0]
-        assert (camera.width, camera.height) == expected
-
-
 IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
@@ -204,15 +179,6 @@ def test_what_is_wrong_with_a_path_is_said(tmp_path: Path, changes: dict[str, An
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[1, 2]", b'{"camera_path": NaN}', b"\xff\xfe", b"[" * 100_000])
-def test_files_that_are_no_path(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "path.json").write_bytes(content)
-    with pytest.raises(BadInput, match=r"path\.json"):
-        read_camera_path(tmp_path / "path.json", SIMILARITY)
-    with pytest.raises(BadInput, match=r"missing\.json"):
-        read_camera_path(tmp_path / "missing.json", SIMILARITY)
-
-
 def test_a_path_is_drawn(tmp_path: Path) -> None:
     tree = BallTree(similarity=SIMILARITY)
     cameras = read_camera_path(path_file(tmp_path), SIMILARITY, width=40).cameras
@@ -227,13 +193,6 @@ def test_a_path_is_drawn(tmp_path: Path) -> None:
     with av.open(str(written[-1])) as container:
         first = next(container.decode(video=0)).to_ndarray(format="rgb24")
     assert first[:4, :4].min() > 250, "what is transparent lies on white in the video"
-
-
-def test_an_unknown_background_is_refused_before_anything_is_drawn(tmp_path: Path) -> None:
-    cameras = turntable_cameras(BallTree(), frames=1, width=16, height=16)
-    with pytest.raises(UsageError, match="background"):
-        render_path(BallTree(), cameras, tmp_path / "out", RenderOptions(background="paper"))
-    assert not (tmp_path / "out").exists()
 
 
 ODD_NUMBERS = [10**400, 1e308, -1e308, 1e-308, 0, -1, 1e31, math.nan, math.inf, "1", [], None, {}, True]
@@ -356,14 +315,6 @@ def test_paths_by_name_and_by_hand() -> None:
     assert turntable_cameras(tree, frames=1, width=64, height=48, path="captured", fov=90.0)[0].params[0] == pytest.approx(24)
 
 
-def test_with_its_surroundings_the_camera_keeps_its_distance() -> None:
-    tree = replace(captured_tree(360.0), region=Region(np.array([[-9.0] * 3, [9.0] * 3])))
-    back, stays = (turntable_cameras(tree, frames=4, width=64, height=48, surroundings=shown) for shown in (False, True))
-    middle = np.median([camera.centre for camera in stays], axis=0)
-    assert np.linalg.norm(back[0].centre - middle) > 1.3 * np.linalg.norm(stays[0].centre - middle)
-    assert 2 * math.degrees(math.atan(24 / stays[0].params[0])) <= 75.001
-
-
 def test_captured_cameras_survive_the_metadata() -> None:
     cameras = arc(360.0, count=150)
     stated = captured_metadata(cameras)
@@ -401,22 +352,6 @@ def test_captured_cameras_that_cannot_be_are_refused(change: dict[str, Any]) -> 
         captured_of({"captured_path": 7})
 
 
-def test_coverage_of_cameras_round_a_point() -> None:
-    found = coverage(np.array([camera.centre for camera in arc(140.0, target=(1.0, 2.0, 3.0))]), np.array([1.0, 2.0, 3.0]))
-    assert found.arc == pytest.approx(0.9 * 140)
-    assert found.heading == pytest.approx(-90)
-    assert found.distance == pytest.approx(3)
-    assert found.elevation == pytest.approx(20, abs=4)
-    assert 5 < found.heights < 10
-    assert coverage(np.array([camera.centre for camera in arc(360.0, count=4)]), np.zeros(3)).arc == 360  # four on all sides
-    assert coverage(np.zeros((1, 3)), np.ones(3)).arc == pytest.approx(0)
-
-
-def test_paths_of_the_setting_are_those_that_there_are() -> None:
-    assert typing.get_args(typing.get_type_hints(TurntableSettings)["path"]) == PATHS
-    assert typing.get_args(typing.get_type_hints(TurntableSettings)["region"]) == REGIONS
-
-
 @pytest.mark.parametrize("path", ["orbit", "sway"])
 def test_a_forward_facing_asset_takes_other_paths_too(path: str) -> None:
     cameras = turntable_cameras(wall(voxels=12), frames=6, width=64, height=48, path=path)
@@ -451,10 +386,3 @@ def test_what_the_path_has_no_use_for_is_told(tree: NerfTree, given: dict[str, A
         without = turntable_cameras(tree, **size, **{key: value for key, value in given.items() if key != name})
         same = all(np.array_equal(a.world_from_camera, b.world_from_camera) and a.params == b.params for a, b in zip(cameras, without, strict=True))
         assert same == (name in expected or name not in given)
-
-
-def test_the_stage_warns_of_each_setting_that_its_path_has_no_use_for() -> None:
-    told: list[str] = []
-    cameras_of(captured_tree(360.0), TurntableSettings(frames=3, path="captured", elevation=5.0, sway=3.0), told.append)
-    path = "has no effect: the camera's path is past the captured cameras (turntable.path=captured)"
-    assert told == [f"turntable.elevation=5 {path}", f"turntable.sway=3 {path}"]

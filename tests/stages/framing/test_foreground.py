@@ -253,13 +253,6 @@ def test_a_facade_before_all_cameras_is_kept_whole() -> None:
     assert (inside_distance(found, in_box([-0.5, -0.15, -1], [0.5, 0.0, 1])) > found.fade).all()
 
 
-def test_the_same_rays_give_the_same_region() -> None:
-    cameras = ring(20, 2.5, 1.0)
-    first, second = (region(cameras, [ball([0, 0, 0], 0.5), ROOM], noise=0.02) for _ in range(2))
-    assert np.array_equal(first.bounds, second.bounds)
-    assert (first.corner_radius, first.fade) == (second.corner_radius, second.fade)
-
-
 def test_the_scale_of_the_scene_does_not_matter() -> None:
     cameras = ring(20, 2.5, 1.0)
     points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5), ROOM])
@@ -273,11 +266,3 @@ def test_the_scale_of_the_scene_does_not_matter() -> None:
     assert found is not None
     assert scaled is not None
     assert scaled.bounds == pytest.approx(8 * found.bounds)
-
-
-def test_rays_that_say_nothing_give_no_region() -> None:
-    cameras = ring(6, 2.0, 1.0)
-    points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5)])
-    assert find_foreground(np.full_like(points, np.inf), views, pixels, cameras) is None
-    assert find_foreground(points, views, pixels, cameras, weights=np.zeros(len(points))) is None
-    assert find_foreground(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)), []) is None

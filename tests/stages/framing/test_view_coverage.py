@@ -19,9 +19,7 @@ from efficientnerf.training.pixels import Pixels
 from stages import bake, train
 from stages.artifacts import BakeOutputs
 from stages.framing.view_coverage import (
-    CLEARANCE,
     before_near,
-    bit_reversed_order,
     cells_before_near,
     cells_below_min_views,
     cells_without_view,
@@ -30,7 +28,6 @@ from stages.framing.view_coverage import (
     kept_pixels,
     poorly_seen,
     shows,
-    shrunk,
 )
 from stages.io.field_file import load_renderer, space_of
 from stages.io.png import write_png
@@ -167,13 +164,6 @@ def test_no_more_are_asked_for_than_a_quarter_of_the_cameras(count: int, needed:
     assert not cells_below_min_views(SPACE, cameras, 0, SIDE).any()
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
-def test_cameras_are_asked_once_each_far_ones_first(count: int) -> None:
-    order = bit_reversed_order(count)
-    assert sorted(order) == list(range(count))
-    assert count < 3 or abs(order[1] - order[0]) >= count // 2
-
-
 def narrow_scene(folder: Path) -> Scene:
     """Photographs of a ball, of which nine are for training, whose corners of the box few of them show."""
     s = load_scene(poses(folder, count=10, photographs=True))
@@ -220,15 +210,6 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, min
     assert few.any() == (min_views == 0)
 
 
-def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_the_box(tmp_path: Path) -> None:
-    narrow_scene(tmp_path / "poses")
-    anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, min_views="off"), poses=tmp_path / "poses")
-    bounded = job(tmp_path / "bounded", balls.settings(iterations=2), poses=poses(tmp_path / "cut", count=10))
-    for made in (anywhere, bounded):
-        train.run(made)
-        assert not torch.isneginf(load_renderer(made.out).model.voxels.values).any()
-
-
 def test_a_view_counts_only_where_its_mask_keeps_the_pixel() -> None:
     cameras = balls.cameras(8)
     points = np.random.default_rng(3).uniform(-0.6, 0.6, (400, 3))
@@ -245,16 +226,6 @@ def test_a_view_counts_only_where_its_mask_keeps_the_pixel() -> None:
     everything = [np.ones((3, 4), bool) for _ in cameras]
     np.testing.assert_array_equal(has_min_views(points, cameras, 2, everything), has_min_views(points, cameras, 2))
     assert not has_min_views(points, cameras, 2, [~mask for mask in everything]).any()
-
-
-def test_small_masks_keep_what_any_pixel_keeps() -> None:
-    mask = np.zeros((30, 47), bool)
-    mask[29, 46] = mask[11, 5] = True
-    small = shrunk(mask, 16)
-    assert small.shape == (11, 16)
-    assert small.sum() == 2
-    assert small[-1, -1]
-    np.testing.assert_array_equal(shrunk(mask, 47), mask)
 
 
 def leaving_out(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
@@ -324,14 +295,3 @@ def test_space_that_cameras_look_through_is_masked_and_no_other(count: int) -> N
         assert masked[tuple((at * side).astype(int))]
         beyond = SPACE.grid(torch.from_numpy(camera.centre + 1.6 * plane * camera.forward)).numpy()
         assert not masked[tuple((beyond * side).astype(int))]
-
-
-def test_the_path_leads_to_neighbours_alone_that_are_close() -> None:
-    first, last = aimed(np.zeros(3), 2)
-    far = float(np.linalg.norm(first.centre - last.centre))
-    middle = (first.centre + last.centre)[None] / 2
-    assert close_to_path(middle, [first, last], [0.6 * far, 0.6 * far])[0]
-    assert not close_to_path(middle, [first, last], [0.3 * far, 0.3 * far])[0]
-    beside = first.centre[None] + np.array([[0.0, 0.0, 1.01 * CLEARANCE * 0.3 * far]])
-    assert not close_to_path(beside, [first], [0.3 * far])[0]
-    assert close_to_path(first.centre[None], [first], [0.3 * far])[0]

@@ -51,22 +51,6 @@ def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path, monk
     assert all(set(few) <= set(many) for few, many in zip(again.points.tracks, capture.points.tracks, strict=True))
 
 
-def test_depth_of_low_confidence_or_out_of_range_is_not_used(tmp_path: Path) -> None:
-    folder, made = sharp(tmp_path / "a")
-    for index in range(6):
-        sure = np.full((48, 64), 127, np.uint8)
-        sure[12:36, 16:48] = 255
-        captures.write_picture(folder / f"keyframes/confidence/img_{index}.png", sure)
-    capture = read(folder)
-    assert capture.points is not None
-    for index, camera in enumerate(made):
-        seen = [point for point, track in zip(capture.points.xyz, capture.points.tracks, strict=True) if index in track]
-        assert (np.abs(project(camera, np.array(seen))[0] - (16, 12)) < (8.1, 6.1)).all(), "in the middle, where the maps are sure"
-    for index, camera in enumerate(made):
-        exports.write_depth(folder / f"keyframes/depth/img_{index}.png", np.where(exports.plane_depth(camera, 64, 48) > 0, 5.5, 0))
-    assert read(folder).points is None
-
-
 def test_depth_that_no_other_image_confirms_is_left_out_with_a_word(tmp_path: Path) -> None:
     folder, _ = sharp(tmp_path / "a")
     random = np.random.default_rng(0)

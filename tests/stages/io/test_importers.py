@@ -90,13 +90,6 @@ def test_of_several_models_the_one_with_most_images_is_taken(tmp_path: Path) -> 
     assert any("sparse/0 (3 images)" in warning for warning in capture.warnings)
 
 
-def test_blenders_splits_and_axes(tmp_path: Path) -> None:
-    capture = read(captures.blender(tmp_path / "a"))
-    assert [photo.split for photo in capture.photos] == ["train"] * 4 + ["test"] * 2
-    assert capture.up is not None
-    assert capture.up.tolist() == [0, 0, 1]
-
-
 def test_nerfstudio_extras(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     made = captures.cameras()
@@ -167,15 +160,6 @@ def test_masks_beside_photographs(tmp_path: Path) -> None:
         assert importers.files(root, Settings()) == sorted([image, made])
 
 
-def test_photographs_anywhere_below(tmp_path: Path) -> None:
-    captures.write_pictures(tmp_path / "a" / "day 1", ["1.png"])
-    captures.write_pictures(tmp_path / "a" / "day 2", ["1.png"])
-    captures.write_pictures(tmp_path / "a" / "masks", ["1.png"])
-    described = describe_source(tmp_path / "a")
-    assert described["format"] == "photographs"
-    assert described["count"] == 2
-
-
 def test_lists_that_have_travelled(tmp_path: Path) -> None:
     made = captures.cameras()
     frames = captures.frames(made)
@@ -212,13 +196,6 @@ def test_cameras_stated_for_the_pixels_as_stored_turn_with_them(tmp_path: Path, 
     for _ in range(turns):
         truth = [rotated_clockwise(camera) for camera in truth]
     assert_same_rays(capture, truth)
-
-
-def test_an_image_listed_twice_counts_once(tmp_path: Path) -> None:
-    frames = captures.frames(captures.cameras())
-    capture = read(captures.nerfstudio(tmp_path / "a", frames=[*frames, frames[0]]))
-    assert len(capture.photos) == 6
-    assert capture.rejected[0][0] == "images/img_0.png"
 
 
 def test_several_formats_in_one_folder_are_named(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from pipeline.stage import Job
 from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo
 from stages.io.png import write_png
 from stages.masking.photographs import _of_turning_subject, mask_choice
-from stages.masking.turning import border_stands_still, masks_of_turning_subject, turn
+from stages.masking.turning import border_stands_still, masks_of_turning_subject
 from stages.poses import PosesSettings, read
 from stages.verdict.verdict import verdict_on
 from tests.stages import turntables
@@ -83,16 +83,6 @@ def test_nothing_is_left_out_where_nothing_moves_or_all_inside_a_frame_does(tmp_
         framed.append(frame.astype(np.uint8))
         framed[-1][20:-20, 20:-20] = rng.integers(0, 255, (200, 280, 3))
     assert not found_in(written(tmp_path / "framed", framed), tmp_path / "framed masks")
-
-
-def test_turn_is_the_largest_angle_between_view_directions() -> None:
-    from stages.io.capture import Photo
-
-    photos = [Photo(camera, Path("none.png")) for camera in turntables.cameras(8)]
-    assert turn(photos[:1]) == pytest.approx(0.0, abs=1e-5)
-    assert 40 < turn(photos[:2]) < 50
-    assert turn(photos) > 120
-    assert turn([]) == 0.0
 
 
 @pytest.mark.parametrize(

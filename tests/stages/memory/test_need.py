@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,6 @@ from stages.bake import BakeSettings
 from stages.evaluate import EvaluateSettings
 from stages.memory.need import Need, has_room, refuse_what_does_not_fit
 from stages.memory.poses import feature_threads, features_needed
-from stages.memory.surface import surface_needed
-from stages.memory.training import rows_for_training, samples_of
 from stages.mesh import MeshSettings
 from stages.points import PointsSettings
 from stages.poses import PosesSettings
@@ -65,12 +62,6 @@ def test_a_need_that_fits_is_recorded_and_one_that_does_not_is_refused(tmp_path:
         " Or give more by --memory."
     )
     assert caught.value.exit_code == 2
-
-
-def test_without_a_known_limit_everything_fits(tmp_path: Path) -> None:
-    need = Need({"pixels": 2**60})
-    assert has_room(job(tmp_path, None), need)
-    refuse_what_does_not_fit(job(tmp_path, None), need, "")
 
 
 def test_what_other_programs_take_is_a_warning_and_no_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,16 +128,6 @@ def test_a_bake_is_refused_where_not_even_its_images_fit(made: dict[str, Path], 
     assert not list(short.work.iterdir())
 
 
-def test_a_bake_that_may_not_fit_says_so_and_goes_on(made: dict[str, Path], tmp_path: Path) -> None:
-    events: list[dict[str, Any]] = []
-    wanted = BakeSettings(resolution=256, max_mib=4096, refine_steps=1, samples_per_voxel=1, visibility_rays=1000)
-    tight = limited(job(tmp_path, wanted, poses=made["poses"], train=made["train"]), GIB, events)
-    tight.safe_point = lambda: (_ for _ in ()).throw(KeyboardInterrupt)  # type: ignore[method-assign]
-    with pytest.raises(KeyboardInterrupt):
-        bake.run(tight)
-    assert any("an asset of 4096 MiB may need" in event.get("text", "") for event in events)
-
-
 def test_a_photograph_that_does_not_fit_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
     source = tmp_path / "photographs"
     source.mkdir()
@@ -171,13 +152,6 @@ def test_features_are_detected_on_as_many_threads_as_fit(tmp_path: Path) -> None
     assert features_needed([(900, 600)], 1600, 4096, 1).total > features_needed([(1000, 600)], 1600, 4096, 1).total  # detected at twice the size
 
 
-def test_a_step_has_the_samples_of_its_batch_or_of_its_rays() -> None:
-    small = settings(sample_batch_size=1000, max_rays_per_batch=64, max_pivots=8, samples_per_pivot=4)
-    assert samples_of(small, 100) == 2000
-    assert samples_of(dataclasses.replace(small, sample_batch_size="off"), 100) == 64 * 132
-    assert samples_of(dataclasses.replace(small, max_rays_per_batch=1), 100) == 132
-
-
 def test_enclosed_space_is_found_with_any_number_of_bricks_at_once(made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     from efficientnerf.asset.format import load
     from efficientnerf.surface import isosurface
@@ -188,19 +162,3 @@ def test_enclosed_space_is_found_with_any_number_of_bricks_at_once(made: dict[st
     whole = isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3)))
     monkeypatch.setattr(volumes, "VOXELS_AT_ONCE", 1)
     assert np.array_equal(isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3))), whole)
-
-
-def test_points_count_beside_the_surface(made: dict[str, Path]) -> None:
-    from efficientnerf.asset.format import load
-
-    tree = load(made["bake"] / BakeOutputs.asset)
-    assert surface_needed(tree, 1000).total > surface_needed(tree).total
-
-
-def test_rows_are_in_memory_where_they_fit(made: dict[str, Path], tmp_path: Path) -> None:
-    from stages.io import scene
-    from stages.io.field_file import space_of
-
-    s = scene.load(made["poses"])
-    views = scene.views_of(s, "train")
-    assert rows_for_training(limited(job(tmp_path, None), 8 * GIB), made["poses"], views, settings(**QUICK), space_of(s)) is None

@@ -12,7 +12,7 @@ from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.filling import carried_on
-from efficientnerf.surface.texturing.photographs import REACH, Photograph, PhotographTexture, edge_distance, halved, photograph, survey, texels_wanted
+from efficientnerf.surface.texturing.photographs import REACH, PhotographTexture, edge_distance, photograph, survey
 
 from .shapes import ball, box, cameras, pattern, photographed, textured
 
@@ -143,18 +143,6 @@ def away(camera: Camera) -> Camera:
     return replace(camera, world_from_camera=pose)
 
 
-def test_photographs_of_nothing_leave_what_is_expected() -> None:
-    vertices, faces = ball(2)
-    white = np.full((96, 96, 3), 255, np.uint8)
-    for photos in (
-        [Photograph(away(camera), white, np.ones((96, 96), bool)) for camera in cameras(3)],
-        [Photograph(camera, white, np.zeros((96, 96), bool)) for camera in cameras(3)],
-    ):
-        _, colours, known = textured(vertices, faces, photos, expected=(10, 20, 30))
-        assert (known == 0).all()
-        np.testing.assert_array_equal(np.unique(np.round(colours * 255), axis=0), [[10, 20, 30]])
-
-
 def test_a_blurred_photograph_counts_less() -> None:
     vertices, faces = ball(3)
     normals = vertex_normals(vertices, faces)
@@ -181,18 +169,6 @@ def test_the_same_bytes_on_any_number_of_threads(threads: int) -> None:
     np.testing.assert_array_equal(first, again)
 
 
-def test_halved_photographs_show_the_same_places() -> None:
-    camera = replace(cameras(1, size=97)[0], height=95)
-    ramp = np.linspace(0, 255, 97) * np.ones((95, 1))
-    photo = Photograph(camera, np.repeat(ramp[..., None], 3, 2).astype(np.uint8), np.ones((95, 97), bool))
-    half = halved(photo)
-    assert half.colours.shape == (47, 48, 3)
-    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.3
-    np.testing.assert_allclose(project(half.camera, points)[0], project(camera, points)[0] / 2, atol=1e-6)
-    row, column = 20, 30
-    assert abs(int(half.colours[row, column, 0]) - float(photo.colours[2 * row : 2 * row + 2, 2 * column : 2 * column + 2, 0].mean())) <= 1
-
-
 def test_a_texel_sees_all_pixels_that_lie_in_it() -> None:
     """Photographs that are finer than the texture: a chequered pattern of pixels becomes its mean, not either colour."""
     vertices, faces = ball(3)
@@ -203,15 +179,6 @@ def test_a_texel_sees_all_pixels_that_lie_in_it() -> None:
         photos.append(replace(photo, colours=np.repeat(np.where((x + y) % 2, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)))
     _, colours, known = textured(vertices, faces, photos, size=64)
     assert np.abs(colours[known > 0.95] - 0.5).max() < 0.06
-
-
-def test_a_texel_is_as_large_as_a_pixel() -> None:
-    vertices, faces = ball(4)
-    camera = cameras(1)[0]
-    found = survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), photographed(vertices, faces, camera))
-    nearest = 1.1 * 96 / (3.2 - 1)  # pixels for each unit of the surface that faces the camera
-    assert 0.5 * nearest < texels_wanted(vertices, faces, found.density) / 1.25 < nearest
-    assert np.isinf(texels_wanted(vertices, faces, np.zeros(len(faces))))
 
 
 def test_many_photographs_keep_the_best() -> None:
