@@ -71,8 +71,7 @@ def check_laws(capture: Capture, framed: TrainingFrame) -> None:
 # -------------------------------------------------------------------------------------------------------------------- up
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("arc", [360.0, 150.0, 40.0])
+@pytest.mark.parametrize(("seed", "arc"), [(0, 360.0), (1, 150.0), (2, 40.0), (3, 40.0)])
 def test_up_is_found_from_level_cameras(seed: int, arc: float) -> None:
     cameras = ring(24, 2.0, 1.0, np.zeros(3), arc=arc, roll=0.01)
     rotation = some_rotation(seed)
@@ -81,7 +80,7 @@ def test_up_is_found_from_level_cameras(seed: int, arc: float) -> None:
     assert np.degrees(np.arccos(found @ rotation[:, 2])) < (1.0 if arc > 100 else 10.0)
 
 
-@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, 1, 0], [-1, 0, 0], [0.6, 0.0, -0.8], [0.1, -0.9, 0.2]])
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0.1, -0.9, 0.2]])
 def test_rotation_to_z(up: list[float]) -> None:
     unit = np.array(up) / np.linalg.norm(up)
     rotation = rotation_to_z(unit)
@@ -104,8 +103,7 @@ def test_stated_up_keeps_the_axes() -> None:
 # ------------------------------------------------------------------------------------------------------------------- box
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("arc", [360.0, 170.0])
+@pytest.mark.parametrize(("seed", "arc"), [(0, 360.0), (1, 170.0), (2, 360.0)])
 def test_box_holds_the_subject_and_not_the_room(seed: int, arc: float) -> None:
     subject, wall = scene_points(seed)
     cameras = ring(30, 1.6, 0.8, np.array([0, 0, 0.2]), arc=arc)

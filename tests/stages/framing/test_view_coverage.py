@@ -89,8 +89,7 @@ def aimed(at: np.ndarray, count: int) -> list[Camera]:
     return out
 
 
-@pytest.mark.parametrize("side", [24, 17])
-@pytest.mark.parametrize("min_views", [2, 3])
+@pytest.mark.parametrize(("side", "min_views"), [(24, 2), (17, 3)])
 def test_it_is_the_voxels_in_or_before_the_box_that_few_cameras_project_into_their_pictures(side: int, min_views: int) -> None:
     cameras = [narrow(camera, 1.8) for camera in balls.cameras(12)]
     world, box = centres(side)
@@ -107,7 +106,7 @@ def test_it_is_the_voxels_in_or_before_the_box_that_few_cameras_project_into_the
     np.testing.assert_array_equal(cells_below_min_views(SPACE, cameras, min_views, side), expected)
 
 
-@pytest.mark.parametrize(("watching", "min_views", "closed"), [(0, 2, True), (1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
+@pytest.mark.parametrize(("watching", "min_views", "closed"), [(1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
 def test_a_place_that_enough_cameras_see_is_open_and_one_that_fewer_see_is_not(watching: int, min_views: int, closed: bool) -> None:
     """Twelve cameras look at the middle; a place beside it is seen by those alone that look there."""
     beside = np.array([0.85, 0.8, 1.05])
@@ -150,18 +149,6 @@ def test_what_stands_before_the_box_for_a_camera_that_just_misses_it_is_poorly_s
     assert among([*one_side, looking_along_y(0.0, x=0.45, back=True)]) >= among(one_side)  # something behind it, which could as well be farther away
     assert "before the box" not in among([*one_side, looking_along_y(0.0, x=0.45, back=True), looking_along_y(0.0, x=0.5, back=True)])
     assert not among(one_side[:4])  # of four cameras one is enough
-
-
-@pytest.mark.parametrize(("count", "needed"), [(1, 1), (4, 1), (5, 2), (8, 2), (9, 3), (40, 3)])
-def test_no_more_are_asked_for_than_a_quarter_of_the_cameras(count: int, needed: int) -> None:
-    """All look at the middle, and `needed` or one less of them at a place beside it."""
-    beside = np.array([0.85, 0.8, 1.05])
-    world, inside = centres()
-    lump = tuple(np.argwhere(inside)[np.argmin(np.linalg.norm(world[inside] - beside, axis=-1))])
-    for watching in (needed - 1, needed):
-        cameras = [*aimed(np.zeros(3), count - watching), *aimed(beside, watching)]
-        assert cells_below_min_views(SPACE, cameras, 3, SIDE)[lump] == (1 < needed > watching)
-    assert not cells_below_min_views(SPACE, cameras, 0, SIDE).any()
 
 
 def narrow_scene(folder: Path) -> Scene:
@@ -278,7 +265,7 @@ def test_training_learns_nothing_behind_ignored_pixels(tmp_path: Path) -> None:
     assert expected[(distance > 0.9) & (distance < 0.98)].mean() < 0.3
 
 
-@pytest.mark.parametrize("count", [1, 2, 9])
+@pytest.mark.parametrize("count", [1, 9])
 def test_space_that_cameras_look_through_is_masked_and_no_other(count: int) -> None:
     cameras = balls.cameras(count)
     near = [0.3 * float(np.linalg.norm(camera.centre)) for camera in cameras]
