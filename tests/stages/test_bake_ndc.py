@@ -75,29 +75,6 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     assert not [event for event in told if event["event"] == "warning"]
 
 
-def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path], tmp_path: Path) -> None:
-    made = job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4, discretise=48), poses=inputs["poses"])
-    train.run(made)
-    on_voxels = {**inputs, "train": made.out}
-    told: list[dict[str, Any]] = []
-    tree = baked(tmp_path / "own", on_voxels, told, resolution=48)
-    assert tree.ndc is not None
-    assert tree.ndc.to_json() == load_renderer(made.out, "cpu").model.space.ndc.to_json()
-    assert not [event for event in told if event["event"] == "warning"]
-    baked(tmp_path / "other", on_voxels, told, resolution=48, ndc_voxel_depth=2.0)
-    assert any("bake.ndc_voxel_depth=2" in event["text"] and "train.discretise=48" in event["text"] for event in told if event["event"] == "warning")
-
-
-def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
-    scene = poses(tmp_path / "poses")
-    train.run(job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4), poses=scene))
-    told: list[dict[str, Any]] = []
-    tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_voxel_depth=2.0)
-    assert tree.ndc is None
-    assert len(set(tree.resolution)) == 1
-    assert any("bake.ndc_voxel_depth" in event["text"] for event in told if event["event"] == "warning")
-
-
 def test_a_space_of_deeper_voxels_has_the_same_grid_coordinates(inputs: dict[str, Path]) -> None:
     space = load_renderer(inputs["train"], "cpu").model.space
     assert isinstance(space, NdcSpace)

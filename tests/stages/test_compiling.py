@@ -31,12 +31,6 @@ def test_a_stage_says_that_it_compiles_kernels_when_the_first_is_and_how_long_th
     assert len(events) == 2
 
 
-def test_a_stage_that_finds_its_kernels_says_nothing(tmp_path: Path) -> None:
-    events: list[dict[str, Any]] = []
-    compiling_kernels(lambda job: None)(job(tmp_path, None, events=events))
-    assert events == []
-
-
 def test_the_clock_of_a_budget_stands_still_while_kernels_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now, heard = [100.0], []
     monkeypatch.setattr(compiling.time, "monotonic", lambda: now[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-import warnings
 
 import pytest
 
@@ -49,15 +48,3 @@ def test_an_error_is_raised_in_its_place(threads: int) -> None:
     with pytest.raises(KeyError, match="4"):
         done.extend(in_order(work, range(9), threads, lambda: None))
     assert done == [0, 1, 2, 3]
-
-
-def test_filters_of_warnings_are_as_before() -> None:
-    def work(item: int) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            time.sleep(0.001)
-            warnings.warn("of a damaged file", stacklevel=1)
-
-    before = list(warnings.filters)
-    list(in_order(work, range(12), 4, lambda: None))
-    assert list(warnings.filters) == before

@@ -26,13 +26,6 @@ def test_stops_are_those_of_the_exposure_whatever_is_shown(stops: float) -> None
         assert found == pytest.approx(stops, abs=0.05)
 
 
-def test_few_points_and_points_outside_of_the_picture_tell_nothing() -> None:
-    light = np.full(40, 0.2)
-    assert over_points(photograph(light, 0), places(40)[: LEAST_POINTS - 1], light[: LEAST_POINTS - 1]) is None
-    assert over_points(photograph(light, 0), places(40) + 100, light) is None
-    assert over_points(photograph(light, 9), places(40), light) is None  # white holds nothing
-
-
 def looks_of(brightness: list[float], over: list[float | None]) -> dict[str, Look]:
     plain = look(np.full((64, 64), 100, np.uint8))
     return {

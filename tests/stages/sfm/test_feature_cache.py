@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from stages.sfm import feature_cache, matches
-from stages.sfm.colmap import import_pycolmap
 from stages.sfm.database import FEATURES, database_path, open_database, rows_of
 from stages.sfm.images import WorkImage, prepare_images
 
@@ -80,14 +79,6 @@ def test_other_options_and_masks_are_looked_at_anew(monkeypatch: pytest.MonkeyPa
     Image.fromarray(np.full((192, 256), 255, np.uint8)).save(cache.parent / "mask.png")
     masked = cache.parent / "masked"
     assert len(detected(monkeypatch, masked, opened(photographs, masked, masks={"0.png": cache.parent / "mask.png"}))) == 3
-
-
-def test_another_build_of_colmap_looks_anew(monkeypatch: pytest.MonkeyPatch, cache: Path, photographs: Path) -> None:
-    first, second = cache.parent / "first", cache.parent / "second"
-    detected(monkeypatch, first, opened(photographs, first))
-    monkeypatch.setattr(import_pycolmap(), "COLMAP_build", "Commit 0000000")
-    feature_cache.folder.cache_clear()
-    assert len(detected(monkeypatch, second, opened(photographs, second))) == 3
 
 
 @pytest.mark.parametrize("damage", ["cut", "altered", "empty", "of_another_kind", "a_folder", "a_link"])

@@ -13,7 +13,7 @@ from PIL import Image, ImageFilter
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.sfm import ladder, lenses, mapping, matches, merging, pairs, reconstruction
+from stages.sfm import ladder, lenses, mapping, matches, merging, pairs
 from stages.sfm.images import WorkImage
 from stages.sfm.reconstruction import find_cameras
 
@@ -85,15 +85,6 @@ def test_nothing_more_is_tried_where_every_photograph_has_a_camera(monkeypatch: 
     assert not (tmp_path / "rungs").exists()
 
 
-def test_one_lost_photograph_is_worth_the_cheap_rungs_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (19, 0.95), "fewer matches": (19, 0.95), "wider matching": (19, 0.95)})
-    found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", "wider matching"]
-    assert rig.weak == [[19]]
-    assert found.models[0].rung == "exhaustive"  # of equals the first
-    assert found.work == tmp_path
-
-
 def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
@@ -110,14 +101,7 @@ def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypat
     assert found.models[0].rung == found.rung == "another beginning"
 
 
-def test_a_folded_scene_is_begun_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.5), "another beginning": (20, 0.97)})
-    found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "another beginning"]
-    assert found.models[0].rung == "another beginning"
-
-
-@pytest.mark.parametrize(("each", "kept"), [((20, 0.97), True), ((20, 0.92), False), ((10, 0.99), False), ((0, 0.0), False)])
+@pytest.mark.parametrize(("each", "kept"), [((20, 0.97), True), ((20, 0.92), False), ((10, 0.99), False)])
 def test_focal_lengths_of_their_own_are_kept_where_they_explain_what_disagreed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, each: tuple[int, float], kept: bool
 ) -> None:
@@ -190,12 +174,6 @@ def test_networks_come_last_and_for_photographs_without_a_camera_alone(
     assert compared == ([[(i, j) for i, j in sorted(pairs.all_pairs(20)) if {i, j} & weak]] if tried else [])
 
 
-def test_nothing_at_all_is_no_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    found = climbed(Rig(monkeypatch, {}), tmp_path)
-    assert found.models == []
-    assert {rung["registered"] for rung in found.rungs} == {0}
-
-
 def test_a_weak_photograph_is_matched_with_all_but_those_it_overlaps_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: dict[str, Any] = {}
     monkeypatch.setattr(ladder, "neighbours", lambda work, count: {i: {5} if i == 3 else {3} if i == 5 else set() for i in range(count)})
@@ -225,15 +203,6 @@ def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> 
     errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))
     assert len(errors) == 6
     assert errors.max() < 0.02
-
-
-def test_sub_models_are_said_that_have_photographs_which_the_largest_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(ladder, "neighbours", lambda work, count: {i: set() for i in range(count)})
-    monkeypatch.setattr(reconstruction, "planar_share", lambda path: None)
-    parts = [range(17), range(12, 17), range(15, 20), range(17, 20)]
-    models = [SimpleNamespace(images={k: SimpleNamespace(name=IMAGES[k].file, has_pose=True) for k in part}) for part in parts]
-    assert reconstruction._facts_of_matching(IMAGES, ladder.Found(models, tmp_path, []), "exhaustive")["models"] == [17, 5, 3]
-    assert reconstruction._facts_of_matching(IMAGES, ladder.Found([], tmp_path, []), "exhaustive")["models"] == []
 
 
 def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:

@@ -139,20 +139,6 @@ def test_a_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> No
         assert page.console == []
 
 
-def test_an_altered_page_says_so(chromium: Any, tmp_path: Path) -> None:
-    good = serialize(random_tree(1), "compact")
-    altered = bytearray(good)
-    altered[-1] ^= 1
-    with browser.opened(chromium, written(tmp_path, bytes(altered))) as page:
-        assert "refused" in page.refusal()
-        assert "SHA-256" in page.refusal()
-        assert page.console == []
-    text = viewer_page(good).decode().replace(f'"bytes":{len(good)}', f'"bytes":{len(good) - 1}')
-    (tmp_path / "viewer.html").write_text(text)
-    with browser.opened(chromium, tmp_path / "viewer.html") as page:
-        assert "longer than it states" in page.refusal()
-
-
 def test_a_large_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> None:
     """Of several parts of data, cut short or altered anywhere: the asset in it, or the page itself."""
     good = serialize(random_tree(1, shape=(20, 20, 20), brick=4, degree=2, share=0.6), "compact")
