@@ -303,9 +303,9 @@ def test_paths_by_name_and_by_hand() -> None:
 
 def test_captured_cameras_that_cannot_be_are_refused() -> None:
     upright = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]
-    wrong: list[Any] = [[], [[0.0] * 12], [[1.0] * 11], [[*upright[:11], math.nan]], [[*upright[:10], -1, 0]], [[1, 0, 0, 1e300, *upright[4:]]], "x", [upright] * 65]
+    wrong: list[Any] = [[], [[0.0] * 12], [[1.0] * 11], [[*upright[:11], math.nan]], [[*upright[:10], -1, 0]], [[1, 0, 0, 1e300, *upright[4:]]], "x"]
     stated = captured_metadata(arc(90.0))
-    for change in [{"poses": poses} for poses in wrong] + [{"focal": 0}, {"width": -3}, {"height": None}, {"focal": math.inf}]:
+    for change in [{"poses": poses} for poses in [*wrong, [upright] * 65]] + [{"focal": 0}, {"width": -3}, {"height": None}, {"focal": math.inf}]:
         with pytest.raises(BadInput, match="captured_path"):
             captured_of({"captured_path": stated | change})
     with pytest.raises(BadInput, match="captured_path"):

@@ -143,7 +143,7 @@ def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
         with pytest.raises(CorruptArtifact):
             read(tmp_path, view)
     captures.write_picture(tmp_path / view.image, captures.picture(1, 12, 12))
-    with pytest.raises(CorruptArtifact, match="12x12.*16x12"):
+    with pytest.raises(CorruptArtifact, match=r"12x12.*16x12"):
         scene.read_image(tmp_path, view)
 
 

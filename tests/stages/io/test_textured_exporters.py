@@ -269,7 +269,7 @@ BROKEN = {
 @pytest.mark.parametrize("extension", [".glb", ".obj", ".usdz"])
 def test_broken_textures_are_refused(extension: str, tmp_path: Path) -> None:
     for mesh in BROKEN.values():
-        with pytest.raises(BadInput, match="texture|coordinates|normal"):
+        with pytest.raises(BadInput, match=r"texture|coordinates|normal"):
             MESH_EXPORTERS[extension](mesh, tmp_path / f"a{extension}", Z_UP)
     assert list(tmp_path.iterdir()) == []
 

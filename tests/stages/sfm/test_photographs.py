@@ -314,7 +314,7 @@ def test_photographs_that_show_nothing_in_common_are_named(tmp_path: Path) -> No
     names = [f"{index}.png" for index in range(4)]
     for name in names:
         Image.fromarray(rng.integers(0, 255, (24, 32, 3), np.uint8)).resize((320, 240), Image.Resampling.BICUBIC).save(tmp_path / name)
-    with pytest.raises(BadInput, match="0 of 4 .*0.png, 1.png, 2.png"):
+    with pytest.raises(BadInput, match=r"0 of 4 .*0.png, 1.png, 2.png"):
         find(tmp_path, names, tmp_path / "w")
 
 
