@@ -45,9 +45,6 @@ def baked(folder: Path, inputs: dict[str, Path], told: list[dict[str, Any]] | No
 def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path) -> None:
     cubes, deep = baked(tmp_path / "cubes", inputs, ndc_voxel_depth=1.0), baked(tmp_path / "deep", inputs)
     space = load_renderer(inputs["train"], "cpu").model.space
-    assert cubes.ndc is not None
-    assert deep.ndc is not None
-    assert space.ndc is not None
     assert cubes.ndc.to_json() == space.ndc.to_json()
     assert deep.ndc.slopes == pytest.approx(tuple(NdcSpace.voxel_depth * slope for slope in space.ndc.slopes))
     # As many voxels across, half as many in depth.
@@ -89,7 +86,6 @@ def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:
     small, large, huge = (forward_facing(side) for side in (200, 1000, 4000))
     assert budget_of(small, None) == NDC_MIN_MIB
     assert budget_of(huge, None) == NDC_MAX_MIB
-    assert large.forward is not None
     across, down = (large.forward.bounds[1] - large.forward.bounds[0])[:2] / ndc_pixel(large, large.forward)
     assert budget_of(large, None) == int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
     assert budget_of(huge, 7) == 7

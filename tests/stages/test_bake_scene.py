@@ -87,9 +87,7 @@ def test_a_view_that_was_held_back_is_shown_whole_by_the_asset_alone(inputs: dic
     assert len(tree.outer) >= 2
     assert report["cascades"] == np.bincount(voxel_cascades(tree)).tolist()
     assert min(report["cascades"]) > 0
-    assert tree.environment is not None
     assert tree.environment.shape == (16, 32, 3)
-    assert tree.region is not None
     assert (cascades_of(tree)[0].bounds(tree.brick)[0] <= tree.region.bounds[0] + 1e-6).all()
     assert (cascades_of(tree)[0].bounds(tree.brick)[1] >= tree.region.bounds[1] - 1e-6).all()
     outermost = cascades_of(tree)[-1].bounds(tree.brick)
@@ -289,11 +287,9 @@ def test_voxels_of_a_cascade_reach_into_the_one_before_by_one(inputs: dict[str, 
 def test_bounds_given_by_hand_are_the_region(tmp_path: Path, inputs: dict[str, Path]) -> None:
     poses = shutil.copytree(inputs["poses"], tmp_path / "poses")
     found, _ = baked(tmp_path / "found", inputs | {"poses": poses}, refine_steps=0)
-    assert found.region is not None
     assert np.abs(found.region.bounds - BOUNDS).max() > 0.01
     (poses / PosesOutputs.report).write_text(json.dumps({"framing": {"bounds_from": "given"}}))
     given, _ = baked(tmp_path / "given", inputs | {"poses": poses}, refine_steps=0)
-    assert given.region is not None
     assert np.array_equal(given.region.bounds, BOUNDS)
     assert (given.bounds_min <= BOUNDS[0] + 1e-9).all()
     assert (given.bounds_max >= BOUNDS[1] - 1e-9).all()

@@ -69,10 +69,8 @@ def test_overlap_counts_what_moves_alike_and_what_stands_still(tmp_path: Path) -
     scene = panorama(0)
     one, near, far, other = (small_of(p, tmp_path / "p.png") for p in (relief(scene, 0), relief(scene, 12), relief(scene, 400), relief(panorama(1), 0)))
     same = overlap_of(one, one)
-    assert same is not None
     assert (same.still, same.plane) == (1.0, 1.0)
     moved = overlap_of(one, near)
-    assert moved is not None
     assert moved.matches >= preflight.OVERLAP
     assert moved.still < 0.1
     assert overlap_of(one, far) is None

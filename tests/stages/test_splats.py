@@ -89,7 +89,6 @@ def test_they_are_as_good_as_the_asset_on_views_that_are_held_back(tmp_path: Pat
     splats.run(Job(settings=settings, inputs=inputs, out=tmp_path / "out", work=tmp_path / "work"))
     tree = load(inputs["bake"] / "asset.nerftree")
     measured = load_splats(SplatsOutputs(tmp_path / "out"), tree)
-    assert measured is not None
     views = [view for view in load_scene(inputs["poses"]).views if view.split == "test"]
     for camera in [*(view.camera for view in views), *cameras(20, 48)[16:]]:
         straight = picture(camera) / 255

@@ -246,7 +246,6 @@ def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, di
         used[choice] = begin_exposure(scene, s, pixels_of(scene, scenes.views_of(s, "train")), choice, "cpu")
     assert (used["auto"] is not None) == differ
     assert used["off"] is None
-    assert used["on"] is not None
     stops = used["on"].log_gains().detach().numpy()[:, 1] / np.log(2)
     if differ:
         assert stops[1] - stops[0] == pytest.approx(np.log2(linear_from_srgb(121.5 / 255) / linear_from_srgb(71.5 / 255)), abs=0.1)

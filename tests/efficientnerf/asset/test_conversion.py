@@ -104,8 +104,6 @@ def test_cascades_get_larger_voxels_in_smaller_bricks_and_keep_their_boxes() -> 
             assert old.shape == new.shape
             np.testing.assert_allclose(old.bounds(tree.brick), new.bounds(fewer.brick))
             assert np.array_equal(old.brick_index >= 0, new.brick_index >= 0)
-        assert fewer.region is not None
-        assert tree.region is not None
         assert np.array_equal(fewer.region.bricks, tree.region.bricks)  # type: ignore[arg-type]
         assert np.array_equal(fewer.environment, tree.environment)  # type: ignore[arg-type]
     for name, found in zip(("colour", "opacity"), reference_images(with_resolution(tree, 16), tree), strict=True):
@@ -136,7 +134,6 @@ def test_the_bricks_of_a_region_follow_their_place() -> None:
     assert tree.region is not None
     for resolution in (10, 7, 5, 3):
         fewer = with_resolution(tree, resolution)
-        assert fewer.region is not None
         assert fewer.region.bricks is not None
         assert len(fewer.region.bricks) == len(fewer.voxel_index)
         # A voxel's centre, and the brick of the new tree that holds it.

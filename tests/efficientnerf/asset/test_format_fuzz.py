@@ -14,8 +14,6 @@ SCRIPT = Path(__file__).resolve().parents[3] / "benchmarks" / "fuzz_format.py"
 
 def fuzz() -> ModuleType:
     spec = importlib.util.spec_from_file_location("fuzz_format", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(SCRIPT.parent))
     try:

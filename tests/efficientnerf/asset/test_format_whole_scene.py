@@ -84,8 +84,6 @@ def test_bricks_of_a_region_follow_the_order_of_the_file(tmp_path: Path) -> None
     """A tree whose bricks are numbered otherwise is the same tree, and the same file."""
     made = random_tree(3)
     tree = replace(made, region=region(made))
-    assert tree.region is not None
-    assert tree.region.bricks is not None
     order = np.random.default_rng(0).permutation(len(tree.voxel_index))
     number = np.argsort(order).astype(np.int32)
     other = replace(

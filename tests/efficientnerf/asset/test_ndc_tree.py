@@ -123,7 +123,6 @@ def test_frame_rays_are_where_the_grid_is() -> None:
     origins, directions = np.array([[0.3, -1.0, 0.2]]), np.array([[0.1, 1.0, -0.05]]) / np.linalg.norm([0.1, 1.0, -0.05])
     seen = render_rays(tree, origins, directions)
     warped = tree.frame.rays(origins, directions)
-    assert tree.ndc is not None
     point = tree.ndc.points(origins + seen.depth[:, None].astype(np.float64) * directions)
     along = point - warped.origins
     np.testing.assert_allclose(np.cross(along, warped.directions), 0, atol=1e-6)

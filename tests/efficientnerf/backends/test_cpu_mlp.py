@@ -173,5 +173,4 @@ def test_the_field_is_that_of_plain_torch(precision: str, near: float, layers: i
     mine, its = ([group.gradient(name) for name in group.parameters] for group in groups)
     for one, other in zip(mine, its, strict=True):
         assert one is not None
-        assert other is not None
         assert (one - other).norm() < 5 * near * other.norm()  # ReLUs close to zero fall to the other side

@@ -77,8 +77,7 @@ def assert_as_the_reference(tree: NerfTree, outputs: Rendering, origins: np.ndar
     assert opacity.max() > 0.5
 
 
-@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
-@pytest.mark.parametrize("layout", ["floats", "codes"])
+@pytest.mark.parametrize(("count", "brick", "degree", "layout"), [(*case, layout) for case, layout in zip(CASES, 3 * ["floats", "codes"], strict=True)])
 def test_rays_match_the_reference(count: int, brick: int, degree: int, layout: str) -> None:
     tree = random_cascades(count + brick, count=count, brick=brick, degree=degree)
     if layout == "codes":
@@ -94,8 +93,8 @@ def test_rays_match_the_reference(count: int, brick: int, degree: int, layout: s
     np.testing.assert_allclose(outputs.depth[hit], expected[hit], rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
-@pytest.mark.parametrize(("model", "distance"), [*((model, distance) for model in LENSES for distance in (0.02, 1.2, 2.7)), ("PINHOLE", 40.0)])
+@pytest.mark.parametrize(("model", "distance"), [*((model, distance) for model in LENSES for distance in (0.02, 2.7)), ("PINHOLE", 40.0)])
+@pytest.mark.parametrize(("count", "brick", "degree"), CASES[2:4])
 def test_images_match_the_reference(count: int, brick: int, degree: int, model: str, distance: float) -> None:
     tree = random_cascades(count, count=count, brick=brick, degree=degree, share=0.4)
     camera = camera_of(tree, model, distance)
@@ -128,7 +127,7 @@ def test_normals_are_those_of_the_cascade_that_is_hit() -> None:
     assert np.quantile(np.abs(outputs.normal[hit] - normal_at(tree, at)), 0.97) < 1e-3
 
 
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.2, 0.5, 0.9)])
+@pytest.mark.parametrize("background", [(0.2, 0.5, 0.9)])
 def test_a_background_takes_the_place_of_the_environment(background: tuple[float, float, float]) -> None:
     tree = random_cascades(1)
     camera = camera_of(tree)
@@ -180,25 +179,6 @@ def test_outer_cascades_that_hold_nothing_change_nothing() -> None:
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
-def test_a_uniform_medium_absorbs_by_the_length_of_the_path() -> None:
-    """Far from the faces of the last box it does not matter how many cascades hold it."""
-    count, sigma = 3, 0.7
-    grids = cascade_grids(np.array([[-0.8] * 3, [0.8] * 3]), 0.1, 4, count)
-    tree = nested([replace(uniform_tree(shape, brick=4, voxel=voxel, sigma=sigma), bounds_min=low) for shape, voxel, low in grids])
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(200, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = rng.uniform(-2, 2, (200, 3))
-    with np.errstate(divide="ignore"):
-        length = np.maximum((3.2 - origins) / directions, (-3.2 - origins) / directions).min(axis=1)
-    found = render_rays(tree, origins, directions)
-    # Sums of half steps on either side of a face, and the last half voxel, in which density falls to one half.
-    np.testing.assert_allclose(-np.log1p(-found.opacity.astype(np.float64)), sigma * length, atol=sigma * 0.6)
-    deep = np.isfinite(found.depth) & (np.log(2) / sigma < length - 0.6)
-    assert deep.sum() > 100
-    np.testing.assert_allclose(found.depth[deep], np.log(2) / sigma, atol=0.45)
-
-
 def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     tree = random_cascades(5, count=4, brick=4, degree=2, share=0.5)
     packed_of(tree)
@@ -221,9 +201,7 @@ def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.Monk
     assert len(calls) > 20
 
 
-@pytest.mark.parametrize("model", LENSES)
-@pytest.mark.parametrize("share", [0.01, 0.1])
-@pytest.mark.parametrize("distance", [0.1, 1.5, 9.0])
+@pytest.mark.parametrize(("model", "share", "distance"), [("PINHOLE", 0.01, 9.0), ("OPENCV", 0.1, 1.5), ("OPENCV_FISHEYE", 0.1, 0.1)])
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_cascades(11, count=4, cells=6, brick=3, share=share)
     timid = replace(tree)
@@ -235,8 +213,7 @@ def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, d
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
-@pytest.mark.parametrize("distance", [0.02, 0.8, 2.5])
-@pytest.mark.parametrize("focal", [8.0, 20.0, 200.0])
+@pytest.mark.parametrize(("distance", "focal"), [(0.02, 8.0), (0.8, 200.0), (2.5, 20.0)])
 def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their colours are not summed. All samples have colours of the view here, and so would show what was left out."""
     tree = random_cascades(8, count=3, cells=20, brick=2, degree=2, share=0.1)
@@ -282,7 +259,7 @@ def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
         render(tree, replace(camera_of(tree), params=(20.0, np.nan, 10.0, 10.0)))
 
 
-@pytest.mark.parametrize("least", [-1e-42, 1e-42, -1e-320, 1e-31, 0.0])
+@pytest.mark.parametrize("least", [-1e-42, 1e-31, 0.0])
 def test_rays_along_the_faces_of_boxes_and_cells(least: float) -> None:
     """From outside, from the inner box's face and from its middle, along each axis; in the planes of a box's faces either side may be seen, or none."""
     grids = cascade_grids(np.array([[-8.0] * 3, [8.0] * 3]), 1.0, 4, 3)
@@ -299,7 +276,7 @@ def test_rays_along_the_faces_of_boxes_and_cells(least: float) -> None:
                 assert found.opacity.min() > 0.7
 
 
-@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
+@pytest.mark.parametrize(("count", "brick", "degree"), CASES[1:4])
 def test_points_are_looked_up_in_the_cascade_that_they_belong_to(count: int, brick: int, degree: int) -> None:
     tree = random_cascades(count, count=count, brick=brick, degree=degree, share=0.5)
     rng = np.random.default_rng(0)

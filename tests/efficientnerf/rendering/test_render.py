@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from efficientnerf.asset.rendering import render, render_rays, render_reference
-from efficientnerf.asset.tree import LOOKUPS
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from tests import reference
@@ -32,9 +31,8 @@ def test_the_kernel_is_the_torch_function(brick: int, degree: int, step_size: fl
     assert seen.opacity.max() > 0.8
 
 
-@pytest.mark.parametrize("step_size", [0.5, 1.0])
-@pytest.mark.parametrize("lookup", LOOKUPS)
-@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
+@pytest.mark.parametrize(("lookup", "step_size"), [("trilinear", 0.5), ("trilinear", 1.0), ("nearest", 0.5)])
+@pytest.mark.parametrize(("brick", "degree"), TREES[1:3])
 def test_the_torch_function_is_the_loop(brick: int, degree: int, lookup: str, step_size: float) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, lookup=lookup, step_size=step_size)
     origins, directions = rays_at(tree, 24)
@@ -55,11 +53,10 @@ def test_gradients_of_the_torch_function_are_finite_differences() -> None:
     sh = torch.from_numpy(tree.sh).double().requires_grad_()
     assert torch.autograd.gradcheck(lambda d, s: render_reference(tree, origins, directions, d, s), (density, sh), fast_mode=True)
     render_reference(tree, origins, directions, density, sh)[0].sum().backward()
-    assert density.grad is not None
     assert density.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("share", [0.02, 0.5])
 def test_leaping_changes_no_value(share: float) -> None:
     tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
     origins, directions = rays_at(tree, 600)
@@ -118,7 +115,7 @@ def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
         render(tree, camera, supersample=0)
 
 
-@pytest.mark.parametrize("supersample", [1, 2, 3])
+@pytest.mark.parametrize("supersample", [1, 3])
 def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: int) -> None:
     tree = random_tree(4, share=0.7, sigma=20.0)
     picture = render(tree, looking(tree, 40), supersample=supersample)
@@ -127,8 +124,7 @@ def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: i
     assert ((np.abs(length - 1) < 1e-3) | (length == 0)).all()
 
 
-@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
-@pytest.mark.parametrize("supersample", [2, 3])
+@pytest.mark.parametrize(("lookup", "supersample"), [("trilinear", 3), ("nearest", 2)])
 def test_renders_do_not_depend_on_how_they_are_cut(lookup: str, supersample: int) -> None:
     tree = replace(random_tree(0, share=0.7), lookup=lookup)
     whole = render(tree, looking(tree), supersample=supersample)
@@ -196,7 +192,6 @@ def test_opacity_nearer_than_the_depth_is_half_at_most(contracted: bool) -> None
     field, camera = dense(contracted=contracted), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
     assert field.render(camera).nearer is None
     at = field.render(camera, limits=lambda origins, directions, distance: distance)
-    assert at.nearer is not None
     assert (at.nearer[at.opacity >= 0.5] < 0.5).all()
     none, everything = (field.render(camera, limits=lambda o, d, distance, limit=limit: np.full(len(distance), limit)) for limit in (0.0, np.inf))
     assert not none.nearer.any()  # type: ignore[union-attr]

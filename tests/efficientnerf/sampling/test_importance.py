@@ -100,7 +100,6 @@ def same_up_to(capacity: int, padded: Samples, exact: Samples) -> None:
     """Filled from the beginning on, zeros behind; rays that end beyond the capacity are not complete."""
     kept = min(capacity, len(exact.start))
     assert torch.equal(padded.first, exact.first.clamp(max=kept))
-    assert padded.complete is not None
     assert torch.equal(padded.complete, exact.first[1:] <= capacity)
     last = int(padded.first[:-1][padded.complete.logical_not()].min()) if not padded.complete.all() else kept  # a ray that is cut ends elsewhere
     for ours, theirs in zip(padded[1:5], exact[1:5], strict=True):

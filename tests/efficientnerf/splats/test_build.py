@@ -149,7 +149,6 @@ def test_gaussians_of_normalised_device_coordinates_lie_in_the_world() -> None:
     moved[:2, 3] = 0.2, 0.1
     beside = replace(camera, world_from_camera=moved)
     gaussians = merging.merged(tree, [camera, beside], 1100, 0)
-    assert tree.ndc is not None
     depth = tree.ndc.world(np.array([[0.0, 0.0, 23 / 16 - 1]]))[0, 2]
     assert np.abs(gaussians.means[:, 2] - depth).max() < 0.1 * depth
     for view in (camera, beside):

@@ -86,16 +86,6 @@ def test_planes_do_not_reach_over_a_step() -> None:
     np.testing.assert_allclose(found[5, 18:23, NEAREST], [1, 1, 1, 1 / far[5, 21], 1 / far[5, 22]], rtol=0.02)
 
 
-def test_what_is_half_seen_through_is_neither_surface_nor_free() -> None:
-    depth = np.full((36, 48), np.inf, np.float32)
-    opacity = np.zeros((36, 48), np.float32)
-    opacity[10, 10] = 0.4
-    found = fitted(depth, opacity)
-    assert (found[..., CONFIDENCE] == 0).all()
-    assert np.isinf(found[9:12, 9:12, NEAREST]).all()
-    assert (found[13:, :, NEAREST] == 0).all()
-
-
 def grid(count: int = 32) -> tuple[np.ndarray, np.ndarray]:
     """Corner of a grid about the origin, and distances (count, count, count) of its voxels' centres from the origin."""
     first = np.full(3, -VOXEL * count / 2)

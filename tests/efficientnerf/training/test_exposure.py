@@ -113,10 +113,8 @@ def test_a_photograph_as_if_exposed_like_the_others() -> None:
     dark, all_used = averaged_image(image, np.array([[True, False]]), 1, e)
     half = np.rint(255 * srgb_from_linear(linear_from_srgb(image[0, :, :3] / 255.0) / 2))
     assert np.abs(bright[0, :, :3] - half).max() <= 1
-    assert used is not None
     assert used.tolist() == [[True, False]]
     assert dark[0, 1].tolist() == [255] * 4
-    assert all_used is not None
     assert all_used.tolist() == [[True, False]]
     assert (bright[..., 3].tolist(), image[0, 0].tolist()) == ([[7, 255]], [100, 200, 10, 7])
 
@@ -157,7 +155,6 @@ def test_differences_between_photographs_are_found(monkeypatch: pytest.MonkeyPat
             assert np.corrcoef(found.ravel(), logs.ravel())[0, 1] > (0.9 if begun else 0.6)
             again = trainer(untrained(contracted=True, iterations=200), exposure_of(cameras(8)))
             restore(again, state_of(t))
-            assert again.exposure is not None
             assert torch.equal(again.exposure.photographs, t.exposure.photographs)
             assert torch.equal(again.exposure.cameras, t.exposure.cameras)
     assert losses[True] < 0.95 * losses[False]

@@ -49,23 +49,19 @@ def test_counts_arrive_late_once_the_averages_are_known() -> None:
     assert capacities[3] == SampleCapacity(readback.GRANULARITY, readback.GRANULARITY)
     assert kept.fine_per_ray == pytest.approx(2 * kept.valid_per_ray)
     big = kept.capacity(10**6)
-    assert big is not None
     assert big.fine >= readback.MARGIN * kept.fine_per_ray * 10**6 > big.fine - readback.GRANULARITY - 1
 
 
 def test_rays_whose_samples_do_not_fit_are_left_out() -> None:
     whole = complete_rays(samples([2, 3, 4, 0], capacity=6), samples([1, 1, 1, 0], capacity=10))
-    assert whole is not None
     assert whole.tolist() == [True, True, False, False]
     assert complete_rays(samples([2, 4]), samples([2, 4])) is None  # counted, not padded
     one = complete_rays(samples([2, 4]), samples([2, 4], capacity=6))
-    assert one is not None
     assert one.all()  # it is full, and nothing was lost
     values = torch.tensor([[1.0, 3.0], [5.0, 5.0], [float("nan"), 1.0], [1e9, 0.0]], requires_grad=True)
     mean = mean_over(values, whole)
     assert float(mean.detach()) == pytest.approx(3.5)
     mean.backward()
-    assert values.grad is not None
     assert not values.grad[2:].any()
     assert float(mean_over(values.detach()[:2], None)) == 3.5
     assert float(mean_over(values.detach(), torch.zeros(4, dtype=torch.bool))) == 0

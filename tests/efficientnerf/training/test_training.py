@@ -31,8 +31,7 @@ def psnr_of(steps: list[Progress]) -> float:
     return -10 * math.log10(np.mean([step.loss for step in steps]))
 
 
-@pytest.mark.parametrize("rule", ["momentum", "maximum"])
-@pytest.mark.parametrize("field", ["hash", "mlp"])
+@pytest.mark.parametrize(("field", "rule"), [("hash", "momentum"), ("hash", "maximum"), ("mlp", "maximum")])
 def test_it_learns(field: str, rule: str) -> None:
     m = untrained(occupancy_rule=rule, **(dict(MLP, iterations=40) if field == "mlp" else {}))
     steps = run(m)
@@ -78,8 +77,7 @@ def test_two_runs_give_the_same_bytes_and_another_seed_others() -> None:
     assert states[0] != states[2]
 
 
-@pytest.mark.parametrize("field", ["hash", "mlp"])
-@pytest.mark.parametrize("at", [1, 4, 7])
+@pytest.mark.parametrize(("field", "at"), [("hash", 1), ("hash", 7), ("mlp", 4)])
 def test_a_restored_trainer_goes_on_to_the_same_bytes(field: str, at: int) -> None:
     changes = dict(MLP if field == "mlp" else {}, iterations=10, occupancy_warmup_steps=5, sample_batch_size=2048)
     whole = trainer(untrained(**changes))
@@ -154,8 +152,7 @@ def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
     assert opacity[~on_ball].mean() < 0.02
 
 
-@pytest.mark.parametrize("strategy", ["uniform", "hierarchical", "valid"])
-@pytest.mark.parametrize("field", ["mlp", "nerf"])
+@pytest.mark.parametrize(("field", "strategy"), [("mlp", "uniform"), ("nerf", "hierarchical"), ("mlp", "valid")])
 def test_other_samplings_learn_too_and_only_those_that_prune_touch_the_voxels(field: str, strategy: str) -> None:
     m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, num_importance_samples=16, sample_batch_size="off", max_rays_per_batch=128)
     steps = run(m)

@@ -250,7 +250,6 @@ def captured_tree(degrees: float, **more: Any) -> NerfTree:
 @pytest.mark.parametrize(("degrees", "size"), [(360.0, (64, 48)), (120.0, (48, 64)), (40.0, (48, 64))])
 def test_the_whole_region_is_in_the_middle_of_every_picture(degrees: float, size: tuple[int, int]) -> None:
     tree = captured_tree(degrees)
-    assert tree.region is not None
     cameras = turntable_cameras(tree, frames=16, width=size[0], height=size[1])
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     points = tree.region.bounds[0] + (0.1 + 0.8 * corners) * (tree.region.bounds[1] - tree.region.bounds[0])
@@ -295,7 +294,6 @@ def test_paths_by_name_and_by_hand() -> None:
     assert max(min(a, 360 - a) for a in swayed) == pytest.approx(7, abs=0.1)
     captured = turntable_cameras(tree, frames=30, width=64, height=48, path="captured")
     places = np.array([camera.centre for camera in captured])
-    assert tree.region is not None
     assert np.linalg.norm(places - tree.region.bounds.mean(axis=0), axis=1) == pytest.approx(3.0, rel=0.05)
     assert captured[0].params[0] == pytest.approx(110.0 * 80 / 150, rel=1e-3)  # by the diagonal
     assert turntable_cameras(tree, frames=1, width=64, height=48, path="captured", fov=90.0)[0].params[0] == pytest.approx(24)
@@ -311,7 +309,6 @@ def test_captured_cameras_that_cannot_be_are_refused() -> None:
     with pytest.raises(BadInput, match="captured_path"):
         captured_of({"captured_path": 7})
     found = captured_of({"captured_path": json.loads(json.dumps(captured_metadata(arc(360.0, count=150))))})
-    assert found is not None
     assert len(found.poses) == 64
 
 

@@ -83,7 +83,6 @@ def test_the_space_follows_the_kind_of_source_and_the_setting() -> None:
 
 def test_the_reference_camera_is_in_the_training_frame() -> None:
     found = find_training_frame(capture(row()))
-    assert found.forward is not None
     there = [found.world_from_capture.camera(photo.camera) for photo in capture(row()).photos]
     np.testing.assert_allclose(found.forward.ndc.world_from_camera, mean_pose(there), atol=1e-9)
     points = found.world_from_capture.points(Similarity(3.0, some_rotation(2), np.array([5.0, -2.0, 1.0])).points(in_pictures(row(), NEAR, FAR)))

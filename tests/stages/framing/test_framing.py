@@ -304,6 +304,5 @@ def test_fern_and_door_are_framed() -> None:
     framed = find_training_frame(door)
     check_laws(door, framed)
     assert framed.facts["bounds_from"] == "sparse points"
-    assert door.points is not None
     inside = np.abs(framed.world_from_capture.points(door.points.xyz)) <= framed.bounds[1]
     assert inside.all(1).mean() > 0.9

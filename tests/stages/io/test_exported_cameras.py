@@ -128,7 +128,6 @@ def test_a_fourth_radial_coefficient_becomes_a_quotient(k4: float) -> None:
 def test_opensfms_points_and_reconstructions(tmp_path: Path) -> None:
     folder, _ = exports.opensfm(tmp_path / "a", ".")
     capture = read(folder)
-    assert capture.points is not None
     np.testing.assert_allclose(capture.points.xyz, POINTS)
     assert capture.points.tracks == ((0, 1, 2, 3),) * 3 + ((),) * 6
     assert capture.points.rgb[4].tolist() == [10, 20, 34]
@@ -138,7 +137,6 @@ def test_opensfms_points_and_reconstructions(tmp_path: Path) -> None:
 
 def test_kaptures_points_and_images_without_a_pose(tmp_path: Path) -> None:
     capture = read(exports.kapture(tmp_path / "a")[0])
-    assert capture.points is not None
     np.testing.assert_allclose(capture.points.xyz, POINTS)
     assert capture.points.tracks == ((), (), (0, 3), (), (1,), (), (), (), ())
     assert capture.rejected == (("map/lost.png", "without a pose"),)
@@ -150,7 +148,6 @@ def test_polycam_without_corrected_cameras(tmp_path: Path) -> None:
     capture = read(folder)
     assert_seen(capture, {name: where for name, where in pixels.items() if name != "img_5.jpg"})
     assert capture.metric
-    assert capture.up is not None
     assert capture.up.tolist() == [0, 1, 0]
     assert capture.rejected == (("keyframes/images/img_5.jpg", "without a camera file"),)
     assert any("the phone's own poses" in warning for warning in capture.warnings)

@@ -32,7 +32,6 @@ def sharp(folder: Path) -> tuple[Path, list[Camera]]:
 def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, made = sharp(tmp_path / "a")
     capture = read(folder)
-    assert capture.points is not None
     assert len(capture.points.xyz) > 500
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01, "they lie on the plane"
     assert min(map(len, capture.points.tracks)) >= 3
@@ -45,7 +44,6 @@ def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path, monk
     assert {folder / f"keyframes/depth/img_{index}.png" for index in range(6)} < set(importers.files(folder, Settings()))
     monkeypatch.setattr("stages.io.importers.depth.MAX_TRACK", 3)
     again = read(folder)
-    assert again.points is not None
     np.testing.assert_array_equal(again.points.xyz, capture.points.xyz)
     assert {len(track) for track in again.points.tracks} == {3}
     assert all(set(few) <= set(many) for few, many in zip(again.points.tracks, capture.points.tracks, strict=True))
@@ -74,7 +72,6 @@ def test_depth_of_transforms(key: str, unit: float, more: dict[str, float], tmp_
         exports.write_depth(tmp_path / f"depth/img_{index}.png", exports.plane_depth(camera, 64, 48), unit)
     captures.nerfstudio(tmp_path, frames=frames, **more)
     capture = read(tmp_path)
-    assert capture.points is not None
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01
     assert capture.metric == (key == "depth_file_path")
     assert tmp_path / "depth/img_3.png" in importers.files(tmp_path, Settings())
@@ -94,12 +91,10 @@ def test_record3ds_depth(tmp_path: Path) -> None:
         header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
         openexr.File(header, {"R": values}).write(str(place / f"{photo.image.stem}.exr"))
     capture = read(folder)
-    assert capture.points is not None
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01
     assert place / "3.exr" in importers.files(folder, Settings())
     (place / "3.exr").write_bytes(b"nothing")
     found = read(folder)
-    assert found.points is not None
     assert all(3 not in track for track in found.points.tracks)
     assert any("1 of 6 depth maps are not used, e.g. 3.exr: unreadable" in warning for warning in found.warnings)
 
@@ -138,7 +133,6 @@ def test_points_of_depth_supervise_training(tmp_path: Path, monkeypatch: pytest.
     made = scene.load(tmp_path / "poses")
     assert made.metric
     found = sparse_depth_of(tmp_path / "poses", made)
-    assert found is not None
     ends = found.origins + found.directions * found.distance[:, None]
     there = made.world_from_capture.inverse().points(ends)
     assert np.abs(there[:, 2]).max() < 0.02

@@ -49,7 +49,6 @@ def test_colmap_lenses(model: str, write: object, tmp_path: Path) -> None:
     capture = read(write(tmp_path / "a", made))  # type: ignore[operator]
     assert_same_rays(capture, made)
     assert capture.photos[0].camera.params == LENSES[model]
-    assert capture.points is not None
     assert capture.points.tracks[0] == tuple(range(6))
     assert capture.points.rgb[0].tolist() == [200, 100, 50]
     assert capture.reprojection_error == pytest.approx(0.5)
@@ -77,7 +76,6 @@ def test_a_model_written_by_colmap_with_rigs_and_frames(tmp_path: Path) -> None:
         assert (other / "sparse/0" / f"frames.{suffix}").is_file()
         capture = read(other, allow_outside=True)
         assert_same_rays(capture, captures.cameras())
-        assert capture.points is not None
         np.testing.assert_allclose(np.sort(capture.points.xyz, 0), np.sort(captures.sparse_points(), 0))
 
 
@@ -109,7 +107,6 @@ def test_nerfstudio_extras(tmp_path: Path) -> None:
     assert [photo.split for photo in capture.photos] == ["train"] * 4 + ["val", "test"]
     assert capture.photos[0].mask == folder / "masks/img_0.png"
     assert capture.photos[0].mask_ignore == "black"
-    assert capture.points is not None
     np.testing.assert_allclose(capture.points.xyz, points, atol=1e-6)
     assert {folder / "cloud.ply", folder / "masks/img_0.png"} < set(importers.files(folder, Settings()))
 
@@ -241,7 +238,6 @@ def test_door_points_lie_where_colmap_saw_them() -> None:
     folder = shared("lund_door_colmap")
     capture = read(folder)
     assert len(capture.photos) == 12
-    assert capture.points is not None
     assert len(capture.points.xyz) == 11384
     observed: dict[str, dict[int, tuple[float, float]]] = {}
     for _, line, points in colmap_model._image_lines(folder / "sparse/0/images.txt"):

@@ -35,7 +35,6 @@ def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
     rgba[:, :4, 3] = 0
     Image.fromarray(rgba).save(tmp_path / "alpha.png")
     opaque = reading.read_photo(tmp_path / "alpha.png", 100).opaque
-    assert opaque is not None
     assert opaque[:, 4:].all()
     assert not opaque[:, :4].any()
 

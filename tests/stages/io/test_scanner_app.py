@@ -44,7 +44,6 @@ def test_frame_up_and_what_has_no_partner(tmp_path: Path) -> None:
     capture = read(folder)
     assert [photo.image.name for photo in capture.photos] == [f"frame_0000{index}.jpg" for index in (0, 1, 2, 3, 5)]
     assert capture.metric
-    assert capture.up is not None
     assert capture.up.tolist() == [0, 1, 0]
     assert capture.facts["poses_without_picture"] == 2
     assert capture.rejected == (("frame_00004.jpg", "without a pose"),)
@@ -122,7 +121,6 @@ def test_depth_where_the_sensor_is_sure(tmp_path: Path) -> None:
         sure[12:36, 16:48] = 2
         captures.write_picture(folder / f"conf_{number}.png", sure)
     capture = read(folder)
-    assert capture.points is not None
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01, "they lie on the plane"
     for index, photo in enumerate(capture.photos):
         seen = [point for point, track in zip(capture.points.xyz, capture.points.tracks, strict=True) if index in track]

@@ -31,7 +31,6 @@ def written(path: Path, gaussians: Gaussians, frame: Any = Z_UP) -> Path:
 
 
 def same(facts: dict[str, Any] | None, gaussians: Gaussians, coded: bool) -> None:
-    assert facts is not None
     assert (facts["gaussians"], facts["sh_degree"], facts["not_finite"]) == (len(gaussians), gaussians.degree, None)
     np.testing.assert_allclose(facts["bounds"], [gaussians.means.min(axis=0), gaussians.means.max(axis=0)], atol=2.0**-12 if coded else 1e-6)
     scales = [gaussians.scales.min(), gaussians.scales.max()]
@@ -70,7 +69,6 @@ def test_a_ply_of_others_has_its_columns_in_any_order_and_of_any_type(order: str
     path.write_bytes(head.encode() + rows.tobytes())
     facts = describe_splats(path)
     same(facts, gaussians, coded=False)
-    assert facts is not None
     assert len(facts["notes"]) == 1
     assert "\x1b" not in facts["notes"][0]
 
@@ -88,8 +86,6 @@ def test_the_older_spz_versions(tmp_path: Path) -> None:
     fixed = (at * 2**12).astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3].tobytes()
     path.write_bytes(spz(2, 2, 1, fixed + rest, flags=1))
     second = describe_splats(path)
-    assert first is not None
-    assert second is not None
     assert first["bounds"] == second["bounds"] == [at.min(axis=0).tolist(), at.max(axis=0).tolist()]
     assert first["scales"] == second["scales"] == [1.0, 1.0]
     assert first["opacities"] == second["opacities"] == [0.0, 1.0]
@@ -116,7 +112,6 @@ def test_numbers_that_are_not_finite_are_counted(tmp_path: Path) -> None:
     body = content.index(b"end_header\n") + 11
     path.write_bytes(content[:body] + np.float32(np.nan).tobytes() + content[body + 4 :])
     facts = describe_splats(path)
-    assert facts is not None
     assert facts["not_finite"] == 1
     assert np.isfinite(facts["bounds"]).all()
 

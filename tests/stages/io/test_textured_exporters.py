@@ -115,7 +115,6 @@ def test_the_same_surface_in_the_same_colours(extension: str, normals: bool, pic
     exporter = MESH_EXPORTERS[extension]
     exporter(mesh, path, Y_DOWN, picture=picture)
     corners, places, colours, bent = READERS[extension](path)
-    assert mesh.texture is not None
     np.testing.assert_allclose(corners, mesh.vertices[mesh.faces], atol=1e-5)
     np.testing.assert_allclose(places, mesh.texture.coordinates, atol=1e-6)
     if picture == "png":
@@ -163,7 +162,6 @@ def test_vertices_are_split_at_seams_alone() -> None:
     corners = split_at_seams(mesh)
     assert len(corners.vertex) == 24, "three sides meet in each of eight corners"
     np.testing.assert_array_equal(corners.vertex[corners.faces], mesh.faces)
-    assert mesh.texture is not None
     np.testing.assert_allclose(corners.coordinates[corners.faces], mesh.texture.coordinates, atol=1e-6)
     whole = replace(mesh, texture=Texture((mesh.vertices[mesh.faces][..., :2] - 1) / 3, mesh.texture.colours))
     np.testing.assert_array_equal(split_at_seams(whole).vertex, np.arange(8))
@@ -172,7 +170,6 @@ def test_vertices_are_split_at_seams_alone() -> None:
 
 def test_open_meshes_are_seen_from_both_sides(tmp_path: Path) -> None:
     closed = textured()
-    assert closed.texture is not None
     part = replace(closed, faces=closed.faces[:-1], texture=replace(closed.texture, coordinates=closed.texture.coordinates[:-1]))
     assert (open_faces(closed.faces), open_faces(part.faces)) == (False, True)
     for mesh, expected in ((closed, False), (part, True)):

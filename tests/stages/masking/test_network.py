@@ -48,7 +48,6 @@ def scene() -> np.ndarray:
 @pytest.mark.parametrize("shape", [(1, 3, SIDE, SIDE), ("batch", 3, "height", "width")])
 def test_the_subject_is_where_the_network_sees_it(tmp_path: Path, logits: bool, shape: tuple[Any, ...]) -> None:
     mask = MaskNetwork(red(tmp_path / "u2net.onnx", logits=logits, shape=shape)).mask(scene())
-    assert mask is not None
     assert mask.shape == ((SIDE, SIDE) if shape[2] == SIDE else (320, 320))
     height, width = mask.shape
     assert mask[int(50 / 96 * height), int(70 / 128 * width)] > 240

@@ -115,7 +115,6 @@ def test_few_photographs_by_the_subject_alone_are_no_reason_to_leave_the_rest_ou
 
     job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=tmp_path, stage="poses")
     capture, seen = _of_turning_subject(job, find, paths)
-    assert capture is not None
     assert not seen
     assert len(capture.photos) == (alone[0] if used == "cameras_of_subject" else whole[0])
     assert (capture.facts.get(BACKGROUND) == LEFT_OUT) == (used == "cameras_of_subject")

@@ -119,7 +119,6 @@ def test_exact_positions_give_metres_and_the_upward_axis(tmp_path: Path) -> None
     np.testing.assert_allclose(lengths(found), true, rtol=0.01, atol=0.01)
     heights = np.array([photo.camera.centre[2] for photo in found.photos])
     np.testing.assert_allclose(heights - heights.mean(), CIRCLE[:, 2] - CIRCLE[:, 2].mean(), atol=0.8)
-    assert found.points is not None
     np.testing.assert_allclose(found.points.xyz, [photo.camera.centre for photo in found.photos], atol=1e-9)  # moved together
     for photo, before in zip(found.photos, given.photos, strict=True):
         np.testing.assert_allclose(photo.camera.world_from_camera[:3, :3] @ photo.camera.world_from_camera[:3, :3].T, np.eye(3), atol=1e-9)
@@ -174,7 +173,6 @@ def test_cameras_that_were_found_come_into_the_frame_of_those_that_the_source_st
     np.testing.assert_array_equal(found.up, [0, 1, 0])
     centres = np.array([photo.camera.centre for photo in found.photos])
     np.testing.assert_allclose(centres, 0.1 * CIRCLE, atol=0.06)
-    assert found.points is not None
     np.testing.assert_allclose(found.points.xyz, centres, atol=1e-9)
     assert "24 of the 24 photographs (polycam)" in sentence
 

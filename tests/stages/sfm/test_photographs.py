@@ -49,7 +49,6 @@ def find(folder: Path, names: list[str], work: Path, **changes: object) -> Captu
 
 def numbers(capture: Capture) -> tuple[bytes, ...]:
     """Every figure of a capture, bit for bit."""
-    assert capture.points is not None
     cameras = [(p.camera.name, p.camera.model, np.array(p.camera.params).tobytes(), p.camera.world_from_camera.tobytes()) for p in capture.photos]
     return (repr(cameras).encode(), capture.points.xyz.tobytes(), capture.points.rgb.tobytes(), repr(capture.points.tracks).encode())
 
@@ -76,7 +75,6 @@ def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path
     assert capture.up is None
     assert not capture.metric
     assert capture.facts["pairs_agreeing"] > 0.9  # type: ignore[operator]
-    assert capture.points is not None
     assert max(max(seen) for seen in capture.points.tracks) < len(names)
 
 

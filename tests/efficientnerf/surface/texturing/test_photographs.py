@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba import get_num_threads, set_num_threads
 
-from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.cameras import project
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.filling import carried_on
@@ -136,33 +136,13 @@ def test_masks_and_alpha_are_kept_to() -> None:
         assert known[pixels[:, 0] < 40].max() > 0.9
 
 
-def away(camera: Camera) -> Camera:
-    """The camera turned round."""
-    pose = camera.world_from_camera.copy()
-    pose[:3, [0, 2]] *= -1
-    return replace(camera, world_from_camera=pose)
-
-
-def test_a_blurred_photograph_counts_less() -> None:
-    vertices, faces = ball(3)
-    normals = vertex_normals(vertices, faces)
-    fine = lambda points: 0.5 + 0.4 * np.sign(np.sin(25 * points))  # noqa: E731
-    photo = photographed(vertices, faces, cameras(1)[0], fine)
-    kernel = np.ones(5) / 5
-    blurred = np.apply_along_axis(np.convolve, 0, np.apply_along_axis(np.convolve, 1, photo.colours.astype(float), kernel, "same"), kernel, "same")
-    soft = replace(photo, colours=blurred.astype(np.uint8))
-    sharp_one, soft_one = (survey(vertices, faces, normals, pattern(vertices), each).sharpness for each in (photo, soft))
-    assert soft_one < 0.5 * sharp_one
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_same_bytes_on_any_number_of_threads(threads: int) -> None:
+def test_the_same_bytes_on_any_number_of_threads() -> None:
     vertices, faces = ball(3)
     photos = [photographed(vertices, faces, camera) for camera in cameras(5)]
     before = get_num_threads()
     first = textured(vertices, faces, photos)[1]
     try:
-        set_num_threads(min(threads, before))
+        set_num_threads(1)
         again = textured(vertices, faces, photos)[1]
     finally:
         set_num_threads(before)
@@ -236,7 +216,7 @@ def test_distances_are_those_of_a_chamfer_from_what_may_not_be_used() -> None:
     assert (edge_distance(usable, np.where(x < 16, 0.5, 0.4).astype(np.float32))[:, 15:17] == 0).all()
 
 
-@pytest.mark.parametrize("after", [0, 2, 5, 8])
+@pytest.mark.parametrize("after", [0, 5])
 def test_a_signal_stops_it_within_a_photograph(after: int) -> None:
     """In the survey of one, in what texels see of one, and when all have been seen."""
     vertices, faces = ball(2)
