@@ -57,7 +57,7 @@ def sparse(weight: np.ndarray, brick: int) -> Visibility:
     return Visibility(cells, rows[cells])
 
 
-@pytest.mark.parametrize(("extent", "resolution", "brick"), [((2, 2, 2), 64, 4), ((2, 1, 0.3), 100, 4), ((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])
+@pytest.mark.parametrize(("extent", "resolution", "brick"), [((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])
 def test_cells_cover_the_box_and_no_more(extent: tuple[float, float, float], resolution: int, brick: int) -> None:
     bounds = np.array([[1.0, 2.0, 3.0], np.add(extent, (1, 2, 3))])
     shape, voxel = grid_of(bounds, resolution, brick)
@@ -78,7 +78,7 @@ def test_visible_voxels_are_the_balls_skin() -> None:
     assert weight[away < 0.2].max() < 1e-3  # nobody sees the inside
 
 
-@pytest.mark.parametrize("resolution", [16, 15, 9, 4])
+@pytest.mark.parametrize("resolution", [15, 4])
 def test_of_a_coarser_grid_what_was_seen_of_a_finer_one(resolution: int) -> None:
     """Each coarse voxel has the greatest of the fine ones whose centres it holds, and about what it would have shown itself."""
     bounds = np.array([[0.0, 0.0, 0.0], [2.0, 1.5, 1.0]])
@@ -115,7 +115,7 @@ def test_chosen_voxels_are_those_above_the_threshold_and_their_neighbours() -> N
     assert not len(chosen_voxels(sparse(np.zeros((8, 4, 4), np.float32), 4), (2, 1, 1), 4, 1e-3, 2))
 
 
-@pytest.mark.parametrize("dilate", [0, 1, 2, 5])
+@pytest.mark.parametrize("dilate", [0, 2])
 def test_growing_is_that_of_a_plain_grid(dilate: int) -> None:
     from scipy.ndimage import binary_dilation
 
@@ -142,7 +142,7 @@ def test_values_are_means_over_the_voxel() -> None:
     assert sh[2, 0, 0] < BOUNDS[0][0] + 11.5 / 8 + 0.01
 
 
-@pytest.mark.parametrize("first", [0, 1, 2])
+@pytest.mark.parametrize("first", [0, 2])
 def test_blocks_do_not_depend_on_where_one_begins(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
     monkeypatch.setattr(bake, "POINTS_PER_BLOCK", 40)
     m = model_of_a_ball()

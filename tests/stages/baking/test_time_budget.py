@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -110,7 +109,7 @@ def test_the_budget_is_met_and_its_steps_give_the_same_asset(inputs: dict[str, P
     assert [path.name for path in sorted((made.out / BakeOutputs.previews).iterdir())] == [f"preview_{step:06d}.png" for step in drawn]
 
 
-@pytest.mark.parametrize("at", [4, 14, 25])
+@pytest.mark.parametrize("at", [4, 25])
 def test_an_interrupted_bake_keeps_to_its_plan(inputs: dict[str, Path], tmp_path: Path, now: list[float], at: int) -> None:
     """Stopped before and after the number of steps of the first phase is set, and in the second."""
     never = StopAt()
@@ -128,16 +127,6 @@ def test_an_interrupted_bake_keeps_to_its_plan(inputs: dict[str, Path], tmp_path
     steps = [line["step"] for line in read_lines(made.out / BakeOutputs.log)]
     assert steps == sorted(set(steps))
     assert_same(asset(made), repeated(tmp_path / "again", inputs, fitted(made)["schedule"]))
-
-
-def test_a_budget_that_is_over_ends_in_an_asset_all_the_same(inputs: dict[str, Path], tmp_path: Path) -> None:
-    events: list[dict[str, Any]] = []
-    made = job(tmp_path, replace(QUICK, time_budget=0.01), events=events, **inputs)
-    bake.run(made)
-    assert [one["iterations"] for one in fitted(made)["schedule"]] == [1, 1]
-    warned = [event["text"] for event in events if event["event"] == "warning"]
-    assert len(warned) == 1
-    assert re.match(r"bake\.time_budget left time for 2 steps of the refinement, where [1-9][\d,]{2,} are usual: ", warned[0])
 
 
 def test_an_asset_is_no_larger_than_the_time_refines(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,11 +44,6 @@ def test_captures_are_graded_as_who_looks_at_them_does(name: str) -> None:
     assert verdict_on_result(a_result(psnr, mean_colour=mean_colour, blurred=blurred)).grade == grade
 
 
-def test_nothing_stands_against_a_good_result() -> None:
-    found = verdict_on_result(a_result(), CameraVerdict("good"))
-    assert (found.grade, found.problems) == ("good", ())
-
-
 SETTINGS = {f"{stage.name}.{name}" for stage in asset.STAGES for name in stage.settings.__dataclass_fields__}
 PICTURES = {
     f"evaluate/{EvaluateOutputs.strip_worst}", f"evaluate/{EvaluateOutputs.contact_sheet}", f"evaluate/{EvaluateOutputs.sparse_points}",
@@ -67,7 +62,7 @@ def check(found: ResultVerdict) -> None:
     assert found.document()["summary"].startswith(f"Result: {found.grade}")
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_worse_figures_never_give_a_better_grade(seed: int) -> None:
     rng = random.Random(seed)
     found, grades = a_result(rng.uniform(10.0, 30.0)), []
