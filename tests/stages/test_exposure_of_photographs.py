@@ -18,7 +18,7 @@ def places(count: int) -> np.ndarray:
     return np.stack([np.arange(count) + 0.5, np.full(count, 8.5)], axis=-1)
 
 
-@pytest.mark.parametrize("stops", [-1.5, -0.5, 0.0, 0.5, 1.0])
+@pytest.mark.parametrize("stops", [-1.5, 0.0, 1.0])
 def test_stops_are_those_of_the_exposure_whatever_is_shown(stops: float) -> None:
     light = np.random.default_rng(0).uniform(0.05, 0.3, 40)
     for shown in (np.sort(light)[:LEAST_POINTS], np.sort(light)[-LEAST_POINTS:]):

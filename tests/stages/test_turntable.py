@@ -75,8 +75,7 @@ def test_a_stop_anywhere_and_going_on_gives_the_same_bytes(tmp_path: Path, momen
     assert CountingTree.calls == max(0, 5 - moment), "finished frames are not drawn again"
 
 
-@pytest.mark.parametrize("how", SPOILERS)
-@pytest.mark.parametrize("suffix", [".png", ".exr", ".json"])
+@pytest.mark.parametrize(("how", "suffix"), [("cut", ".png"), ("zero", ".exr"), ("link", ".png"), ("half zero", ".json")])
 def test_every_scratch_file_of_a_turntable_may_be_damaged(tmp_path: Path, suffix: str, how: str) -> None:
     whole = job_in(tmp_path / "whole")
     render_turntable(BallTree(), whole, BallTree.render)

@@ -93,8 +93,7 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
 LENSES = {"PINHOLE": (60.0, 55.0, 20.0, 14.0), "SIMPLE_RADIAL": (60.0, 20.0, 15.0, -0.05), "OPENCV_FISHEYE": (60.0, 55.0, 20.0, 15.0, 0.02, 0.0, 0.001, 0.0)}
 
 
-@pytest.mark.parametrize("model", LENSES)
-@pytest.mark.parametrize("place", [*PLACES.values(), (0.0, 20.0, 0.0)], ids=[*PLACES, "behind the wall"])
+@pytest.mark.parametrize(("model", "place"), [("PINHOLE", (0.0, 20.0, 0.0)), *zip(LENSES, list(PLACES.values())[1:], strict=True)])
 def test_rays_that_are_warped_in_the_kernel_are_those_that_are_given(model: str, place: tuple[float, float, float]) -> None:
     """Rays of a camera that stands anywhere and looks aside, too, some of which never come to the near plane. Seen from the very reference camera rays run
     along the faces of voxels, of which rounding says whose they are."""

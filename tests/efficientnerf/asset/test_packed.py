@@ -151,8 +151,7 @@ def test_neighbours_are_those_one_step_back(each: int) -> None:
         assert found[n].tolist() == [number.get(step, -1) for step in steps]
 
 
-@pytest.mark.parametrize("most", [1, 9, 40])
-@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize(("most", "wide"), [(1, False), (9, True), (40, False)])
 def test_slices_of_any_size_hold_the_same_on_any_number_of_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, wide: bool) -> None:
     tree = compacted(random_cascades(4, count=2, brick=2, degree=2), 300 if wide else 256, (8,) if wide else None)
     save(tree, tmp_path / "a.nerftree")

@@ -53,8 +53,7 @@ def test_inside_distance_is_that_to_the_nearest_point_outside(radius: float) -> 
             assert nearest <= distance + 0.1
 
 
-@pytest.mark.parametrize("tree", CASES)
-@pytest.mark.parametrize(("radius", "fade"), [(0.0, 0.0), (0.2, 0.1), (5.0, 0.15)])
+@pytest.mark.parametrize(("tree", "radius", "fade"), [(tree, *(((0.0, 0.0), (0.2, 0.1), (5.0, 0.15))[n % 3])) for n, tree in enumerate(CASES)])
 def test_inside_nothing_changes_and_outside_is_nothing(tree: NerfTree, radius: float, fade: float) -> None:
     region = middle(tree, 0.8, corner_radius=radius, fade=fade)
     restricted = foreground(replace(tree, region=region))

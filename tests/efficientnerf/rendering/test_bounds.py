@@ -26,8 +26,7 @@ from tests.efficientnerf.trees import looking, random_tree, uniform_tree
 FAR = [1e9, 1e15, 1e18, 1e25, 1e200]
 
 
-@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
-@pytest.mark.parametrize("distance", FAR)
+@pytest.mark.parametrize(("lookup", "distance"), [("trilinear", FAR[0]), ("trilinear", FAR[-1]), ("nearest", FAR[-1])])
 def test_rays_from_far_away_end(lookup: str, distance: float) -> None:
     """Rounding makes the stretch of such a ray in the grid longer than the grid, by far more steps than could ever be done."""
     tree = random_tree(0, lookup=lookup)

@@ -17,8 +17,7 @@ from tests.efficientnerf.balls import pose, untrained
 from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tensors, uniform_tree
 
 
-@pytest.mark.parametrize("step_size", [0.3, 0.5, 1.0])
-@pytest.mark.parametrize(("brick", "degree"), TREES)
+@pytest.mark.parametrize(("brick", "degree", "step_size"), [(*tree, (0.3, 0.5, 1.0)[n % 3]) for n, tree in enumerate(TREES)])
 def test_the_kernel_is_the_torch_function(brick: int, degree: int, step_size: float) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, step_size=step_size)
     origins, directions = rays_at(tree, 400)

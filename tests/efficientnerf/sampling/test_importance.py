@@ -108,8 +108,7 @@ def same_up_to(capacity: int, padded: Samples, exact: Samples) -> None:
         assert not ours[kept:].any()
 
 
-@pytest.mark.parametrize("capacity", [30, 70, 120, 5000])
-@pytest.mark.parametrize("outside", [False, True])
+@pytest.mark.parametrize(("capacity", "outside"), [(30, False), (70, True), (5000, True)])
 def test_a_capacity_pads_or_cuts_even_samples(outside: bool, capacity: int) -> None:
     o, d, near, far = rays()
     jitter = torch.rand(len(o), 10, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -121,8 +120,7 @@ def test_a_capacity_pads_or_cuts_even_samples(outside: bool, capacity: int) -> N
         assert len(padded.start) == 120
 
 
-@pytest.mark.parametrize("capacity", [40, 90, 5000])
-@pytest.mark.parametrize("padding", [0, 9])
+@pytest.mark.parametrize(("padding", "capacity"), [(0, 40), (9, 90), (9, 5000)])
 def test_a_capacity_pads_or_cuts_samples_by_importance(padding: int, capacity: int) -> None:
     """Of coarse samples that are padded themselves, or not; some rays have none, also the last."""
     coarse, at = pruned()
@@ -179,9 +177,10 @@ def test_colours_are_differentiable_through_every_sampler() -> None:
             assert torch.autograd.gradcheck(seen, (raw,), fast_mode=True)
 
 
-@pytest.mark.parametrize("field", ["hash", "mlp", "nerf"])
-@pytest.mark.parametrize("strategy", ["uniform", "hierarchical", "valid", "efficient"])
-@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize(
+    ("field", "strategy", "contracted"),
+    [(("hash", "mlp", "nerf")[n % 3], each, n % 2 == 0) for n, each in enumerate(2 * ["uniform", "hierarchical", "valid", "efficient"])],
+)
 def test_every_strategy_serves_every_field(field: str, strategy: str, contracted: bool) -> None:
     m = untrained(contracted=contracted, field=field, sampling=strategy, num_importance_samples=6, num_coarse_samples=10)
     some = pixels()

@@ -100,9 +100,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     assert reach.min() > reference.FARTHEST
 
 
-@pytest.mark.parametrize("divider", DIVIDERS)
-@pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("per_pivot", [1, 4, 5])
+@pytest.mark.parametrize(("divider", "contracted", "per_pivot"), [(each, *how) for each in DIVIDERS for how in [(False, 1), (True, 4), (False, 5)]])
 def test_pivotal_slots_tile_their_intervals(divider: str, contracted: bool, per_pivot: int) -> None:
     rays = make_rays("outside")
     space, coarse, pivotal = coarse_samples_of(rays, contracted)

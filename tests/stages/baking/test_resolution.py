@@ -26,8 +26,7 @@ def test_the_finest_follows_the_pixels(tmp_path: Path) -> None:
     assert str(told) in held.why
 
 
-@pytest.mark.parametrize("power", [1.6, 2.0, 2.4, 3.0])
-@pytest.mark.parametrize("room", [3_000, 50_000, 800_000, 10_000_000])
+@pytest.mark.parametrize(("power", "room"), [(1.6, 3000), (2.0, 10_000_000), (2.4, 800_000), (3.0, 50_000)])
 def test_the_room_is_used_where_voxels_grow_by_a_power(power: float, room: int) -> None:
     finest = Choice(800, "pixels")
     asked = []

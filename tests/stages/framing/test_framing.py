@@ -232,8 +232,10 @@ def shares_outside(pictures: list[np.ndarray], cameras: list[Camera], low: np.nd
     return scene_bounds.shares_outside(pictures, scene_bounds.silhouettes_outside(pictures, cameras, low, high))
 
 
-@pytest.mark.parametrize(("far", "close", "arc"), [(0.3, 1.3, 360), (0.3, 1.6, 360), (1.0, 1.0, 360), (0.6, 1.3, 360), (0.6, 1.3, 150), (1.0, 1.0, 150)])
-@pytest.mark.parametrize("kind", ["ears", "horns"])
+@pytest.mark.parametrize(
+    ("kind", "far", "close", "arc"),
+    [("ears", 0.3, 1.3, 360), ("horns", 0.3, 1.6, 360), ("horns", 1.0, 1.0, 360), ("ears", 0.6, 1.3, 150)],
+)
 def test_what_three_photographs_show_is_in_the_box_of_silhouettes(kind: str, far: float, close: float, arc: float) -> None:
     cameras = near_and_far(4, far, close, arc)
     pictures = [outlines(kind, camera) for camera in cameras]

@@ -39,10 +39,7 @@ def same(facts: dict[str, Any] | None, gaussians: Gaussians, coded: bool) -> Non
     np.testing.assert_allclose(facts["opacities"], opacities, atol=0.5 / 255 + 1e-6 if coded else 1e-6)
 
 
-@pytest.mark.parametrize("at_once", [7, 2**16])
-@pytest.mark.parametrize("frame", [Z_UP, Y_DOWN], ids=["z up", "y down"])
-@pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.parametrize("extension", SPLAT_EXPORTERS)
+@pytest.mark.parametrize(("extension", "degree", "frame", "at_once"), [(each, *how) for each in SPLAT_EXPORTERS for how in [(0, Z_UP, 7), (3, Y_DOWN, 2**16)]])
 def test_what_was_written_is_described(extension: str, degree: int, frame: Any, at_once: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the file's frame, whatever the pieces in which it is read."""
     monkeypatch.setattr(description, "AT_ONCE", at_once)

@@ -119,7 +119,7 @@ def test_a_checkpoint_that_does_not_fit_changes_nothing(stopped: tuple[Path, Pat
     assert newest.name in said[0]
 
 
-@pytest.mark.parametrize("how", SPOILERS)
+@pytest.mark.parametrize("how", ["cut", "zero", "link"])
 def test_every_scratch_file_of_training_may_be_damaged(stopped: tuple[Path, Path, str], tmp_path: Path, how: str) -> None:
     scene, work, whole = stopped
     shutil.copytree(work, tmp_path / "work")
