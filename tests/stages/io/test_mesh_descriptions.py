@@ -19,7 +19,7 @@ import trimesh
 
 from efficientnerf.surface.mesh import PointCloud
 from pipeline.errors import BadInput
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from stages.io.meshes.description import describe_mesh
 from tests.stages.io.meshes import Y_DOWN, block
 from workflows.inspection.describe import MESHES
