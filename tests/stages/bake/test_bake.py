@@ -248,26 +248,6 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
     assert ((fitted - truth) ** 2).mean() < 0.5 * ((raw - truth) ** 2).mean()
 
 
-@pytest.mark.parametrize(("total_variation", "beside"), [(0.0, 0), (1e-5, 28)])
-def test_a_device_without_room_leaves_the_fit_to_the_host(total_variation: float, beside: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.asset.refinement.targets import Targets
-    from tests.efficientnerf.balls import pixels
-    from tests.efficientnerf.trees import random_tree
-
-    tree, targets, there = random_tree(degree=3), Targets(pixels(2, 8), (1.0, 1.0, 1.0)), object()
-    monkeypatch.setattr(Targets, "to", lambda self, device: self if device == "cpu" else there)
-    events: list[dict[str, Any]] = []
-    made = job(tmp_path, dataclasses.replace(QUICK, total_variation=total_variation), events=events)
-    made.device = "cuda"
-    needed = (604 + beside) * len(tree.density_values) + 4 * 5**3 * len(tree.voxel_index) + 12 * 60 + 2 * 64 * 4
-    for free, where in ((needed, there), (needed - 1, targets)):
-        monkeypatch.setattr(memory, "free_on_device", lambda device, free=free: free)
-        assert refinement.targets_on_device(made, tree, targets) is where
-    assert ["refined on the CPU" in event["text"] for event in events if event["event"] == "warning"] == [True]
-    made.device = "cpu"
-    assert refinement.targets_on_device(made, tree, targets) is targets
-
-
 def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
     m = load_renderer(inputs["train"]).model
     m.voxels.values.fill_(-1.0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import field_samples, format
-from efficientnerf.asset.cascades import cascade_sides, cascades_of, subset, voxel_cascades
+from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades
 from efficientnerf.asset.refinement import schedule
 from efficientnerf.asset.refinement.schedule import Phase
 from efficientnerf.asset.rendering import render
@@ -33,7 +33,7 @@ from stages.io import field_file
 from stages.io.png import read_png, write_png
 from stages.io.scene import Scene, View, load, save
 from stages.train import averaged
-from tests.efficientnerf.surroundings import GROUND, WALL, around, photographs, surroundings
+from tests.efficientnerf.surroundings import WALL, around, photographs, surroundings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job
 from tests.stages.spoilers import SPOILERS
 
@@ -267,21 +267,6 @@ def test_a_scene_that_does_not_fit_into_memory_is_refused_before_voxels_are_bake
     with pytest.raises(UsageError, match="--memory"):
         bake.run(short)
     assert not list(short.work.glob("cascade0_*.npy"))
-
-
-def test_voxels_of_a_cascade_reach_into_the_one_before_by_one(inputs: dict[str, Path], undisturbed: tuple[Path, int]) -> None:
-    tree = format.load(undisturbed[0] / "out" / BakeOutputs.asset)
-    sides, of, at = cascade_sides(tree), voxel_cascades(tree), voxel_coordinates(tree)
-    reaching = 0
-    for n in range(1, len(sides)):
-        low, high = cascades_of(tree)[n - 1].bounds(tree.brick)
-        centre = cascades_of(tree)[n].bounds_min + (at[of == n] + 0.5) * sides[n]
-        depth = np.minimum(centre - low, high - centre).min(axis=1) / sides[n]  # inside of the box before, in voxels
-        assert depth.max() < 1
-        reaching += int((depth > 0).sum())
-    assert reaching > 0
-    ground = np.abs(cascades_of(tree)[1].bounds_min[2] + (at[of == 1, 2] + 0.5) * sides[1] - GROUND) < 2 * sides[1]
-    assert ground.any()
 
 
 def test_bounds_given_by_hand_are_the_region(tmp_path: Path, inputs: dict[str, Path]) -> None:

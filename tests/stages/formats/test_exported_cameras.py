@@ -76,14 +76,6 @@ def test_metashapes_project_frame_and_cameras_without_a_place(tmp_path: Path) ->
     assert not any("listed" in warning for warning in capture.warnings), "labels state no folder"
 
 
-def test_metashapes_fisheye_lens(tmp_path: Path) -> None:
-    lens = {"f": 25.0, "cx": 0.3, "cy": -0.2, "b1": 0.4, "k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": -0.0005}
-    folder, pixels = exports.metashape(tmp_path / "a", lens, "fisheye")
-    capture = read(folder)
-    assert_seen(capture, pixels)
-    assert capture.photos[0].camera.model == "OPENCV_FISHEYE"
-
-
 def test_a_geocentric_project_keeps_scale_and_finds_up(tmp_path: Path) -> None:
     folder, _ = exports.metashape(tmp_path / "a")
     text = (folder / "cameras.xml").read_text()
@@ -210,15 +202,6 @@ def test_images_under_another_folder_are_found_and_said(how: str, tmp_path: Path
     assert len([path for path in importers.files(folder, Settings()) if path.suffix == ".png"]) == 6
 
 
-def test_two_folders_that_hold_as_many_are_not_chosen_between(tmp_path: Path) -> None:
-    folder = moved(captures.nerfstudio(tmp_path / "a"), "left")
-    captures.write_pictures(folder / "right", [f"img_{index}.png" for index in range(6)])
-    with pytest.raises(BadInput):
-        read(folder)
-    (folder / "right/img_5.png").unlink()
-    assert {photo.image.parent.name for photo in read(folder).photos} == {"left"}
-
-
 def test_depth_and_images_of_another_split_do_not_stand_in(tmp_path: Path) -> None:
     """Blender's splits have files of the same names."""
     folder = moved(captures.nerfstudio(tmp_path / "a"), "Depth")
@@ -228,12 +211,6 @@ def test_depth_and_images_of_another_split_do_not_stand_in(tmp_path: Path) -> No
     shutil.rmtree(folder / "train")
     with pytest.raises(BadInput):
         read(folder)
-
-
-def test_bare_names_lie_in_the_usual_folder_of_several(tmp_path: Path) -> None:
-    folder, pixels = exports.metashape(tmp_path / "a")
-    captures.write_pictures(folder / "images_2", list(pixels))
-    assert {photo.image.parent.name for photo in read(folder).photos} == {"images"}
 
 
 # --- hostile

@@ -98,13 +98,6 @@ def test_folders_of_masks_have_any_case(masks: str, tmp_path: Path) -> None:
     assert masks_of(source, found) == {found[0]: folder / masks / "photos/a/1.png", found[1]: folder / f"photos/b/{masks}/1_mask.png"}
 
 
-def test_masks_of_a_list_that_names_none(tmp_path: Path) -> None:
-    folder = write(captures.nerfstudio(tmp_path), "masks/img_0.png", "images/img_1_mask.png")
-    capture = importers.IMPORTERS["nerfstudio"].read(folder, Settings())
-    assert [photo.mask for photo in capture.photos[:3]] == [folder / "masks/img_0.png", folder / "images/img_1_mask.png", None]
-    assert {folder / "masks/img_0.png", folder / "images/img_1_mask.png"} < set(importers.files(folder, Settings()))
-
-
 # --- one picture in two formats
 
 

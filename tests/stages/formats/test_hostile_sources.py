@@ -19,7 +19,7 @@ from pipeline.run import Run
 from pipeline.stage import Job
 from stages.formats import importers
 from stages.formats.importers.description import describe_source
-from stages.formats.importers.source import Source, walk
+from stages.formats.importers.source import walk
 from stages.io import pictures, scene
 from stages.poses import run as poses
 from stages.poses.run import PosesSettings
@@ -151,19 +151,6 @@ def test_messages_about_hostile_names_are_one_printable_line(tmp_path: Path) -> 
         with pytest.raises(BadInput) as caught:
             run(source, tmp_path / "out")
         assert str(caught.value).isprintable()
-
-
-def test_no_two_pictures_have_one_name(tmp_path: Path) -> None:
-    source = Source(tmp_path)
-    names = [source.name_of(tmp_path / name) for name in ("\udcff.png", r"\udcff.png", "\udcff.png")]
-    assert names == [r"\udcff.png", r"\udcff.png (2)", r"\udcff.png"]
-
-
-def test_a_long_name_leaves_room_for_its_working_image(tmp_path: Path) -> None:
-    names = ["\udcff" * 120 + f"{index}.jpg" for index in range(3)] + ["y" * 250 + ".jpg", "z.png", "é" * 124 + ".png"]
-    made = [dataclasses.replace(camera, name=name) for camera, name in zip(captures.cameras(), names, strict=True)]
-    found, _ = run(captures.nerfstudio(tmp_path / "source", made), tmp_path / "out")
-    assert len({view.image for view in found.views}) == 6
 
 
 # --- runs inside of the source

@@ -233,18 +233,6 @@ def test_a_full_disk_leaves_no_part_of_an_obj(function: str, call: int, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_obj_appears_after_what_it_refers_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    order, real = [], os.replace
-
-    def replaced(source: Path, target: Path) -> None:
-        order.append(Path(target).suffix)
-        real(source, target)
-
-    monkeypatch.setattr(os, "replace", replaced)
-    MESH_EXPORTERS[".obj"](textured(), tmp_path / "a.obj", Z_UP)
-    assert order == [".png", ".mtl", ".obj"]
-
-
 def spoilt(**changes: np.ndarray) -> Mesh:
     mesh = textured()
     assert mesh.texture is not None

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.region import Region
-from efficientnerf.asset.rendering import MOST_PIXELS, Rendering
+from efficientnerf.asset.rendering import MOST_PIXELS
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput
@@ -212,23 +212,6 @@ def test_an_odd_orbit_gives_cameras_or_is_refused(name: str) -> None:
         except BadInput:
             continue
         assert np.isfinite([camera.world_from_camera for camera in cameras]).all()
-
-
-def test_an_environment_is_behind_frames_unless_a_background_is_asked_for(tmp_path: Path) -> None:
-    tree = replace(random_tree(), environment=np.ones((4, 8, 3), np.float32))
-    camera = turntable_cameras(tree, frames=1, width=16, height=12)[0]
-
-    def draw(shown: NerfTree, camera: Any, **more: Any) -> Rendering:
-        shape = (camera.height, camera.width)
-        blue = np.zeros((*shape, 3), np.float32)
-        blue[..., 2] = 0.0 if shown.environment is None else 1.0
-        return Rendering(blue, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32), np.zeros((*shape, 3), np.float32))
-
-    for background, expected in (("auto", [0, 0, 255]), ("white", [255, 255, 255]), ("#ff0000", [255, 0, 0]), ("transparent", [0, 0, 0, 0])):
-        render_path(tree, [camera], tmp_path / background, RenderOptions(background=background, video=None, exr="off"), draw=draw)
-        assert read_png(tmp_path / background / "frame_0000.png")[0, 0].tolist() == expected
-    render_path(replace(tree, environment=None), [camera], tmp_path / "none", RenderOptions(video=None, exr="off"), draw=draw)
-    assert read_png(tmp_path / "none" / "frame_0000.png")[0, 0].tolist() == [255, 255, 255]
 
 
 def arc(degrees: float, *, count: int = 20, distance: float = 3.0, target: tuple[float, float, float] = (0.0, 0.0, 0.0), rise: float = 10.0) -> list[Camera]:

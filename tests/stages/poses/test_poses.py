@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -244,14 +243,6 @@ def test_a_box_and_an_up_axis_can_be_set(tmp_path: Path) -> None:
     made, _ = run(captures.colmap_bin(tmp_path / "source"), tmp_path, up="z", crop_box=(-1.0, -0.5, -0.25, 1.0, 0.5, 0.25))
     np.testing.assert_allclose(made.bounds, [[-1, -0.5, -0.25], [1, 0.5, 0.25]], atol=1e-12)
     np.testing.assert_allclose(made.world_from_capture.matrix(), np.eye(4), atol=1e-12)
-
-
-def test_names_that_differ_only_in_their_extension() -> None:
-    from stages.io.working_images import image_paths
-
-    names = ["images/a.png", "images/a.jpg", "images_4/A.png", "b/../../a.png", "/c.png"]
-    cameras = [replace(camera, name=name) for name, camera in zip(names, captures.cameras(5), strict=True)]
-    assert image_paths(cameras) == ["a.png", "a_2.jpg", "A_3.png", "b/a.png", "c.png"]
 
 
 def test_real_photographs_with_colmap_cameras(tmp_path: Path) -> None:

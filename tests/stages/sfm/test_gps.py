@@ -125,17 +125,6 @@ def test_exact_positions_give_metres_and_the_upward_axis(tmp_path: Path) -> None
         assert photo.camera.params == before.camera.params
 
 
-def test_coarser_ones_give_the_scale_alone(tmp_path: Path) -> None:
-    given, files, _ = capture(tmp_path, CIRCLE, 1.6, np.random.default_rng(3))
-    found, sentence = with_gps(given, files)
-    assert (found.metric, found.up) == (True, None)
-    assert found.facts["gps"]["used"] == "scale"  # type: ignore[index]
-    true = np.linalg.norm(CIRCLE[:, None] - CIRCLE[None], axis=2)
-    ratio = lengths(found)[true > 0] / true[true > 0]
-    assert abs(ratio.mean() - 1) < 0.05
-    assert "the scale is taken" in sentence
-
-
 @pytest.mark.parametrize(("extent", "noise", "known"), [(0.05, 4.0, 99), (1.0, 0.1, 11)])
 def test_positions_that_say_nothing_change_nothing(tmp_path: Path, extent: float, noise: float, known: int) -> None:
     given, files, _ = capture(tmp_path, CIRCLE, 0.0, np.random.default_rng(5), known)

@@ -24,7 +24,7 @@ pytest.importorskip("onnx", reason="the package onnx, which makes the networks o
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
 
 from stages.sfm.learned.networks import Detector, Features, Matcher, given_networks
-from tests.stages.sfm.made_networks import WIDE, _Graph, detector, echo, matcher, value
+from tests.stages.sfm.made_networks import WIDE, _Graph, detector, matcher, value
 
 ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
@@ -88,16 +88,6 @@ def test_layouts_of_matchers_find_the_same_shift(tmp_path: Path) -> None:
     moved = other.xy[pairs[0][:, 1]] - one.xy[pairs[0][:, 0]]
     assert len(moved) > 30
     np.testing.assert_allclose(np.median(moved, axis=0), (6, 0), atol=0.01)
-
-
-def test_matchers_get_key_points_as_they_were_exported_to(tmp_path: Path) -> None:
-    """Only matches that are sure enough count: what this network says of a feature is its first coordinate."""
-    found = strongest(detector(tmp_path / "d.onnx"))
-    for layout, expected in (("COLMAP", found.seen[:, 0] >= 0.1), ("LightGlue-ONNX", (found.seen[:, 0] - WIDTH / 2) / (WIDTH / 2) >= 0.1)):
-        pairs = Matcher(echo(tmp_path / f"{layout}.onnx", layout)).matches(found, found)
-        np.testing.assert_array_equal(pairs[:, 0], np.flatnonzero(expected))
-    few = Features(found.xy[:5], found.seen[:5], found.size, found.descriptors[:5])
-    assert Matcher(tmp_path / "COLMAP.onnx").matches(few, found).shape == (0, 2)
 
 
 def refused_networks(folder: Path) -> dict[str, Path]:

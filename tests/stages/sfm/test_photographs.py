@@ -316,28 +316,6 @@ def test_photographs_that_show_nothing_in_common_are_named(tmp_path: Path) -> No
         find(tmp_path, names, tmp_path / "w")
 
 
-def test_one_thread_compares_descriptors(ten: tuple[list[str], Path, Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The BLAS inside pycolmap hands the same scratch memory to two threads now and then: too rarely to be seen in a test."""
-    import pycolmap
-
-    names, work, _ = ten
-    shutil.copytree(work, tmp_path / "work")
-    with sqlite3.connect(tmp_path / "work" / "database.db") as connection:
-        connection.execute("DELETE FROM matches")
-        connection.execute("DELETE FROM two_view_geometries")
-    connection.close()
-    asked: list[int] = []
-    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda path, matching, *rest: asked.append(matching.num_threads))
-    images, _ = prepare_images(
-        STILL_LIFE, names, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
-        progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
-    )  # fmt: skip
-    monkeypatch.setattr(pair_workers, "record", lambda *a: None)
-    monkeypatch.setattr(matches, "record", lambda *a: None)
-    matches.match_pairs(tmp_path / "work", images, all_pairs(10), seed=0, progress=lambda *a, **k: None, safe_point=lambda: None)
-    assert set(asked) == {1}
-
-
 def without_pairs(work: Path) -> dict[str, list[Any]]:
     """Remove all pairs from the database, and the notes of them; what they were."""
     with contextlib.closing(sqlite3.connect(database_path(work))) as connection, connection:

@@ -141,13 +141,6 @@ def test_the_signals_of_a_terminal_are_the_parents_alone(monkeypatch: pytest.Mon
     assert process.run({}, **QUIET) == "alive"
 
 
-@pytest.mark.parametrize("executable", ["", "/nowhere/python3"])
-def test_an_odd_interpreter(monkeypatch: pytest.MonkeyPatch, executable: str) -> None:
-    monkeypatch.setattr(sys, "executable", executable)
-    child_does(monkeypatch, "import msgspec\nreturn 'found'")
-    assert process.run({}, **QUIET) == "found"
-
-
 def test_modules_in_the_working_folder_are_not_imported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("json", "ctypes", "stages", "queue"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('taken from the working folder')")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.errors import CorruptArtifact, Interrupted, StageFailed
+from pipeline.errors import Interrupted, StageFailed
 from stages.artifacts import TrainOutputs
 from stages.evaluate.trivial import blurred
 from stages.io import scene as scenes
@@ -246,13 +246,3 @@ def test_a_trial_begins_with_what_is_stated_whatever_training_made_of_it(tmp_pat
     unmasked = second_chances._with_views(changed, tuple(replace(view, mask=None) for view in views))
     assert unmasked.usable_at(index).all()
     assert not changed.usable_at(index).all()
-
-
-@pytest.mark.parametrize("spoiled", [{"format": 2}, {"choices": {"near": "nowhere"}}, {"choices": {"masks": 3}}])
-def test_choices_that_training_did_not_write_are_refused(tmp_path: Path, spoiled: dict[str, Any]) -> None:
-    path = TrainOutputs(tmp_path).choices
-    training_choices.write(TrainingChoices(near="median"), path)
-    assert training_choices.load(tmp_path) == TrainingChoices(near="median")
-    path.write_text(json.dumps(json.loads(path.read_text()) | spoiled))
-    with pytest.raises(CorruptArtifact):
-        training_choices.load(tmp_path)

@@ -226,10 +226,6 @@ def test_exposures_are_saved(tmp_path: Path) -> None:
     assert as_taken(tmp_path) is None
 
 
-def test_where_exposure_is_not_learned_the_bytes_are_those_without_it(scene: Path, tmp_path: Path, undisturbed: str) -> None:
-    assert run(job(tmp_path, settings(**QUICK, exposure="off"), poses=scene)) == undisturbed
-
-
 @pytest.mark.parametrize("differ", [True, False])
 def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, differ: bool) -> None:
     """Photographs of the same points, of one brightness or of several; without points nothing is known, and before a constant background nothing is learned."""

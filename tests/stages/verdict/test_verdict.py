@@ -207,16 +207,6 @@ def test_enlarged_pictures_have_no_blocks(step: int) -> None:
     assert not look(coarse[:40]).compressed
 
 
-@pytest.mark.parametrize(("tiny", "grade"), [(1, "good"), (8, "usable"), (24, "poor")])
-def test_tiny_photographs_are_named_with_their_size(tiny: int, grade: str) -> None:
-    seen = sharp(NAMES, **{name: {"longest": 96} for name in NAMES[:tiny]})
-    found = verdict_on(capture(), seen)
-    assert [(problem.what, problem.grade, problem.images) for problem in found.problems] == [("tiny", grade, tuple(NAMES[:tiny]))]
-    assert "96 px" in found.problems[0].sentence
-    assert "tiny" in [problem.what for problem in failed("none.", "try.", 0, LOST, seen, {}, ()).problems]
-    assert verdict_on(replace(capture(), kind="colmap"), seen).grade == "good"  # its cameras are known
-
-
 def lens(**changes: float) -> tuple[float, ...]:
     return tuple(({"f": 500.0, "x": 320.0, "y": 240.0} | changes).values())
 
@@ -251,14 +241,6 @@ def test_photographs_in_which_something_moves_are_named_with_the_share_of_the_pi
     doubtful = moving(3, first=0.1, pairs_agreeing=0.9)
     assert [(problem.what, problem.grade) for problem in doubtful.problems] == [("moving parts", "poor"), ("disagreement", "usable")]
     assert "moving parts" not in [problem.what for problem in moving(24, background="in the picture").problems]  # the subject turned
-
-
-def test_lost_photographs_have_the_registered_ones_that_they_failed_against() -> None:
-    overlaps = (("00.jpg", "lost0.jpg", 12), ("01.jpg", "lost0.jpg", 19), ("lost0.jpg", "lost1.jpg", 90), ("00.jpg", "01.jpg", 500))
-    made = capture(rejected=LOST[:2], overlaps=overlaps)
-    found = verdict_on(made, {})
-    assert found.images["lost0.jpg"]["nearest"] == [{"image": "01.jpg", "matches": 19}, {"image": "00.jpg", "matches": 12}]
-    assert found.images["lost1.jpg"]["nearest"] == []
 
 
 BARE = tuple((f"bare{k}.jpg", "only 3 features detected: blurred, dark or without texture") for k in range(4))

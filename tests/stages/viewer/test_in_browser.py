@@ -190,16 +190,6 @@ def test_a_large_page_that_was_damaged_says_so(chromium: Any, tmp_path: Path) ->
         assert page.page.evaluate("typeof enerf") == "undefined"
 
 
-def test_a_browser_without_webgl2_is_told(chromium: Any, tmp_path: Path) -> None:
-    context = chromium.new_context()
-    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    page = context.new_page()
-    page.goto(written(tmp_path, serialize(random_tree(1), "compact")).as_uri())
-    page.wait_for_selector(".failed")
-    assert "WebGL2" in page.inner_text("#status")
-    context.close()
-
-
 def test_its_own_digests_and_base64_are_those_of_the_standards(chromium: Any, tmp_path: Path) -> None:
     with browser.opened(chromium, written(tmp_path, serialize(random_tree(1), "compact"))) as page:
         for length in (0, 3, 55, 56, 63, 64, 65, 119, 120, 1000):

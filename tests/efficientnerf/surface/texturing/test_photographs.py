@@ -161,22 +161,6 @@ def test_a_texel_sees_all_pixels_that_lie_in_it() -> None:
     assert np.abs(colours[known > 0.95] - 0.5).max() < 0.06
 
 
-def test_many_photographs_keep_the_best() -> None:
-    """A texel keeps no more than so many: those of the highest grades, whatever the order they come in."""
-    vertices, faces = ball(2)
-    photos = [photographed(vertices, faces, camera) for camera in cameras(12)]
-    normals, found = vertex_normals(vertices, faces), []
-    for order in (1, -1):
-        surveys = [survey(vertices, faces, normals, pattern(vertices), photo) for photo in photos]
-        atlas = textured(vertices, faces, photos[:1])[0]
-        texels = PhotographTexture(vertices, faces, normals, atlas, np.max([each.density for each in surveys], axis=0), 1.0, kept=3)
-        for photo, each in list(zip(photos, surveys))[::order]:
-            texels.look(photo, each)
-        assert (np.diff(texels.grades, axis=1) <= 0).all()
-        found.append(texels.grades)
-    np.testing.assert_array_equal(*found)
-
-
 @pytest.mark.parametrize(("tilt", "gap"), [(0.0, 0.005), (0.9, 0.03)])
 def test_no_photograph_shows_what_lies_close_behind_a_thin_sheet(tilt: float, gap: float) -> None:
     """Two sheets that face the camera, one a small share of the distance behind the other: thin parts do not show through, as far as pixels tell."""
