@@ -99,7 +99,7 @@ DAMAGE: dict[str, tuple[Callable[[Any], None], str]] = {
     "bounds": (set_in("bounds", [[1, 1, 1], [0, 0, 0]]), "bounds"),
     "scale": (set_in("world_from_capture", "scale", -1.0), r"world_from_capture\.scale"),
     "background": (set_in("background", [1, 1]), r"\$\.background"),
-    "no space": (set_in("space", None), ""),
+    "no space": (set_in("space", None), "without"),
     "a space without its camera": (set_in("space", "ndc"), "'ndc'"),
     "infinity": (lambda document: document["orbit"].update(radius=float("1e999")), "Infinity|radius"),
 }
