@@ -12,7 +12,7 @@ from stages.compiling import compiling_kernels
 from tests.stages.balls import job
 
 
-def test_a_stage_says_that_it_compiles_kernels_when_the_first_is_and_how_long_that_took(tmp_path: Path) -> None:
+def test_a_stage_says_that_it_compiles_kernels(tmp_path: Path) -> None:
     events: list[dict[str, Any]] = []
     heard = []
 

@@ -29,7 +29,7 @@ def everything(tree: NerfTree) -> np.ndarray:
     return np.ones(len(tree.density_values), bool)
 
 
-def test_a_small_piece_that_the_box_cuts_off_is_a_scrap_and_one_inside_is_not() -> None:
+def test_a_small_piece_that_the_box_cuts_off_is_a_scrap() -> None:
     tree, of = tree_of(((8, 8, 8), (28, 28, 28)), ((40, 40, 44), (44, 44, 48)), ((36, 8, 36), (40, 12, 40)))  # 8000, 64 (at a face), 64 (inside) voxels
     np.testing.assert_array_equal(small_components(tree, everything(tree), 0.02), of == 1)
 

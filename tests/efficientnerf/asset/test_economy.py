@@ -49,7 +49,7 @@ def test_voxels_that_weigh_more_err_less() -> None:
     assert np.abs(opacity - seen)[heavy].mean() < np.abs(opacity - seen)[~heavy].mean()
 
 
-def test_the_order_of_voxels_does_not_matter_and_codes_are_the_same_every_time() -> None:
+def test_codes_do_not_depend_on_the_order_of_voxels() -> None:
     tree = ball()
     rng = np.random.default_rng(2)
     order = rng.permutation(len(tree.density_values))

@@ -101,7 +101,7 @@ def test_large_grids_have_cells_of_several_tiles(monkeypatch: pytest.MonkeyPatch
         ErrorMap(grid, None, np.zeros((2, len(grid)), np.float32))
 
 
-def test_of_masks_that_keep_little_no_more_patches_are_drawn_than_are_asked_for() -> None:
+def test_no_more_patches_are_drawn_than_are_asked_for() -> None:
     masks = [np.zeros((h, w), bool) for w, h in SIZES]
     masks[1][5, 3] = True
     grid = PatchGrid(views(masks), 2)

@@ -191,7 +191,7 @@ def test_golden_files_stay_readable(path: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.nerftree")), ids=lambda path: path.stem)
-def test_a_reader_written_from_the_text_alone_decodes_golden_files_to_the_same_voxels(path: Path) -> None:
+def test_a_reader_of_the_text_alone_decodes_golden_files_alike(path: Path) -> None:
     ours, theirs = load(path), Tree(path)
     for reader, lines in ((nerftree_reader, 150), (packed_reader, 150)):
         text = Path(reader.__file__).read_text()

@@ -45,7 +45,7 @@ def test_compact_packed_and_compact_again_is_the_same_file(tmp_path: Path, brick
     assert (tmp_path / "a.nerftree").read_bytes() == (tmp_path / "b.nerftree").read_bytes()
 
 
-def test_a_whole_scene_and_normalised_device_coordinates_are_packed_without_loss(tmp_path: Path) -> None:
+def test_whole_scenes_and_ndc_are_packed_without_loss(tmp_path: Path) -> None:
     scene = random_cascades(4, count=3, brick=2, degree=2)
     nearest = replace(random_tree(3, degree=2), lookup="nearest")
     for tree in (scene, nearest):

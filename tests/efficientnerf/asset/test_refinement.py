@@ -194,7 +194,7 @@ def weights_by_hand(tree: NerfTree, origins: np.ndarray, directions: np.ndarray,
     return out
 
 
-def test_greatest_weights_are_those_of_a_march_by_hand_in_any_number_of_parts() -> None:
+def test_greatest_weights_are_those_of_a_march_by_hand() -> None:
     tree = random_tree(3, shape=(2, 3, 2), brick=3, sigma=6.0)
     origins, directions = rays_at(tree, 40)
     gain = np.random.default_rng(0).random(40).astype(np.float32)

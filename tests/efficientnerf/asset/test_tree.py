@@ -55,7 +55,7 @@ def test_normals_point_down_the_density() -> None:
         np.testing.assert_allclose(normal, -gradient / length if length > 0 else 0 * gradient, atol=1e-3)
 
 
-def test_a_point_in_an_empty_cell_has_no_density_whatever_its_neighbours_hold() -> None:
+def test_a_point_in_an_empty_cell_has_no_density() -> None:
     indices = np.argwhere(np.ones((4, 4, 4), bool))
     tree = tree_from_voxels((2, 1, 1), 1.0, np.zeros(3), indices, np.full(64, 8.0, np.float32), np.zeros((64, 1, 3), np.float32))
     points = np.array([[3.99, 2.0, 2.0], [4.01, 2.0, 2.0], [3.5, 2.0, 2.0], [0.01, 2.0, 2.0], [-0.01, 2.0, 2.0]])

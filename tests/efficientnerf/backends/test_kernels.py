@@ -139,7 +139,7 @@ def test_masks_leave_pixels_out() -> None:
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
-def test_directions_between_knots_are_off_by_less_than_a_hundredth_of_a_pixel(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_directions_between_knots_are_off_by_a_hundredth_of_a_pixel(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     monkeypatch.setattr("efficientnerf.training.pixels.EXACT", 100)
     focal = 900.0
     more = (-0.12, 0.03, 0.001, -0.002) if model == "OPENCV" else (0.02, -0.01, 0.003, 0.0)

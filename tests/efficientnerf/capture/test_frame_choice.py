@@ -67,7 +67,7 @@ def test_time_in_which_nothing_moves_takes_no_frames_from_the_rest() -> None:
     assert (np.array(choose(standing, np.ones(260), 15))[there] == CHOSEN).tolist() == (np.array(choose(motion, np.ones(60), 15)) == CHOSEN).tolist()
 
 
-def test_a_long_blur_is_thinned_but_no_two_that_follow_each_other_are_left_out() -> None:
+def test_a_long_blur_is_thinned_without_a_gap() -> None:
     sharpness = np.ones(120)
     sharpness[40:80] = 0.5
     picked = [verdict for verdict in choose(np.linspace(0, 1, 120), sharpness, 24) if verdict in (CHOSEN, BLUR)]

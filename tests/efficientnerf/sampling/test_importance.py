@@ -64,7 +64,7 @@ def test_even_samples_tile_the_ray() -> None:
 
 
 @pytest.mark.parametrize("drop", [-1.0, 0.5])
-def test_samples_by_importance_tile_their_intervals_and_contain_the_coarse_ones(drop: float) -> None:
+def test_samples_by_importance_tile_their_intervals(drop: float) -> None:
     coarse, at = pruned(drop)
     o, d, _, _ = rays()
     weight = torch.rand(len(at), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -226,7 +226,7 @@ def test_counts_are_those_of_the_strategies() -> None:
 
 
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
-def test_valid_samples_of_what_is_not_pruned_are_those_that_the_voxels_would_keep(rule: str) -> None:
+def test_valid_samples_are_those_that_the_voxels_would_keep(rule: str) -> None:
     """Equation 5 on a trained NeRF: density above zero, read as the voxels read it."""
     m = untrained(field="mlp", sampling="hierarchical", occupancy_rule=rule, num_importance_samples=6, num_coarse_samples=10)
     bundle = [torch.from_numpy(a) for a in pixels().bundle(np.arange(100, 140))[:4]]

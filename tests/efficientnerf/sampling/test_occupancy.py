@@ -91,7 +91,7 @@ def test_maximum_keeps_the_largest_and_forgets() -> None:
 
 @pytest.mark.parametrize("padded", [False, True])
 @pytest.mark.parametrize(("rule", "beta", "decay"), [("momentum", 1.0, 0.5), ("momentum", 0.1, 0.5), ("maximum", 0.1, 0.0), ("maximum", 0.1, 0.95)])
-def test_masked_voxels_stay_masked_and_updates_of_others_do_not_depend_on_them(rule: str, beta: float, decay: float, padded: bool) -> None:
+def test_masked_voxels_stay_masked_and_change_no_others(rule: str, beta: float, decay: float, padded: bool) -> None:
     voxels, plain = (density_voxels(SIDE, rule, threshold=1.0, beta=beta, decay=decay) for _ in range(2))
     masked = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
     masked[1] = True

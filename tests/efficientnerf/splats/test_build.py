@@ -80,7 +80,7 @@ def test_gaussians_of_a_ball_lie_flat_on_it_in_its_colours_as_many_as_wanted() -
     np.testing.assert_allclose(colours[:, :2], 1 / (1 + np.exp(-wanted[:, :2])), atol=0.02)
 
 
-def test_fitting_brings_gaussians_nearer_to_pictures_that_they_were_not_fitted_to() -> None:
+def test_fitting_brings_gaussians_nearer_to_pictures_held_back() -> None:
     tree, cameras = ball(16), ring(12)
     views = photographs(tree, cameras)
     seen, held_back = views[::2], views[1::2]
@@ -207,7 +207,7 @@ def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkey
     assert met.min() > 0
 
 
-def test_gaussians_are_divided_where_the_error_was_and_those_that_hide_nothing_go() -> None:
+def test_gaussians_are_divided_by_error_and_faint_ones_go() -> None:
     begun = merging.merged(ball(16, 0), ring(3), 100, 0)
     count = len(begun)
     faint = np.where(np.arange(count) < 5, np.float32(0.003), begun.opacities)

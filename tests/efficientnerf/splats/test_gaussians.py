@@ -40,7 +40,7 @@ def test_what_no_gaussian_may_be_is_refused(name: str, value: np.ndarray, compla
         replace(some(), **{name: value})
 
 
-def test_quaternions_and_matrices_are_each_others_inverse_half_turns_included() -> None:
+def test_quaternions_and_matrices_are_each_others_inverse() -> None:
     quaternions = np.concatenate([some(200).rotations.astype(np.float64), np.eye(4)])
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     matrices = rotation_matrices(quaternions)

@@ -100,7 +100,7 @@ LENSES = [
 
 
 @pytest.mark.parametrize(("model", "extra"), LENSES)
-def test_a_small_gaussian_lands_where_the_lens_sends_it_in_the_shape_of_its_points(model: str, extra: tuple[float, ...]) -> None:
+def test_a_small_gaussian_lands_where_the_lens_sends_its_points(model: str, extra: tuple[float, ...]) -> None:
     lens, rng = camera(model, extra), np.random.default_rng(0)
     one = some(count=1)
     pixels = np.array([[9.0, 7.0], [30.0, 20.0], [18.3, 13.1]])

@@ -109,7 +109,7 @@ def test_a_hash_map_stays_half_empty_and_an_octree_shares_its_rows() -> None:
     np.testing.assert_array_equal(np.sort(inner // 8 + tree.child[inner]), np.arange(1, len(tree.child) // 8))  # each node has one parent
 
 
-def test_a_tree_of_bricks_takes_less_than_a_quarter_of_dense_voxels_at_a_fifth() -> None:
+def test_a_tree_of_bricks_takes_a_quarter_of_dense_voxels_at_a_fifth() -> None:
     for voxels in (clustered(128, 0.2, 0), scattered(128, 0.2, 0)):
         tree = BrickTree.cache(voxels)
         assert len(tree.values) == len(voxels.packed)

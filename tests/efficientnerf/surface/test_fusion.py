@@ -119,7 +119,7 @@ def test_a_ball_has_its_distances_on_any_number_of_threads() -> None:
         numba.set_num_threads(before)
 
 
-def test_views_carve_what_they_see_through_and_say_nothing_of_what_they_do_not_show() -> None:
+def test_views_carve_what_they_see_through_and_nothing_else() -> None:
     fusion = fusion_of_views([ball_view(camera(direction)) for direction in DIRECTIONS])
     away, opacity = (grid()[1] - RADIUS) / VOXEL, np.zeros((32,) * 3, np.float32)
     opacity[away <= 0] = 1

@@ -153,7 +153,7 @@ def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
 
 
 @pytest.mark.parametrize(("field", "strategy"), [("mlp", "uniform"), ("nerf", "hierarchical"), ("mlp", "valid")])
-def test_other_samplings_learn_too_and_only_those_that_prune_touch_the_voxels(field: str, strategy: str) -> None:
+def test_other_samplings_learn_and_only_pruning_ones_touch_voxels(field: str, strategy: str) -> None:
     m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, num_importance_samples=16, sample_batch_size="off", max_rays_per_batch=128)
     steps = run(m)
     assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 1

@@ -201,7 +201,7 @@ def test_the_field_takes_back_what_it_left_out_wrongly(field: Model) -> None:
     assert np.array_equal(c.pose, np.stack([each.world_from_camera for each in CAMERAS]))
 
 
-def test_a_pose_that_was_found_is_trained_on_once_the_field_that_has_not_seen_it_agrees(field: Model) -> None:
+def test_a_found_pose_is_trained_on_once_the_field_agrees(field: Model) -> None:
     cameras = [*CAMERAS[:5], rotated(5, 20), *CAMERAS[6:]]
     c, pixels = ViewChecks.none(cameras), pixels_of(cameras, PICTURES)
     assert check(c, field, pixels, None, 300)
@@ -212,7 +212,7 @@ def test_a_pose_that_was_found_is_trained_on_once_the_field_that_has_not_seen_it
     assert angle(c.cameras[5], CAMERAS[5]) < 2
 
 
-def test_training_with_wrong_cameras_finds_them_and_draws_none_of_their_pixels() -> None:
+def test_training_finds_wrong_cameras_and_draws_none_of_their_pixels() -> None:
     """The field has seen them from its first step on."""
     cameras = list(CAMERAS)
     for n, degrees in ((2, 10), (13, 45)):

@@ -233,7 +233,7 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
     }
 
 
-def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_photograph(
+def test_the_raw_asset_is_like_the_field_the_fitted_like_the_photograph(
     inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int]
 ) -> None:
     view = load(inputs["poses"]).views[-1]
@@ -257,7 +257,7 @@ def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None
         run(job(tmp_path, QUICK, poses=inputs["poses"], train=tmp_path / "train"))
 
 
-def test_a_size_without_room_for_a_voxel_is_refused_before_the_field_is_rendered(
+def test_a_size_without_room_for_a_voxel_is_refused_early(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(baking, "visible_voxels", lambda *_: pytest.fail("the field was rendered"))
@@ -283,7 +283,7 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
     assert sizes[20_000][2] <= 20_000 < sizes[10**7][2]
 
 
-def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_asked_for() -> None:
+def test_steps_of_the_fit_follow_the_voxels_or_what_was_asked_for() -> None:
     chosen = BakeSettings(refine_rays_per_batch=1000)
     assert [refinement.refinement_steps(chosen, voxels, whole=False) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
     assert [refinement.refinement_steps(chosen, voxels, whole=True) for voxels in (1, 10**6)] == [320, 6000]
@@ -303,7 +303,7 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
     assert format.describe(made.out / BakeOutputs.asset)["layout"] == layout
 
 
-def test_a_packed_asset_keeps_to_a_part_of_a_mib_and_says_what_its_codes_show(inputs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_packed_asset_keeps_to_a_part_of_a_mib(inputs: dict[str, Path], tmp_path: Path) -> None:
     settings = BakeSettings(
         resolution=40, samples_per_voxel=1, weight_threshold=0.0, visibility_rays=4000, max_mib=0.1, layout="packed", refine_steps=2, refine_rays_per_batch=512
     )

@@ -54,7 +54,7 @@ def test_where_there_is_room_codes_are_as_fine_as_they_may_be(tree: NerfTree) ->
 
 
 @pytest.mark.parametrize("share", [0.7])
-def test_codes_are_coarser_where_the_file_would_be_too_large_and_it_is_nearly_filled(tree: NerfTree, share: float) -> None:
+def test_codes_are_coarser_where_the_file_would_be_too_large(tree: NerfTree, share: float) -> None:
     most = len(serialize(economised(tree), "packed"))
     found, _, warned = packed(tree, int(share * most))
     assert 0.85 * share * most < len(serialize(found, "packed")) <= share * most
@@ -63,7 +63,7 @@ def test_codes_are_coarser_where_the_file_would_be_too_large_and_it_is_nearly_fi
     assert serialize(again, "packed") == serialize(found, "packed")
 
 
-def test_the_voxels_that_weigh_least_go_where_the_coarsest_codes_are_too_large(tree: NerfTree, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxels_that_weigh_least_go_where_the_coarsest_codes_are_too_large(tree: NerfTree, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(economy, "COARSEST", 10 * DEFAULT_RATE)
     coarsest = len(serialize(economised(tree, rate=10 * DEFAULT_RATE), "packed"))
     found, _, _ = packed(tree, coarsest // 2)

@@ -103,7 +103,7 @@ def test_a_view_that_was_held_back_is_shown_whole_by_the_asset_alone(inputs: dic
     assert report["optimisation"]["holes"]["refined"] < 0.02
 
 
-def test_a_size_that_the_environment_map_fills_is_refused_before_the_field_is_rendered(
+def test_a_size_that_the_environment_map_fills_is_refused_early(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(field_samples, "field_samples", lambda *_: pytest.fail("the field was rendered"))
@@ -259,7 +259,7 @@ def test_a_scene_is_as_fine_as_pixels_cells_and_settings_allow(inputs: dict[str,
     assert budget_of(s, 7) == 7
 
 
-def test_a_scene_that_does_not_fit_into_memory_is_refused_before_voxels_are_baked(inputs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_scene_that_does_not_fit_into_memory_is_refused_early(inputs: dict[str, Path], tmp_path: Path) -> None:
     made = job(tmp_path, QUICK, **inputs)
     bake.run(made)
     short = job(tmp_path / "short", QUICK, **inputs)

@@ -46,7 +46,7 @@ def read(folder: Path, **more: Any) -> tuple[list[str], str]:
 # --- where they lie
 
 
-def test_photographs_below_come_before_a_video_and_that_before_too_few_of_them(tmp_path: Path) -> None:
+def test_photographs_come_before_videos_unless_they_are_too_few(tmp_path: Path) -> None:
     """And a cover hides none of them; unless there is a folder `images`."""
     names = ["photos/1.png", "photos/2.png", "photos/3.png"]
     found, said = read(write(tmp_path / "a", "clip.mp4", *names))

@@ -102,7 +102,7 @@ def tree(voxel: float = 0.25, low: float = -1.0, shape: tuple[int, int, int] = (
     return tree_from_voxels(shape, voxel, np.full(3, low), at, density, rng.normal(0, 3, (len(at), 4, 3)).astype(np.float32))
 
 
-def test_density_and_colour_lie_where_the_asset_has_them_in_the_capture_s_units() -> None:
+def test_density_and_colour_lie_where_the_asset_has_them() -> None:
     """What light loses along a way is the same in either frame; of harmonics of degree 0 alone colours are as they are, in linear light."""
     from efficientnerf.asset.queries import colour_at, density_at
 

@@ -110,7 +110,7 @@ def test_outliers_near_a_camera_do_not_pull_its_near_plane() -> None:
     assert dirty == pytest.approx(clean, rel=0.25)
 
 
-def test_cameras_that_look_at_a_subject_never_begin_behind_its_middle_even_without_points() -> None:
+def test_near_planes_never_begin_behind_the_subjects_middle() -> None:
     capture = replace(room_capture(0), points=None)
     framed = find_training_frame(capture)
     placed = [framed.world_from_capture.camera(photo.camera) for photo in capture.photos]

@@ -91,7 +91,7 @@ def aimed(at: np.ndarray, count: int) -> list[Camera]:
 
 
 @pytest.mark.parametrize(("side", "min_views"), [(24, 2), (17, 3)])
-def test_it_is_the_voxels_in_or_before_the_box_that_few_cameras_project_into_their_pictures(side: int, min_views: int) -> None:
+def test_closed_voxels_are_those_that_few_cameras_see(side: int, min_views: int) -> None:
     cameras = [narrow(camera, 1.8) for camera in balls.cameras(12)]
     world, box = centres(side)
     inside = box | between(world, cameras)
@@ -108,7 +108,7 @@ def test_it_is_the_voxels_in_or_before_the_box_that_few_cameras_project_into_the
 
 
 @pytest.mark.parametrize(("watching", "min_views", "closed"), [(1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
-def test_a_place_that_enough_cameras_see_is_open_and_one_that_fewer_see_is_not(watching: int, min_views: int, closed: bool) -> None:
+def test_a_place_is_open_where_enough_cameras_see_it(watching: int, min_views: int, closed: bool) -> None:
     """Twelve cameras look at the middle; a place beside it is seen by those alone that look there."""
     beside = np.array([0.85, 0.8, 1.05])
     cameras = [*aimed(np.zeros(3), 12), *aimed(beside, watching)]
@@ -131,7 +131,7 @@ def looking_along_y(z: float, *, x: float = 0.0, away: float = 4.0, back: bool =
     return replace(narrow(balls.cameras(1)[0], 2), world_from_camera=placed)
 
 
-def test_what_stands_before_the_box_for_a_camera_that_just_misses_it_is_poorly_seen_and_a_wall_beside_the_subject_is_not() -> None:
+def test_what_cameras_just_miss_before_the_box_is_poorly_seen() -> None:
     """Eight cameras look at the box from one side; a picture's half is 0.19 of the depth."""
     one_side = [looking_along_y(0.01 * n) for n in range(8)]
     places = {

@@ -32,7 +32,7 @@ def test_an_edge_keeps_nothing_of_the_background(behind: tuple[int, int, int]) -
     np.testing.assert_array_equal(found[cover == 255], photograph[cover == 255])
 
 
-def test_a_mask_that_is_too_small_or_too_large_gives_no_colours_that_are_nowhere() -> None:
+def test_masks_too_small_or_too_large_give_no_foreign_colours() -> None:
     front, behind = np.array([180.0, 60.0, 40.0]), np.array([20.0, 200.0, 90.0])
     for radius in (12.0, 16.0):
         cover = disc(radius=radius)

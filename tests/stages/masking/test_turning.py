@@ -61,7 +61,7 @@ def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Pa
     assert "left out" in problems["background"].sentence
 
 
-def test_what_moves_with_the_camera_or_has_no_texture_is_no_standing_background(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
+def test_what_moves_or_has_no_texture_is_no_standing_background(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
     cameras = turntables.cameras(10)
     moving = [turntables.picture(camera, number, wall_moves=True) for number, camera in enumerate(cameras)]
     plain = [turntables.picture(camera, number, wall=np.full((240, 320, 3), 200.0)) for number, camera in enumerate(cameras)]
@@ -95,7 +95,7 @@ def test_nothing_is_left_out_where_nothing_moves_or_all_inside_a_frame_does(tmp_
         ((10, 0.9, 90.0), "nothing", "cameras_of_subject"),
     ],
 )
-def test_few_photographs_by_the_subject_alone_are_no_reason_to_leave_the_rest_out(
+def test_few_photographs_by_the_subject_alone_leave_no_others_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, alone: tuple[int, float, float], whole: Any, used: str
 ) -> None:
     """Photographs with a camera, share of the matches that agree, and the angle between the first and the last camera's view."""

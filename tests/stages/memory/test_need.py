@@ -76,7 +76,7 @@ def test_what_other_programs_take_is_a_warning_and_no_refusal(tmp_path: Path, mo
     assert not has_room(busy, Need({"pixels": 2 * GIB}))  # so that what changes no byte is made smaller
 
 
-def test_training_pixels_go_to_a_file_where_they_do_not_fit_and_the_field_is_the_same(made: dict[str, Path], tmp_path: Path) -> None:
+def test_training_pixels_that_do_not_fit_go_to_a_file(made: dict[str, Path], tmp_path: Path) -> None:
     first = job(tmp_path / "first", settings(**QUICK), poses=made["poses"])
     train.run(first)
     events: list[dict[str, Any]] = []

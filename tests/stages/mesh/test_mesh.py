@@ -147,7 +147,7 @@ def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, photographed: Pat
         stage.run(Job(settings=MeshSettings(density_threshold=1e4), inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
 
 
-def test_an_empty_asset_makes_an_empty_mesh_that_can_be_measured_and_names_the_remedy(photographed: Path, tmp_path: Path) -> None:
+def test_an_empty_asset_makes_an_empty_mesh_that_can_be_measured(photographed: Path, tmp_path: Path) -> None:
     bake = bake_ball(tmp_path / "bake", density=0.01)
     events: list[dict[str, Any]] = []
     stage.run(Job(settings=MeshSettings(), inputs=inputs(bake, photographed), out=tmp_path / "out", work=tmp_path / "work", report=events.append))
@@ -229,7 +229,7 @@ def test_a_normal_map_is_written_and_read_again(ball: Path, photographed: Path, 
         read_mesh(outputs)
 
 
-def test_the_preview_of_a_capture_from_one_side_shows_all_of_a_subject_that_is_clipped() -> None:
+def test_the_preview_shows_all_of_a_subject_that_is_clipped() -> None:
     """What is not clipped may reach far behind the subject: there the outmost fifth is left out."""
     y, z = (part.ravel() for part in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij"))
     corner = 21 * np.arange(20)[:, None] + np.arange(20)

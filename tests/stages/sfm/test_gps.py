@@ -153,7 +153,7 @@ def stated_for(found: Capture, centres: np.ndarray, **changes: Any) -> Capture:
     return Capture("polycam", tuple(photos), None, up=np.array([0.0, 1.0, 0.0]), metric=True, **changes)
 
 
-def test_cameras_that_were_found_come_into_the_frame_of_those_that_the_source_states(tmp_path: Path) -> None:
+def test_found_cameras_come_into_the_frame_of_stated_ones(tmp_path: Path) -> None:
     given, _, _ = capture(tmp_path, CIRCLE, 0.0, np.random.default_rng(2), 0)
     drifted = 0.1 * CIRCLE + np.random.default_rng(3).normal(0, 0.05, CIRCLE.shape)  # the phone's tracking
     drifted[5] += 3.0  # which was lost once

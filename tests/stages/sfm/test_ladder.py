@@ -102,7 +102,7 @@ def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypat
 
 
 @pytest.mark.parametrize(("each", "kept"), [((20, 0.97), True), ((20, 0.92), False), ((10, 0.99), False)])
-def test_focal_lengths_of_their_own_are_kept_where_they_explain_what_disagreed(
+def test_own_focal_lengths_are_kept_where_they_explain_disagreement(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, each: tuple[int, float], kept: bool
 ) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), ladder.EACH: each})
@@ -112,7 +112,7 @@ def test_focal_lengths_of_their_own_are_kept_where_they_explain_what_disagreed(
     assert (found.rung, found.work) == ((ladder.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
 
 
-def test_a_way_straight_ahead_begins_with_small_angles_before_anything_is_matched_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_way_straight_ahead_begins_with_small_angles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"small angles": (20, 0.95)})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", *ANEW]
@@ -133,7 +133,7 @@ def test_focal_lengths_that_differ_are_looked_at_though_the_matches_agree(monkey
 
 
 @pytest.mark.parametrize(("cropped", "kept"), [((20, 0.979), True), ((20, 0.96), False), ((19, 0.98), False)])
-def test_principal_points_of_their_own_are_kept_where_points_lie_closer_and_as_many_matches_agree(
+def test_own_principal_points_are_kept_where_points_lie_closer(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cropped: tuple[int, float], kept: bool
 ) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), ladder.EACH: (20, 0.98), ladder.CROPPED: cropped})

@@ -48,7 +48,7 @@ def merged(scene: tuple[Path, list[WorkImage], Any], *parts: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("second", [[4, 5, 6, 7, 8], [5, 6, 7, 8]])
-def test_two_sub_models_become_one_by_photographs_of_both_or_by_matches_alone(scene: tuple[Path, list[WorkImage], Any], second: list[int]) -> None:
+def test_two_sub_models_become_one_by_photographs_or_matches(scene: tuple[Path, list[WorkImage], Any], second: list[int]) -> None:
     parts = part_of(scene[2], [0, 1, 2, 3, 4]), part_of(scene[2], second, MOVED)
     (whole,) = merged(scene, *parts)
     assert [image.name for image in registered(whole)] == [image.file for image in scene[1]]

@@ -123,7 +123,7 @@ def test_what_is_no_such_network_is_refused_in_one_line(tmp_path: Path) -> None:
         Matcher(tmp_path / "m.onnx").matches(found, Features(found.xy, found.seen, found.size, np.zeros((len(found.xy), WIDE + 1), np.float32)))
 
 
-def test_a_missing_file_or_package_and_one_of_two_networks_are_mistakes_of_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_file_package_or_second_network_is_a_usage_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, other = str(detector(tmp_path / "d.onnx")), str(matcher(tmp_path / "m.onnx"))
     assert given_networks("off", "off") is None
     assert given_networks(path, other) == (Path(path), Path(other))
@@ -140,7 +140,7 @@ def test_a_missing_file_or_package_and_one_of_two_networks_are_mistakes_of_use(t
         given_networks(path, other)
 
 
-def test_photographs_without_cameras_are_compared_with_others_and_those_with_what_they_overlap_with_most() -> None:
+def test_photographs_without_cameras_are_compared_with_others() -> None:
     overlaps = {(i, j): 100 - 10 * (j - i) for i in range(1, 9) for j in range(i + 1, 9)} | {(2, 9): 0}
     pairs = pairs_of([0], [(0, 8), (7, 0), (0, 6)], overlaps)
     assert pairs == [(0, 6), (0, 7), (0, 8), (6, 7)]
@@ -175,7 +175,7 @@ def test_cameras_are_found_where_sift_finds_none(tmp_path: Path) -> None:
     assert errors_of(capture, truth).max() < 0.05
 
 
-def test_a_photograph_without_features_of_sift_gets_its_camera_among_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_photograph_without_sift_features_gets_its_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names, truth = some(6)
     detect = matches.extract_features
 

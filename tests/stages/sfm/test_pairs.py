@@ -39,7 +39,7 @@ def test_sequential_pairs_reach_neighbours_and_close_loops() -> None:
     assert len(found) < 400 * 20
 
 
-def test_retrieval_finds_what_shows_the_same_things_whatever_the_order_of_the_files() -> None:
+def test_retrieval_finds_what_shows_the_same_in_any_order_of_files() -> None:
     rng = np.random.default_rng(1)
     count = 90
     ring = views(count, 120, 12, rng)  # each shares things with the nine before and after it
@@ -74,7 +74,7 @@ def test_nearest_words_are_those_of_exact_arithmetic() -> None:
     assert (pairs._nearest(some, words) == distances.argmin(1)).all()
 
 
-def test_weak_images_are_compared_with_more_and_with_the_neighbours_of_their_neighbours() -> None:
+def test_weak_images_are_compared_with_neighbours_of_neighbours() -> None:
     likeness = -np.abs(np.subtract.outer(np.arange(100.0), np.arange(100.0)))
     near = {i: {i - 1, i + 1} & set(range(100)) for i in range(100)} | {0: {50}, 50: {0, 90}}
     found = pairs.wider_pairs(likeness, [0], near, 12)

@@ -60,7 +60,7 @@ def test_two_zooms_are_told_where_the_matches_agree_with_one(tmp_path: Path) -> 
     assert off(found.models[0], taken) < 0.01
 
 
-def test_photographs_that_were_cropped_get_their_principal_points_and_one_lens(tmp_path: Path) -> None:
+def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -> None:
     cut = [(int(x), int(y)) for x, y in np.random.default_rng(0).integers((0, 0), (120, 90), (COUNT, 2)) - (60, 45)]
     taken = cameras(cut=cut)
     images = matched(tmp_path, taken)

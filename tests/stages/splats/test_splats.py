@@ -106,7 +106,7 @@ def test_the_same_pictures_give_the_same_bytes_and_others_do_not(made: SplatsOut
     assert (tmp_path / "own/splats.ply").read_bytes() != made.ply.read_bytes()
 
 
-def test_photographs_keep_the_alpha_of_an_object_and_are_masked_by_it_elsewhere(inputs: dict[str, Path]) -> None:
+def test_photographs_keep_the_alpha_of_an_object_or_are_masked_by_it(inputs: dict[str, Path]) -> None:
     scene = load_scene(inputs["poses"])
     some = photographs(inputs["poses"], scene, inputs["train"])
     assert [view.camera.name for view in some] == [view.camera.name for view in scene.views if view.split == "train"]

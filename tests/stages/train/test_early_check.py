@@ -122,7 +122,7 @@ def test_black_is_not_all_there_is_to_learn_of_a_small_thing_before_black() -> N
 
 
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0)])
-def test_an_empty_field_has_learned_nothing_however_much_of_the_picture_is_background(tmp_path: Path, background: tuple[float, float, float]) -> None:
+def test_an_empty_field_has_learned_nothing_whatever_the_background(tmp_path: Path, background: tuple[float, float, float]) -> None:
     folder = poses(tmp_path / "poses", side=64, background=background)
     s = scenes.load(folder)
     views = early_check.held_out_views(folder, s)

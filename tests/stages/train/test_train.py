@@ -264,7 +264,7 @@ def test_planes_are_stated_both_and_in_order_and_not_of_a_contracted_scene(scene
     train.STAGE.check({"train": chosen, "poses": PosesSettings()})
 
 
-def test_planes_that_miss_the_scene_are_refused_and_those_that_cut_into_it_are_told(scene: Path) -> None:
+def test_planes_that_miss_the_scene_are_refused(scene: Path) -> None:
     """The views have 1 to 5 of the training frame before them, which is 2 to 10 in the capture's units."""
     s = scenes.load(scene)
     pixels = pixels_of(scene, scenes.views_of(s, "train"))

@@ -45,7 +45,7 @@ def test_more_of_it_takes_longer_and_nothing_else_does(stage: str, more: dict[st
     assert after[stage] > 1.2 * before[stage]
 
 
-def test_a_slower_machine_takes_longer_and_more_cores_less_by_what_they_share() -> None:
+def test_slower_machines_take_longer_and_more_cores_less() -> None:
     before = sum(seconds().values())
     assert sum(seconds(slower=3.0).values()) == pytest.approx(2 * before, rel=1e-2)
     assert 0.28 * sum(seconds(threads=1).values()) < sum(seconds(threads=64).values()) < 0.5 * before

@@ -227,7 +227,7 @@ def test_photographs_that_were_zoomed_or_cropped_are_named() -> None:
     assert with_lenses("zoomed", {}).problems == ()
 
 
-def test_photographs_in_which_something_moves_are_named_with_the_share_of_the_picture() -> None:
+def test_photographs_in_which_something_moves_are_named() -> None:
     def moving(count: int, first: float = 0.02, **facts: object) -> Verdict:
         shares = {name: first + 0.01 * k for k, name in enumerate(NAMES[:count])}
         return verdict_on(capture(facts={"pairs_agreeing": 0.97, "moving_parts": shares} | facts), sharp(NAMES))
