@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import msgspec
 import pytest
 
-from stages.scratch import note, noted, once, opened
+from stages.scratch import note, noted, opened
 
 
 @dataclass(frozen=True)
@@ -89,15 +89,3 @@ def test_odd_values_with_the_right_checksum(tmp_path: Path, value: Any) -> None:
     assert found is None
     assert len(said) == 1
     assert len(said[0]) < 400
-
-
-def test_what_a_check_raises_is_told_of(tmp_path: Path) -> None:
-    note(tmp_path / "thing.json", {"name": "a", "size": 1})
-    said: list[str] = []
-
-    def check(value: Thing, outputs: Any) -> None:
-        raise struct_error
-
-    struct_error = ArithmeticError("of another\nphotograph")
-    assert noted(tmp_path / "thing.json", Thing, once(said.append), check) is None
-    assert said == ["thing.json of an earlier attempt can't be used (of another\\nphotograph); what it stands for is made again"]

@@ -39,12 +39,6 @@ def test_large_pieces_at_a_face_and_what_touches_at_a_corner_stay() -> None:
     assert not small_components(tree, everything(tree), 0.1).any()
 
 
-def test_what_is_dropped_anyway_joins_nothing_and_is_no_scrap() -> None:
-    tree, of = tree_of(((8, 8, 8), (28, 28, 28)), ((28, 8, 8), (44, 12, 12)), ((44, 8, 8), (48, 12, 12)))  # a bridge between the large and the small one
-    assert not small_components(tree, everything(tree), 0.02).any()
-    np.testing.assert_array_equal(small_components(tree, of != 1, 0.02), of == 2)
-
-
 @pytest.mark.parametrize("brick", [1, 2, 4])
 def test_the_largest_piece_is_never_a_scrap(brick: int) -> None:
     rng = np.random.default_rng(brick)

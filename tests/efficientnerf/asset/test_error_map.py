@@ -86,21 +86,6 @@ def test_a_map_goes_on_where_another_one_stopped() -> None:
     assert not np.array_equal(whole.errors[0], whole.errors[1])
 
 
-def test_large_grids_have_cells_of_several_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    grid = PatchGrid(views(), 1)
-    assert count_cells(grid) == len(grid)
-    monkeypatch.setattr(error_map, "MAX_CELLS", 20)
-    assert count_cells(grid) <= 20
-    made = ErrorMap(grid)
-    assert made.tiles > 1
-    drawn = made.draw(40_000, np.random.default_rng(4))
-    found = np.bincount(drawn.patches.tile, minlength=len(grid))
-    assert found.max() < 2 * found[found > 0].mean()  # all tiles are about as probable
-    assert len(np.flatnonzero(found)) == len(set(drawn.patches.tile)) > 0.95 * (grid.pixels.width * grid.pixels.height).sum()
-    with pytest.raises(ValueError, match="expected"):
-        ErrorMap(grid, None, np.zeros((2, len(grid)), np.float32))
-
-
 def test_no_more_patches_are_drawn_than_are_asked_for() -> None:
     masks = [np.zeros((h, w), bool) for w, h in SIZES]
     masks[1][5, 3] = True

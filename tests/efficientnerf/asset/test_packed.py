@@ -110,19 +110,6 @@ def decoded(coder: object, part: int, context: int, lane: int) -> int:
     return symbol
 
 
-def test_bytes_are_near_the_entropy() -> None:
-    """Of 20,000 symbols in two contexts of opposite skew: tables and state included, within 2 % of what the counts allow."""
-    rng = np.random.default_rng(0)
-    which = rng.integers(0, 2, 20_000).astype(np.uint16)
-    symbols = np.where(which == 1, 20 - rng.geometric(0.4, 20_000).clip(1, 20), rng.geometric(0.3, 20_000).clip(1, 20)).astype(np.uint8)
-    coder = recorded(symbols, which, np.array([0, len(symbols)]))
-    counts = np.zeros((2, 256))
-    np.add.at(counts, (which, symbols), 1)
-    share = counts / counts.sum(axis=1, keepdims=True)
-    entropy = -(counts[counts > 0] * np.log2(share[counts > 0])).sum() / 8
-    assert entropy <= len(streams.written(coder, [Family(2)])) <= 1.02 * entropy + 16
-
-
 @pytest.mark.parametrize("counts", [[1], [1] * 256, [10**9, 1], [1, 0, 0, 10**6, 3], [0] * 5])
 def test_frequencies_have_the_sum_of_a_table_and_leave_out_nothing(counts: list[int]) -> None:
     padded = np.array(counts + [0] * (256 - len(counts)), np.int64)

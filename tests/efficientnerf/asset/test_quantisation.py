@@ -11,7 +11,7 @@ import pytest
 from efficientnerf.asset import format
 from efficientnerf.asset.format import WRITERS, describe, load, save, serialize
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.quantisation import clustered, compacted, quantised_density
+from efficientnerf.asset.quantisation import compacted, quantised_density
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -57,15 +57,6 @@ def test_the_nearest_is_the_nearest(count: int, size: int, entries: int) -> None
     approached = np.full(count, 1.0, np.float32)
     kmeans.lower_distances(np.ascontiguousarray(vectors.T), centroids[0], approached)
     np.testing.assert_allclose(approached, np.minimum(squared[:, 0], 1), rtol=1e-5, atol=1e-6)
-
-
-def test_clusters_are_found_and_equals_are_the_first() -> None:
-    rng = np.random.default_rng(0)
-    centres = rng.normal(size=(8, 3)).astype(np.float16).astype(np.float32) * 10
-    owner = rng.integers(0, 8, 3000)
-    centroids, code = clustered(centres[owner] + rng.normal(0, 0.01, (3000, 3)).astype(np.float32), np.ones(3000), 8, 0)
-    assert len(centroids) == 8
-    np.testing.assert_allclose(centroids[code], centres[owner], atol=0.06)
 
 
 def test_codes_repeat_whatever_the_threads() -> None:

@@ -78,20 +78,6 @@ def test_blocks_hold_the_stored_values(brick: int, degree: int) -> None:
     np.testing.assert_allclose(np.sort(density_at(tree, centres)), np.sort(expected[expected > 0]), rtol=1e-3, atol=1e-3)
 
 
-def test_the_order_of_the_list_does_not_matter() -> None:
-    rng = np.random.default_rng(0)
-    indices = rng.permutation(np.argwhere(rng.random((8, 8, 12)) < 0.2))
-    density, sh = rng.random(len(indices)).astype(np.float32), rng.normal(size=(len(indices), 4, 3)).astype(np.float32)
-    order = rng.permutation(len(indices))
-    first = tree_from_voxels((2, 2, 3), 0.1, LOW, indices, density, sh)
-    second = tree_from_voxels((2, 2, 3), 0.1, LOW, indices[order], density[order], sh[order])
-    for name in ("brick_index", "voxel_index", "density_values", "sh"):
-        assert np.array_equal(getattr(first, name), getattr(second, name)), name
-    assert first.degree == 1
-    assert first.resolution == (8, 8, 12)
-    np.testing.assert_allclose(first.bounds_max, LOW + np.array([0.8, 0.8, 1.2]))
-
-
 def test_lists_that_make_no_tree_are_refused() -> None:
     density, sh = np.ones(2, np.float32), np.zeros((2, 1, 3), np.float32)
     with pytest.raises(ValueError, match="listed twice"):

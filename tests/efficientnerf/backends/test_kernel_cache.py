@@ -187,13 +187,6 @@ started = []
     assert "No space left on device; compiled kernels are not kept" in found["stderr"]
 
 
-def test_threads_are_those_of_openmp_whatever_else_is_installed(package: Path, tmp_path: Path) -> None:
-    found = run(package, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
-    assert not found["tbb"]
-    assert found["layer"] in ("omp", "workqueue")
-    assert Path(found["folder"]).parent == tmp_path / "cache" / "efficientnerf"
-
-
 def test_the_key_stands_for_each_kernel_source_and_its_place(package: Path) -> None:
     inner = package / "backends" / "numba" / "inner.py"
     keys = [kernel_cache.key_of(package)]

@@ -53,13 +53,6 @@ def test_a_sharp_frame_is_not_left_for_being_near() -> None:
     assert not chosen[[4, 5]].any()
 
 
-def test_chosen_frames_are_sharper_than_every_nth() -> None:
-    motion, sharpness = steps_and_sharpness(400, 3)
-    chosen = np.array(choose(motion, sharpness, 40)) == CHOSEN
-    assert chosen.sum() >= 30
-    assert sharpness[chosen].mean() > sharpness[::10].mean() + 0.1
-
-
 def test_time_in_which_nothing_moves_takes_no_frames_from_the_rest() -> None:
     motion = np.linspace(0, 1, 60)
     standing = np.concatenate([motion[:30], np.full(200, motion[29]), motion[30:]])

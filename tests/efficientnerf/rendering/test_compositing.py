@@ -70,15 +70,6 @@ def test_splitting_a_sample_in_two_leaves_the_pixel_unchanged(composite: object)
 
 
 @pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
-def test_one_colour_everywhere_gives_that_colour(composite: object) -> None:
-    b = in_float32(bundle(0))
-    raw = b.raw.clone()
-    raw[:, 1:] = 0  # sigmoid(0)
-    out = composite(raw, b.length, b.first, b.harmonics, torch.full_like(b.background, 0.5), "exp")  # type: ignore[operator]
-    torch.testing.assert_close(out.colour, torch.full_like(out.colour, 0.5))
-
-
-@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
 def test_a_thin_surface_is_less_distorted_than_fog(composite: object) -> None:
     raw = torch.zeros(20, 4)
     raw[:10, 0], raw[10:, 0] = 0.0, -9.0

@@ -126,19 +126,6 @@ def test_cells_hold_their_points_and_the_borders_belong_to_the_grid() -> None:
     assert cell_of(point, SIDE).tolist() == [0, 19, 26, 5]
 
 
-def test_random_points_lie_in_their_cells_half_of_them_valid() -> None:
-    voxels = density_voxels(8, "maximum", threshold=1.0)
-    voxels.values.zero_()
-    voxels.values[2, 3, 4] = 5.0
-    cell, point = random_cells(voxels, 101, torch.Generator().manual_seed(1))
-    assert torch.equal(cell_of(point, 8), cell)
-    assert len(cell) == 101
-    assert (cell[51:] == (2 * 8 + 3) * 8 + 4).all()
-    voxels.values.zero_()
-    cell, point = random_cells(voxels, 100, torch.Generator().manual_seed(1))
-    assert torch.equal(cell_of(point, 8), cell)
-
-
 def test_a_sweep_has_every_cell_once() -> None:
     voxels = density_voxels(5, "momentum")
     parts = [sweep_cells(voxels, part, 8, torch.Generator().manual_seed(part)) for part in range(3, 11)]

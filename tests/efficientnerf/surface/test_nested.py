@@ -85,14 +85,6 @@ def test_a_ball_across_the_border_of_two_grids_is_whole_but_for_a_crack() -> Non
     assert distance[~crack].max() < 2.5 * VOXEL
 
 
-def test_the_budget_of_faces_holds_for_all_together() -> None:
-    tree = balls(((0, 0, 0), 0.5), ((1.3, 0, 0), 0.25), ((0, 2.4, 0), 0.6))
-    full, small = mesh_of(tree), mesh_of(tree, faces=600)
-    assert len(full.faces) > 1000
-    assert 100 < len(small.faces) <= 600
-    assert full.facts["cascades"] == 3
-
-
 def test_points_number_as_asked_and_thin_out_outwards() -> None:
     tree = balls(((0, 0, 0), 0.5), ((0, 2.3, 0), 0.6))
     cloud = points_of(tree, 3001)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import Camera, project, rays
+from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface import shading
 from efficientnerf.surface.mesh import Mesh, Texture
 from efficientnerf.surface.shading import Shader, vertex_colours
@@ -50,17 +50,6 @@ def test_each_pixel_shows_the_place_of_the_texture_that_its_ray_meets(tilt: floa
     far = ((place < -0.1) | (place > 1.1)).any(1)
     assert (image.covered.ravel()[far] == 0).all()
     assert np.isinf(depth[far]).all()
-
-
-def test_coverage_is_the_share_of_the_samples() -> None:
-    image, _ = Shader(sheet(np.full((4, 4, 3), 255, np.uint8))).images(VIEW, samples=4)
-    pixels, _ = project(VIEW, sheet(np.zeros((1, 1, 3), np.uint8)).vertices)
-    low, high = pixels.min(0), pixels.max(0)
-    fine = (np.arange(24 * 4) + 0.5) / 4, (np.arange(18 * 4) + 0.5) / 4
-    inside = ((fine[1] > low[1]) & (fine[1] < high[1]))[:, None] & ((fine[0] > low[0]) & (fine[0] < high[0]))
-    expected = inside.reshape(18, 4, 24, 4).mean((1, 3))
-    np.testing.assert_allclose(image.covered, expected, atol=1e-6)
-    np.testing.assert_allclose(image.colour, np.repeat(expected[..., None], 3, 2), atol=1e-6)
 
 
 def test_fine_textures_are_averaged_not_sampled_at_points() -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from efficientnerf.asset.bake import spread_pixels
-from efficientnerf.training import pixels as module
 from tests.efficientnerf.small_views import SIZES, views
 
 
@@ -30,17 +28,3 @@ def test_usable_pixels_are_chosen_alike(share: float) -> None:
         assert set(index) <= set(usable)
     counts = np.bincount(some.choose(4000, np.random.default_rng(2)), minlength=len(some))[usable]
     assert np.abs(counts * len(usable) / 4000 - 1).max() < 0.3
-
-
-@pytest.mark.parametrize("part", [8, 16, 2**24])
-def test_spread_pixels_are_as_many_as_are_asked_for_where_masks_allow_them(part: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PART", part)
-    some = views(masks_of(0.5))
-    usable = np.flatnonzero(some.usable_at(np.arange(len(some))))
-    np.testing.assert_array_equal(some.usable_pixels(np.arange(len(usable))), usable)
-    assert some.usable_pixels(np.array([0, 3, len(usable) - 1])).tolist() == usable[[0, 3, -1]].tolist()
-    np.testing.assert_array_equal(spread_pixels(some, 10**6), usable)
-    stride = len(usable) // 5
-    spread = spread_pixels(some, 5)
-    assert np.isin(spread, usable).all()
-    assert len(spread) == -(-len(usable) // stride)

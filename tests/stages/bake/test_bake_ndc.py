@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
@@ -71,16 +70,6 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     assert looked == {min(int(NDC_RAYS_PER_VOXEL * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
     assert max(looked) > 1000
     assert not [event for event in told if event["event"] == "warning"]
-
-
-def test_a_space_of_deeper_voxels_has_the_same_grid_coordinates(inputs: dict[str, Path]) -> None:
-    space = load_renderer(inputs["train"], "cpu").model.space
-    assert isinstance(space, NdcSpace)
-    flat = space.with_voxel_depth(3.0)
-    world = space.ndc.world(np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3)))
-    np.testing.assert_allclose(flat.ndc.points(world), space.ndc.points(world) * (3, 3, 1), rtol=1e-9, atol=1e-12)
-    one, other = (s.grid(torch.from_numpy(s.ndc.points(world))) for s in (space, flat))
-    torch.testing.assert_close(one, other)
 
 
 def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training.exposure.model import exposure_of
 from pipeline.errors import Interrupted, UsageError
 from pipeline.executors.memory import Limit
-from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
+from stages.artifacts import BakeOutputs, TrainOutputs
 from stages.bake import holes, pruning, resolution, whole_scene
 from stages.bake import run as bake
 from stages.bake.resolution import MAX_CELLS, MAX_MIB, budget_of, finest_of_cascades
@@ -267,14 +267,3 @@ def test_a_scene_that_does_not_fit_into_memory_is_refused_early(inputs: dict[str
     with pytest.raises(UsageError, match="--memory"):
         bake.run(short)
     assert not list(short.work.glob("cascade0_*.npy"))
-
-
-def test_bounds_given_by_hand_are_the_region(tmp_path: Path, inputs: dict[str, Path]) -> None:
-    poses = shutil.copytree(inputs["poses"], tmp_path / "poses")
-    found, _ = baked(tmp_path / "found", inputs | {"poses": poses}, refine_steps=0)
-    assert np.abs(found.region.bounds - BOUNDS).max() > 0.01
-    (poses / PosesOutputs.report).write_text(json.dumps({"framing": {"bounds_from": "given"}}))
-    given, _ = baked(tmp_path / "given", inputs | {"poses": poses}, refine_steps=0)
-    assert np.array_equal(given.region.bounds, BOUNDS)
-    assert (given.bounds_min <= BOUNDS[0] + 1e-9).all()
-    assert (given.bounds_max >= BOUNDS[1] - 1e-9).all()

@@ -135,18 +135,6 @@ def test_what_masks_hide_does_not_count(tmp_path: Path, background: tuple[float,
     assert metrics["network"]["psnr"] > 45
 
 
-def test_a_mask_that_hides_everything_leaves_the_view_out_of_the_means(tmp_path: Path) -> None:
-    poses = make_scene(tmp_path / "poses", "tt", masked=True)
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(poses / "images" / "mask0.png")
-    events: list[dict[str, Any]] = []
-    job = job_in(tmp_path, poses, report=events.append)
-    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
-    metrics = figures_of(job)
-    assert metrics["views"][0]["asset"]["psnr"] is None
-    assert metrics["asset"]["psnr"] == metrics["views"][1]["asset"]["psnr"]
-    assert any("v0.png" in event["text"] for event in events if event["event"] == "warning")
-
-
 @pytest.mark.parametrize("moment", [1, 4])
 def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp_path: Path, moment: int) -> None:
     poses = make_scene(tmp_path / "poses", "tttt", background=None)

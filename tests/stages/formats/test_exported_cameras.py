@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import opengl_from_pose, project
+from efficientnerf.geometry.cameras import project
 from pipeline.errors import BadInput
 from stages.formats import importers
 from stages.formats.importers.brown import MAX_ERROR, quotient_of_cubics
@@ -159,30 +159,6 @@ def test_splits_bounds_masks_and_bad_frames(tmp_path: Path) -> None:
     assert splits == {f"img_{index}.JPG": "train" if index < 4 else "test" for index in range(6)}
     assert ("img_9.JPG", "marked as bad by the data set") in indoor.rejected
     assert indoor.metric
-
-
-def test_open3ds_intrinsics(tmp_path: Path) -> None:
-    folder, pixels = exports.tanks(tmp_path / "a")
-    (folder / "intrinsics.txt").unlink()
-    with pytest.raises(BadInput, match="intrinsics"):
-        read(folder)
-    captures.write_json(folder / "intrinsic.json", {"width": 32, "height": 24, "intrinsic_matrix": [40, 0, 0, 0, 42, 0, 15.5, 12.5, 1]})
-    assert_seen(read(folder), pixels)
-
-
-def test_transforms_of_phone_apps_with_a_lens_for_each_frame(tmp_path: Path) -> None:
-    """As NeRFCapture writes them: names without extension, depth beside the images, a size and a lens in every frame."""
-    frames, pixels = [], {}
-    for index, camera in enumerate(exports.cameras()):
-        matrix = opengl_from_pose(camera.world_from_camera)
-        lens = {"fl_x": 40.0 + index, "fl_y": 41.0, "cx": 15.5, "cy": 12.5, "w": 32, "h": 24}
-        pixels[camera.name] = exports.opengl_pinhole(matrix, *list(lens.values())[:4])
-        frame = {"file_path": f"images/img_{index}", "depth_path": f"images/img_{index}.depth.png", "transform_matrix": matrix.tolist()}
-        frames.append(frame | {"timestamp": index} | lens)
-    captures.write_json(tmp_path / "transforms.json", {"frames": frames, "integer_depth_scale": 1.0, "fl_x": 1.0, "fl_y": 1.0})
-    captures.write_pictures(tmp_path / "images", [*pixels, *(f"img_{index}.depth.png" for index in range(6))])
-    assert importers.detect(tmp_path) == "instant-ngp"
-    assert_seen(read(tmp_path), pixels)
 
 
 # --- images elsewhere

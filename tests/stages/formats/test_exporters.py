@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.surface.mesh import Mesh, PointCloud
-from pipeline.errors import BadInput, UsageError
+from pipeline.errors import BadInput
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.writing import SourceFrame
@@ -175,13 +175,6 @@ def test_las_coordinates_are_fine_wherever_the_points_lie(extension: str, size: 
         POINT_EXPORTERS[extension](points, tmp_path / f"{name}{extension}", Z_UP)
     np.testing.assert_allclose(read_by_laspy(tmp_path / f"a{extension}")[0], places, rtol=0, atol=0.5e-6 * size + 1e-15 * at)
     assert (tmp_path / f"a{extension}").read_bytes() == (tmp_path / f"b{extension}").read_bytes()
-
-
-def test_las_is_refused_where_its_package_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.formats.exporters.las.find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[las\]'"):
-        POINT_EXPORTERS[".laz"](cloud(), tmp_path / "a.laz", Z_UP)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("extension", POINT_EXPORTERS)

@@ -79,15 +79,6 @@ def test_a_model_written_by_colmap_with_rigs_and_frames(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.sort(capture.points.xyz, 0), np.sort(captures.sparse_points(), 0))
 
 
-def test_of_several_models_the_one_with_most_images_is_taken(tmp_path: Path) -> None:
-    folder = captures.colmap_bin(tmp_path / "a", captures.cameras()[:3])
-    captures.colmap_txt(folder, place="sparse/1")
-    capture = read(folder)
-    assert capture.facts["model"] == "sparse/1"
-    assert len(capture.photos) == 6
-    assert any("sparse/0 (3 images)" in warning for warning in capture.warnings)
-
-
 def test_nerfstudio_extras(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     made = captures.cameras()
@@ -142,21 +133,6 @@ def test_llff_takes_the_largest_images_and_scales_the_focal_length(tmp_path: Pat
     assert_same_rays(read(folder, llff_factor=4), captures.cameras())
 
 
-def test_masks_beside_photographs(tmp_path: Path) -> None:
-    from stages.formats.importers.masks import masks_of
-    from stages.formats.importers.photographs import photographs
-    from stages.formats.importers.source import Source
-
-    black = np.zeros((HEIGHT, WIDTH), np.uint8)
-    for layout, mask in {"a": "masks/1.png", "b": "masks/1.jpg.png", "images/c": "images/masks/1.png", "images": "masks/1.PNG"}.items():
-        root = tmp_path / layout.replace("/", "_") / "source"
-        image = captures.write_picture(root / ("images" if layout.startswith("images") else ".") / "1.jpg", captures.picture())
-        made = captures.write_picture(root / mask, black)
-        assert photographs(Source(root)) == [image]
-        assert masks_of(Source(root), [image]) == {image: made}
-        assert importers.files(root, Settings()) == sorted([image, made])
-
-
 def test_lists_that_have_travelled(tmp_path: Path) -> None:
     made = captures.cameras()
     frames = captures.frames(made)
@@ -193,12 +169,6 @@ def test_cameras_stated_for_the_pixels_as_stored_turn_with_them(tmp_path: Path, 
     for _ in range(turns):
         truth = [rotated_clockwise(camera) for camera in truth]
     assert_same_rays(capture, truth)
-
-
-def test_several_formats_in_one_folder_are_named(tmp_path: Path) -> None:
-    folder = captures.nerfstudio(captures.colmap_bin(tmp_path / "a"))
-    assert importers.candidates(folder) == ["nerfstudio", "colmap", "photographs"]
-    assert any("--as colmap" in odd for odd in describe_source(folder)["warnings"])
 
 
 def shared(name: str) -> Path:

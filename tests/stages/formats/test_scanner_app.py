@@ -14,8 +14,6 @@ from PIL import Image
 from efficientnerf.geometry.cameras import project
 from pipeline.errors import BadInput
 from stages.formats import importers
-from stages.formats.importers.photographs import photographs
-from stages.formats.importers.source import Source
 from stages.io.capture import Capture
 from tests.stages import captures, exports
 from tests.stages.captures import Settings
@@ -49,14 +47,6 @@ def test_frame_up_and_what_has_no_partner(tmp_path: Path) -> None:
     assert capture.rejected == (("frame_00004.jpg", "without a pose"),)
     assert any("1 images are left out, without a pose: frame_00004.jpg" in warning for warning in capture.warnings)
     assert folder / "frame_00006.json" not in importers.files(folder, Settings()), "it has no picture"
-
-
-def test_the_folder_that_the_archive_holds(tmp_path: Path) -> None:
-    folder, _ = exports.scanner_app(tmp_path / "a/2026_01_13_14_47_59")
-    assert importers.detect(folder.parent) == NAME
-    assert len(read(folder.parent).photos) == 6
-    captures.write_picture(folder.parent / "IMG_1.jpg", captures.picture())
-    assert importers.candidates(folder.parent) == ["photographs"], "it is not all that is there"
 
 
 def test_a_picture_that_exif_turns_has_the_camera_of_its_stored_pixels(tmp_path: Path) -> None:
@@ -126,13 +116,3 @@ def test_depth_where_the_sensor_is_sure(tmp_path: Path) -> None:
         seen = [point for point, track in zip(capture.points.xyz, capture.points.tracks, strict=True) if index in track]
         assert (np.abs(project(photo.camera, np.array(seen))[0] - (16, 12)) < (8.1, 6.1)).all(), "in the middle, where the maps are sure"
     assert {folder / "depth_00003.png", folder / "conf_00003.png"} < set(importers.files(folder, Settings()))
-
-
-def test_as_photographs_depth_maps_are_left_aside(tmp_path: Path) -> None:
-    folder, pixels = exports.scanner_app(tmp_path / "a")
-    for index in range(8):
-        for kind in ("depth", "conf"):
-            captures.write_picture(folder / f"{kind}_{index:05d}.png", np.ones((24, 32), np.uint8))
-    captures.write_picture(folder / "depth_99.png", np.ones((24, 32), np.uint8))
-    for source in (folder, tmp_path):  # directly in it, or below it
-        assert {path.name for path in photographs(Source(source))} == {*pixels, "textured_output.png", "depth_99.png"}

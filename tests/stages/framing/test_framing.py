@@ -295,16 +295,3 @@ def test_chair_lies_in_its_box() -> None:
         origins, directions = rays(framed.world_from_capture.camera(photo.camera))
         opaque = alpha.ravel() > 127
         assert entry(origins, directions, framed.bounds)[opaque].all()
-
-
-def test_fern_and_door_are_framed() -> None:
-    fern = real("fern_8", "llff")
-    framed = find_training_frame(fern)
-    check_laws(fern, framed)
-    assert framed.orbit.forward_facing
-    door = real("lund_door_colmap", "colmap")
-    framed = find_training_frame(door)
-    check_laws(door, framed)
-    assert framed.facts["bounds_from"] == "sparse points"
-    inside = np.abs(framed.world_from_capture.points(door.points.xyz)) <= framed.bounds[1]
-    assert inside.all(1).mean() > 0.9

@@ -131,15 +131,6 @@ def test_the_choice_can_be_made_by_hand(draw: Drawing, choice: str, tmp_path: Pa
     assert any(text.endswith("poses.masks says so") for text in said)
 
 
-def test_the_choice_is_the_same_again(tmp_path: Path) -> None:
-    source = with_masks("colmap", tmp_path / "source", ball)
-    folders = []
-    for name in "ab":
-        run(source, tmp_path / name)
-        folders.append({path.relative_to(tmp_path / name): path.read_bytes() for path in (tmp_path / name / "poses").rglob("*") if path.is_file()})
-    assert folders[0] == folders[1]
-
-
 def test_only_what_may_be_one_compact_thing_is_compact() -> None:
     picture, half, dots = (np.zeros((24, 32), bool) for _ in range(3))
     picture[8:16, 8:20] = half[:, :18] = dots[2:22:3, 2:30:3] = True

@@ -35,18 +35,6 @@ def test_every_stage_is_foretold_by_its_defaults(stage: str, tmp_path: Path) -> 
     assert LEAST <= needed < 20 * 2**30
 
 
-def test_a_video_needs_the_room_of_its_frames(tmp_path: Path) -> None:
-    clip = tmp_path / "clip.mp4"
-    clip.write_bytes(bytes(1000))
-    one = space_needed("poses", tmp_path / "run", (clip,), DEFAULTS)
-    assert one > 50 * 2**20
-    assert space_needed("poses", tmp_path / "run", (clip, clip), DEFAULTS) == one, "poses.frames are of all videos together"
-    for name in ("notes.txt", "imu.csv", "times.json"):
-        (tmp_path / name).write_bytes(bytes(10))
-    assert space_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS) == one, "a folder with a video and its notes"
-    assert space_needed("poses", tmp_path / "run", (clip,), {**DEFAULTS, "poses": dataclasses.replace(DEFAULTS["poses"], lens="equirectangular")}) > 6 * one
-
-
 def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
     """No features are looked for, and none of the pictures is enlarged: a fleet of such scenes fits on a disk of 60 MB."""
     nerfstudio(tmp_path / "source", cameras(8))

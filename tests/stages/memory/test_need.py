@@ -18,7 +18,7 @@ from stages.bake import run as bake
 from stages.bake.run import BakeSettings
 from stages.evaluate import run as evaluate
 from stages.evaluate.run import EvaluateSettings
-from stages.memory.need import Need, has_room, refuse_what_does_not_fit
+from stages.memory.need import Need, refuse_what_does_not_fit
 from stages.mesh import run as mesh
 from stages.mesh.run import MeshSettings
 from stages.points import run as points
@@ -65,15 +65,6 @@ def test_a_need_that_fits_is_recorded_and_one_that_does_not_is_refused(tmp_path:
         refuse_what_does_not_fit(limited(job(tmp_path, None), GIB), need, "Lower x.")
     assert all(part in str(caught.value) for part in ("4.5 GiB", "pixels 3.0 GiB", "--memory", "Lower x."))
     assert caught.value.exit_code == 2
-
-
-def test_what_other_programs_take_is_a_warning_and_no_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.memory.need.available_now", lambda: GIB)
-    events: list[dict[str, Any]] = []
-    busy = limited(job(tmp_path, None), 4 * GIB, events)
-    refuse_what_does_not_fit(busy, Need({"pixels": 2 * GIB}), "")
-    assert "other programs leave 1.0 GiB" in events[0]["text"]
-    assert not has_room(busy, Need({"pixels": 2 * GIB}))  # so that what changes no byte is made smaller
 
 
 def test_training_pixels_that_do_not_fit_go_to_a_file(made: dict[str, Path], tmp_path: Path) -> None:

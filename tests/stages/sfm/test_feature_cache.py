@@ -119,14 +119,3 @@ def test_the_least_recently_used_are_removed(monkeypatch: pytest.MonkeyPatch, ca
     assert "0.features" not in left
     assert sum(path.stat().st_size for path in cache.rglob("*.features")) <= 2**20
     assert detected(monkeypatch, second, opened(photographs, second)) == []
-
-
-@pytest.mark.parametrize("how", ["none", "unwritable"])
-def test_without_a_folder_features_are_detected(monkeypatch: pytest.MonkeyPatch, cache: Path, photographs: Path, how: str) -> None:
-    if how == "none":
-        monkeypatch.setenv("ENERF_FEATURE_CACHE_MIB", "0")
-    else:
-        cache.write_text("a file where the folder should be")
-    work = cache.parent / "work"
-    assert len(detected(monkeypatch, work, opened(photographs, work))) == 3
-    assert len(features(work)) == 3

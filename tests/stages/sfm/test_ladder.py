@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -141,14 +140,6 @@ def test_own_principal_points_are_kept_where_points_lie_closer(
     found = climbed(rig, tmp_path)
     assert [rung["rung"] for rung in found.rungs] == ["exhaustive", ladder.CROPPED]
     assert found.rung == (ladder.CROPPED if kept else "exhaustive")
-
-
-def test_cropped_photographs_of_several_lenses_stay_as_they_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), ladder.EACH: (20, 0.98), ladder.CROPPED: (20, 0.99)})
-    rig.apart = 0.01
-    for other in (replace(IMAGES[0], focal=50.0), replace(IMAGES[0], fisheye=True), replace(IMAGES[0], work_width=32, work_height=24)):
-        found = ladder.find_models(tmp_path, [other, *IMAGES[1:]], "exhaustive", features=100, seed=0, threads=1, **QUIET)
-        assert [rung["rung"] for rung in found.rungs] == ["exhaustive"]
 
 
 @pytest.mark.parametrize(

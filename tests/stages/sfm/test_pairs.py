@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.sfm import ladder, pairs
+from stages.sfm import pairs
 
 
 def views(count: int, seen: int, step: int, rng: np.random.Generator) -> list[np.ndarray]:
@@ -13,12 +13,6 @@ def views(count: int, seen: int, step: int, rng: np.random.Generator) -> list[np
     things = rng.gamma(0.6, 25.0, (count * step, 128)).clip(0, 255)
     rows = [[(i * step + k) % len(things) for k in range(seen)] for i in range(count)]
     return [(things[some] + rng.normal(0, 4.0, (seen, 128))).clip(0, 255).astype(np.uint8) for some in rows]
-
-
-def test_exhaustive_pairs_are_all_pairs_once() -> None:
-    found = [pair for block in pairs.in_blocks(pairs.all_pairs(23)) for pair in block]
-    assert len(found) == len(set(found)) == 23 * 22 // 2
-    assert all(i < j for i, j in found)
 
 
 @pytest.mark.parametrize("share", [0.01, 1.0])
@@ -80,8 +74,3 @@ def test_weak_images_are_compared_with_neighbours_of_neighbours() -> None:
     found = pairs.wider_pairs(likeness, [0], near, 12)
     assert found == {(0, j) for j in [*range(1, 13), 90]}
     assert pairs.wider_pairs(likeness, [], near, 12) == set()
-
-
-def test_components_are_parts_without_a_path_between_them() -> None:
-    near = {0: {1}, 1: {0, 2}, 2: {1}, 3: {4}, 4: {3}, 5: set[int]()}
-    assert ladder.components(near) == [[0, 1, 2], [3, 4], [5]]

@@ -299,14 +299,6 @@ def test_lens_with_more_than_one_term_of_distortion(tmp_path: Path) -> None:
     assert np.sqrt((errors**2).mean()) < 0.002
 
 
-def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
-    Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg")
-    (tmp_path / "b.jpg").write_bytes(b"no picture")
-    Image.new("RGB", (64, 48)).save(tmp_path / "c.jpg")
-    with pytest.raises(BadInput, match=r"b\.jpg"):
-        find(tmp_path, ["a.jpg", "b.jpg", "c.jpg"], tmp_path / "w")
-
-
 def test_photographs_that_show_nothing_in_common_are_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     names = [f"{index}.png" for index in range(4)]

@@ -28,7 +28,6 @@ from stages.train.data import pixels_of
 from tests.efficientnerf import balls
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
-from tests.stages.forward_facing import painted_wall
 
 LOOKED, STEPS = 40, 80
 QUICK = {"iterations": STEPS, "checkpoint_every": 15}
@@ -143,15 +142,6 @@ def test_a_training_that_learns_is_left_alone(tmp_path: Path, background: tuple[
     assert (found["early_check"][0]["step"], found["second_chances"], found["chosen"]) == (LOOKED, [], None)
     assert not TrainOutputs(made.out).choices.exists()
     assert training_choices.load(made.out) == TrainingChoices()
-
-
-def test_a_forward_facing_training_that_learns_is_left_alone(tmp_path: Path) -> None:
-    folder = painted_wall(tmp_path / "poses")
-    train.run(job(tmp_path, settings(**QUICK, occupancy_warmup_steps=10), poses=folder))
-    found = report(tmp_path)
-    assert [check["learning"] for check in found["early_check"]] == [True]
-    # Near planes and views are no priors of this space.
-    assert list(second_chances.candidates(scenes.load(folder), settings())) == [second_chances.AS_STATED, "exposure", "camera refinement"]
 
 
 @pytest.mark.parametrize(

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import rays
-from efficientnerf.geometry.spaces import BoundedSpace, NdcSpace
-from efficientnerf.model import model
 from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import settings_from
 from stages.bake.resolution import ndc_pixel
-from stages.io.field_file import space_of
 from stages.train.hash_resolution import MAX_LOG2_TABLE, MAX_RESOLUTION, with_auto_sizes
-from tests.efficientnerf.balls import BOUNDS
 from tests.stages.forward_facing import forward_facing
 
 
@@ -44,20 +39,6 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
     assert with_auto_sizes(TrainSettings(), s, 10**9).log2_hashmap_size == MAX_LOG2_TABLE
     given = with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=77), s, 10**9)
     assert (given.log2_hashmap_size, given.finest_resolution, given.num_coarse_samples) == (14, 512, 77)
-
-
-def test_spaces_have_defaults_of_their_own() -> None:
-    s = forward_facing(400)
-    small = TrainSettings(log2_hashmap_size=8, num_levels=2, occupancy_resolution=8)
-    m, usual = model(space_of(s), small, None), model(BoundedSpace(BOUNDS), small, None)
-    assert m.settings.num_coarse_samples == with_auto_sizes(TrainSettings(), s, 1000).num_coarse_samples == NdcSpace.num_coarse_samples
-    assert m.step == pytest.approx(2 * math.sqrt(3) / NdcSpace.num_coarse_samples, rel=1e-6)  # the box is 2 deep
-    assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.05)
-    assert 1 - math.exp(-usual.voxels.threshold * usual.step) == pytest.approx(0.01)
-    assert (m.distortion, usual.distortion) == (0.002, 0.01)
-    stated = model(space_of(s), dataclasses.replace(small, num_coarse_samples=64, occupancy_alpha_threshold=0.2, distortion_loss_weight=0.0), None)
-    assert (stated.settings.num_coarse_samples, stated.distortion) == (64, 0.0)
-    assert 1 - math.exp(-stated.voxels.threshold * stated.step) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(("name", "least", "most"), [("log2_hashmap_size", 8, 24), ("finest_resolution", 16, 16384), ("num_coarse_samples", 8, 1024)])

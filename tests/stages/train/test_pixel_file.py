@@ -32,12 +32,6 @@ def test_rows_are_those_of_an_array(tmp_path: Path, channels: int) -> None:
     assert rows[at[:0]].shape == (0, channels)
 
 
-@pytest.mark.parametrize("index", [[1000], [-1]])
-def test_rows_that_are_not_there_are_refused(tmp_path: Path, index: list[int]) -> None:
-    with pytest.raises(IndexError, match="of 1000"):
-        filled(tmp_path)[0][np.array(index)]
-
-
 def test_the_file_has_no_name(tmp_path: Path) -> None:
     rows, _ = filled(tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -193,11 +193,6 @@ def test_strong_compression_is_told_by_the_file_and_by_its_blocks_in_another(tmp
     assert not looks.look_at(tmp_path / "reduced.jpg").compressed  # smeared over all columns: nothing tells
 
 
-def test_the_blocks_of_a_large_photograph_are_told_by_its_tables(tmp_path: Path) -> None:
-    large = photograph().resize((1920, 1440), Image.Resampling.BICUBIC)  # the decoder reduces it
-    assert looks.compressed(looks.look_at_all({str(q): saved(large, q, tmp_path) for q in (6, 30, 80)})) == ["6"]
-
-
 @pytest.mark.parametrize("step", [5, 8])
 def test_enlarged_pictures_have_no_blocks(step: int) -> None:
     coarse = np.random.default_rng(step).integers(0, 255, (480 // step, 640 // step), np.uint8)

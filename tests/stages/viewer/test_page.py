@@ -68,13 +68,6 @@ def test_nothing_in_the_page_names_another_place(asset: bytes) -> None:
     assert script_text() == text_of(viewer_page(asset)).rpartition("<script>")[2].partition("</script>")[0]
 
 
-def test_cameras_come_from_the_assets_captured_path() -> None:
-    poses = [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, -float(n)] for n in range(3)]
-    path = {"poses": poses, "width": 40, "height": 30, "focal": 50.0}
-    found = facts(text_of(viewer_page(serialize(random_tree(3).with_metadata(captured_path=path), "compact"))))["cameras"]
-    assert [(each["eye"], each["fx"], each["cx"]) for each in found] == [([0, 0, -n], 50.0, 20.0) for n in range(3)]  # type: ignore[attr-defined]
-
-
 @pytest.mark.parametrize("path", [3, {}, {"poses": [[1]], "width": 4, "height": 4, "focal": 4}, {"poses": [], "width": "x", "height": 4, "focal": 4}])
 def test_a_captured_path_that_is_none_is_left_out(path: object) -> None:
     assert facts(text_of(viewer_page(serialize(random_tree(3).with_metadata(captured_path=path), "compact"))))["cameras"] == []

@@ -106,23 +106,6 @@ def test_where_nothing_is_seen_the_colours_beside_it_are_carried_on() -> None:
     np.testing.assert_array_equal(carried_on(mesh, atlas, colours, nothing, colours), mesh.colours)
 
 
-def test_the_back_of_a_wall_has_the_colours_of_its_front() -> None:
-    """Two sides of a wall that share no edge, red to the left and blue to the right; photographs show the front."""
-    y, z = (part.ravel() for part in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij"))
-    corner = (21 * np.arange(20)[:, None] + np.arange(20)).ravel()
-    side = np.concatenate([np.stack([corner, corner + 21, corner + 22], -1), np.stack([corner, corner + 22, corner + 1], -1)])
-    vertices, faces = np.concatenate([np.stack([x + 0 * y, y, z], 1) for x in (0.05, -0.05)]), np.concatenate([side, side[:, ::-1] + 441])
-    atlas = atlas_of(vertices, faces, np.inf, 128)
-    points = atlas.texels.values(vertices, faces)
-    colours = np.where(points[:, 1:2] < 0, np.uint8([200, 0, 0]), np.uint8([0, 0, 200]))
-    known = (points[:, 0] > 0).astype(np.float32)
-    mesh = Mesh(vertices, faces, vertex_normals(vertices, faces), np.ones((882, 3), np.float32))
-    found = 255 * carried_on(mesh, atlas, colours, known, np.full_like(colours, 255))
-    back = found[441:]
-    np.testing.assert_allclose(back[y < -0.3], np.tile([200, 0, 0], ((y < -0.3).sum(), 1)), atol=2)
-    np.testing.assert_allclose(back[y > 0.3], np.tile([0, 0, 200], ((y > 0.3).sum(), 1)), atol=2)
-
-
 def test_masks_and_alpha_are_kept_to() -> None:
     vertices, faces = ball(3)
     camera = cameras(1)[0]
