@@ -171,7 +171,7 @@ def test_refined_cameras_are_recorded_and_used(tmp_path: Path) -> None:
         assert new.source_camera.params[0] / old.source_camera.params[0] == pytest.approx(new.camera.params[0] / old.camera.params[0])
     report = json.loads((made.out / "report.json").read_text())["cameras"]
     assert 0 < report["mean_pixels"] <= report["max_pixels"]
-    made = job(tmp_path / "off", settings(**REFINED | {"camera_refinement": "off"}), poses=scene)
+    made = job(tmp_path / "off", settings(**REFINED | {"camera_refinement": "off", "iterations": 3}), poses=scene)
     train.run(made)
     assert not (made.out / TrainOutputs.cameras).exists()
     assert [view.camera.params for view in load_scene(scene, made.out).views] == [view.camera.params for view in before.views]
@@ -346,9 +346,6 @@ def test_a_view_that_shows_something_else_is_left_out_here_and_after(tmp_path: P
         assert run(job(again, settings(**SWAPPED), poses=scene, stop=stop)) == digest
         assert (again / "out" / TrainOutputs.cameras).read_bytes() == (made.out / TrainOutputs.cameras).read_bytes()
         assert (again / "out" / TrainOutputs.wrong_views).read_bytes() == (made.out / TrainOutputs.wrong_views).read_bytes()
-    off = job(tmp_path / "off", settings(**SWAPPED, wrong_views="off"), poses=scene)
-    assert run(off) != digest
-    assert not (off.out / TrainOutputs.cameras).exists()
 
 
 def test_without_wrong_views_the_checks_change_nothing(tmp_path: Path, early_checks: None) -> None:
