@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.sfm import ladder, lenses, mapping
+from stages.sfm import ladder, mapping
+from stages.sfm.colmap import quiet_pycolmap
+from stages.sfm.database import FEATURES, PAIRS, copy_with_own_cameras, database_path
 from stages.sfm.images import WorkImage
+from stages.sfm.intrinsics import zoom
 from stages.verdict.verdict import DOUBTFUL
 from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, cameras, matched, off, registered
 
@@ -48,10 +51,10 @@ def test_two_zooms_are_told_where_the_matches_agree_with_one(tmp_path: Path) -> 
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
     assert mapping.match_agreement(tmp_path, images, shared) > DOUBTFUL
     assert off(shared, taken) > 0.05
-    assert lenses.focal_length_spread(shared) > ladder.SPREAD
+    assert zoom.focal_length_spread(shared) > ladder.SPREAD
     found = found_for(tmp_path, images)
     assert found.rung == ladder.EACH
-    assert lenses.focal_length_spread(found.models[0]) < 1.01
+    assert zoom.focal_length_spread(found.models[0]) < 1.01
     assert off(found.models[0], taken) < 0.01
 
 
@@ -60,7 +63,7 @@ def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -
     taken = cameras(cut=cut)
     images = matched(tmp_path, taken)
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    assert lenses.principal_point_spread(shared) > ladder.APART
+    assert zoom.principal_point_spread(shared) > ladder.APART
     found = found_for(tmp_path, images)
     assert found.rung == ladder.CROPPED
     model = found.models[0]
@@ -69,6 +72,43 @@ def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -
     assert lens[0, 0] == pytest.approx(400.0, rel=0.08)
     true = np.array([camera.params[1:3] for camera in taken])
     assert (lens[:, 1:3] - true).std() < 0.4 * true.std()
-    assert lenses.principal_point_spread(model) < ladder.APART / 2
+    assert zoom.principal_point_spread(model) < ladder.APART / 2
     assert off(model, taken) < 0.5 * off(shared, taken) < 0.005
     assert numbers(found_for(tmp_path, images)) == numbers(found)
+
+
+def test_the_spread_of_principal_points_does_not_depend_on_where_all_of_them_are(tmp_path: Path) -> None:
+    """All cropped alike: one principal point, off the middle."""
+    images = matched(tmp_path, cameras(cut=((20, -12),) * COUNT))
+    shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
+    assert zoom.principal_point_spread(shared) < ladder.APART
+    assert zoom.focal_length_spread(shared) < ladder.SPREAD
+
+
+def test_one_zoom_is_not_looked_at_again(tmp_path: Path) -> None:
+    images = matched(tmp_path, cameras())
+    found = found_for(tmp_path, images)
+    assert [rung["rung"] for rung in found.rungs] == ["exhaustive"]
+    assert found.rung == "exhaustive"
+    assert not (tmp_path / "own_cameras").exists()
+
+
+def test_a_copy_with_own_cameras_has_the_same_features_and_matches(tmp_path: Path) -> None:
+    images = matched(tmp_path, cameras(ZOOMED))
+    place = tmp_path / "copy"
+    place.mkdir()
+    copy_with_own_cameras(tmp_path, place, images)
+
+    def rows(work: Path, table: str) -> list[Any]:
+        with contextlib.closing(sqlite3.connect(database_path(work))) as connection:
+            return connection.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()
+
+    for table, _ in (*FEATURES, *PAIRS):
+        assert rows(tmp_path, table) == rows(place, table)
+        assert rows(place, table)
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(place)) as database:
+        own = {image.name: (image.image_id, image.camera_id) for image in database.read_all_images()}
+    assert [own[image.file][0] for image in images] == list(range(1, COUNT + 1))
+    assert len({camera for _, camera in own.values()}) == COUNT
+    copy_with_own_cameras(tmp_path, place, images)  # over what is there
+    assert rows(tmp_path, "matches") == rows(place, "matches")
