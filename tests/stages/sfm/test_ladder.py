@@ -12,7 +12,7 @@ from PIL import Image, ImageFilter
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.sfm import ladder, mapping, matches, merging, pairs, reconstruction
+from stages.sfm import ladder, mapping, matches, merging, pairs
 from stages.sfm.images import WorkImage
 from stages.sfm.intrinsics import zoom
 from stages.sfm.reconstruction import find_cameras
