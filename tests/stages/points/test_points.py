@@ -10,7 +10,7 @@ import pytest
 from pipeline.stage import Job
 from stages.points import run as points
 from stages.points.run import PointsSettings
-from tests.stages.mesh.test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
+from tests.stages.mesh.balls import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 
 
 @pytest.fixture(scope="module")
