@@ -42,5 +42,5 @@ NAMES = (
     "turntable",  # bake -> frames, video, EXR
     "points",  # bake -> PLY
 )
-STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}.run").STAGE for name in NAMES)
+STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}.settings").STAGE for name in NAMES)
 WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets", space=space_needed, memory=memory_needed)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from efficientnerf.surface.mesh import Mesh
     from pipeline.executors.memory import Limit
     from stages.formats.exporters.writing import SourceFrame
-    from stages.mesh.run import MeshSettings
+    from stages.mesh.settings import MeshSettings
     from workflows.cli.resolve import Settings
 
 CAMERAS, VIEWER = ".json", ".html"
@@ -265,7 +265,7 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
     from stages.artifacts import BakeOutputs, MeshOutputs
     from stages.formats.exporters.writing import source_frame
     from stages.mesh.files import read_mesh
-    from stages.mesh.run import STAGE, MeshSettings
+    from stages.mesh.settings import STAGE, MeshSettings
     from workflows.cli.target import is_run, open_run
 
     if not is_run(what):

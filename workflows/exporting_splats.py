@@ -11,7 +11,7 @@ from workflows.exporting import Export, Progress, Written
 if TYPE_CHECKING:
     from efficientnerf.splats.gaussians import Gaussians
     from stages.formats.exporters.writing import SourceFrame
-    from stages.splats.run import SplatsSettings
+    from stages.splats.settings import SplatsSettings
     from workflows.cli.resolve import Settings
 
 
@@ -59,7 +59,7 @@ def _made_by_the_stage(what: Path, wanted: SplatsSettings) -> tuple[Gaussians, S
     from stages.artifacts import BakeOutputs, SplatsOutputs
     from stages.formats.exporters.splats.ply import read_splats
     from stages.formats.exporters.writing import source_frame
-    from stages.splats.run import STAGE, SplatsSettings
+    from stages.splats.settings import STAGE, SplatsSettings
     from workflows.cli.target import is_run, open_run
 
     if not is_run(what):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from efficientnerf.training.pixels import PixelRows
     from efficientnerf.training.settings import TrainSettings
     from stages.bake.plan import Plan
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
     from stages.io.scene import Scene, View
 
 COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement

@@ -12,7 +12,7 @@ from stages.framing.captured import captured_metadata
 
 if TYPE_CHECKING:
     from efficientnerf.capture.forward_facing import ForwardFacing
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
     from stages.io.scene import Scene
 
 

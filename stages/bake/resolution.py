@@ -19,7 +19,7 @@ from pipeline.errors import UsageError
 
 if TYPE_CHECKING:
     from efficientnerf.capture.forward_facing import ForwardFacing
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
     from stages.io.scene import Scene
 
 MIN_RESOLUTION = 32  # voxels along the longest side

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.spaces import Space
     from stages.bake.plan import Plan
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
     from stages.io.scene import Scene
 
 def baked_values(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import Pixels
     from stages.bake.resolution import Choice
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
     from stages.io.scene import Scene
 
 MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: of which the refinement keeps the heaviest

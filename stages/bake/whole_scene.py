@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from efficientnerf.asset.region import Region
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import Pixels
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
     from stages.io.scene import Scene
 
 # Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned

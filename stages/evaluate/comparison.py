@@ -15,17 +15,22 @@ numbers a view, that fits the photograph best (`metrics.colour_fitted`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
+from efficientnerf.evaluation.lpips import Lpips
 from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.evaluate.asset import EvaluatedAsset, over_field, render_asset
+from stages.evaluate.lpips_weights import find_weights
 from stages.evaluate.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
 from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
 from stages.evaluate.splats import EvaluatedSplats, splats_image, splats_metrics
@@ -33,9 +38,6 @@ from stages.evaluate.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluate.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.io.scene import Scene, View
 from stages.train.averaged import Taken
-
-if TYPE_CHECKING:
-    from efficientnerf.evaluation.lpips import Lpips
 
 HOLE, SOLID = 0.5, 0.95
 FLOATER_RAYS = 4096
@@ -214,3 +216,29 @@ def clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
     if bad:
         job.warn(f"{what} is not finite at {bad} pixels; they count as black")
     return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+
+
+def load_lpips(network: str, folder: str | None, *, bundled: Sequence[Path] | None = None) -> Lpips:
+    """The metric by "alex" or "vgg".
+
+    folder   searched first, for the network and for the heads
+    bundled  folders that are searched for the heads then; None: that of the package torchmetrics
+
+    Raises UsageError, which names what is missing and where to get it.
+    """
+    backbone, heads = find_weights(network, folder, bundled=bundled)
+    try:
+        return Lpips(network, _state(backbone), _state(heads))
+    except ValueError as error:
+        raise BadInput(f"LPIPS, {backbone.name} with {heads}: {error}. Get the files again.") from None
+
+
+def _state(path: Path) -> dict[str, Any]:
+    """Tensors of a file of torch's, read without executing anything in it."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load does not document what it raises for a damaged file
+        raise BadInput(f"{path}: not a readable file of weights ({str(error).splitlines()[0][:80] if str(error) else type(error).__name__}).") from None
+    if not isinstance(state, dict):
+        raise BadInput(f"{path}: holds {type(state).__name__}; expected named tensors.")
+    return state

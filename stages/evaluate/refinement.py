@@ -11,7 +11,7 @@ from stages.artifacts import BakeOutputs
 def refinement_of(bake: BakeOutputs) -> dict[str, int]:
     """Steps that were taken, and those that are usual for so many voxels and rays a step."""
     from stages.bake.refine.refinement import usual_steps
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
 
     report = read_json(bake.report)
     last = json.loads(bake.log.read_text(encoding="utf-8").splitlines()[-1])

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from msgspec import Meta
 
-from efficientnerf.settings import Auto, Fraction, given, setting
+from efficientnerf.settings import given
 from pipeline.errors import StageFailed
 from pipeline.files import write_json
-from pipeline.stage import Job, Stage
-from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
+from pipeline.stage import Job
+from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
 from stages.compiling import compiling_kernels
 from stages.mesh.check import asset_views, checked, level_of, shown_by, warning_of
-from stages.mesh.texture import facts_of, largest_photograph, refuse_normal_map_without_texture, textured, with_relief
+from stages.mesh.settings import MeshSettings, refuse_normal_map_without_texture
+from stages.mesh.texture import facts_of, largest_photograph, textured, with_relief
 from stages.mesh.timing import Stopwatch
 
 if TYPE_CHECKING:
@@ -32,43 +32,6 @@ PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.
 STEPS = 500  # of the progress of each
 SURFACE_SHARE = 0.7  # of the stage's time; the texture takes the rest
 FACES = {"20k": 20_000, "100k": 100_000, "500k": 500_000}  # of mesh.max_faces
-
-
-@dataclass(frozen=True)
-class MeshSettings:
-    """How the surface is meshed."""
-
-    region: Literal["foreground", "all"] = setting(
-        "foreground",
-        "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
-        advanced=True,
-    )
-    max_faces: Annotated[int, Meta(ge=100)] | Literal["20k", "100k", "500k"] = setting(
-        200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
-    )
-    density_threshold: Annotated[float, Meta(gt=0.0)] | Auto = setting(
-        "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
-    )
-    min_component: Fraction = setting(
-        0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
-    )
-    smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
-        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, of normals follow, which keep edges.", advanced=True
-    )
-    texture: Literal["auto", "photographs", "asset", "off"] = setting(
-        "auto",
-        "Where the texture's colours are from: the training photographs, blended (photographs), or the asset (asset); auto: photographs where they show the"
-        " mesh; off: colours at vertices alone.",
-    )
-    texture_size: Annotated[int, Meta(ge=256, le=8192)] = setting(
-        2048, "Most texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.", advanced=True
-    )
-    normal_map: bool = setting(
-        False,
-        "A normal map beside the texture, of the surface before it was decimated; materials are lit then, so that lamps show its relief over the light of the"
-        " capture.",
-        advanced=True,
-    )
 
 
 def mesh_of(
@@ -266,14 +229,3 @@ def run(job: Job) -> None:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['non_manifold_edges']} non-manifold edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
-
-
-STAGE = Stage(
-    name="mesh",
-    version=15,
-    settings=MeshSettings,
-    needs=needs_of(MeshInputs),
-    run=run,
-    check=lambda settings: refuse_normal_map_without_texture(settings["mesh"]),
-    volatile=(MeshOutputs.timings,),
-)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from efficientnerf.surface.texturing.photographs import Photograph
     from stages.artifacts import MeshInputs
     from stages.io.scene import View
-    from stages.mesh.run import MeshSettings
 
 Progress = Callable[[int, int, str], None]
 
@@ -81,14 +80,6 @@ def with_relief(mesh: Mesh, dense: list[tuple[np.ndarray, np.ndarray]], tick: Ca
     first = np.cumsum([0, *(len(vertices) for vertices, _ in dense)])
     faces = np.concatenate([part + start for (_, part), start in zip(dense, first)])
     return with_normal_map(mesh, Dense(np.concatenate([vertices for vertices, _ in dense]), faces), tick)
-
-
-def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
-    """Raise UsageError for a normal map on a mesh without texture coordinates."""
-    from pipeline.errors import UsageError
-
-    if settings.normal_map and settings.texture == "off":
-        raise UsageError("mesh.normal_map lies on the coordinates of a texture, and mesh.texture is off. Set one of them otherwise.")
 
 
 def largest_photograph(inputs: MeshInputs, choice: str) -> int:

@@ -8,18 +8,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Seed, given, setting
+from efficientnerf.settings import given
 from pipeline.errors import StageFailed, UsageError
 from pipeline.files import write_json
-from pipeline.stage import Job, Stage
-from stages.artifacts import PosesOutputs, SplatsInputs, SplatsOutputs, TrainOutputs, inputs_of, needs_of
+from pipeline.stage import Job
+from stages.artifacts import PosesOutputs, SplatsInputs, SplatsOutputs, TrainOutputs, inputs_of
 from stages.compiling import compiling_kernels
+from stages.splats.settings import SplatsSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,38 +28,8 @@ if TYPE_CHECKING:
     from efficientnerf.splats.gaussians import Gaussians
     from stages.memory.need import Need
 
-MOST = 5_000_000  # Gaussians: beyond that no program opens them
 PASSES, FEWEST_STEPS, MOST_STEPS = 4, 300, 900  # docs/experiments/splats.md
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
-
-
-@dataclass(frozen=True)
-class SplatsSettings:
-    """How the asset becomes 3D Gaussians."""
-
-    make: Literal["auto", "on", "off"] = setting(
-        "auto",
-        "Whether the run makes 3D Gaussians of its asset; auto: where there is memory for it and something shows; 'enerf export RUN --splats' makes them in any"
-        " case.",
-        advanced=True,
-    )
-    region: Literal["foreground", "all"] = setting(
-        "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject with what supports it (foreground).", advanced=True
-    )
-    count: Annotated[int, Meta(ge=1, le=MOST)] = setting(200_000, "Most Gaussians; no more are made than a picture has pixels.", advanced=True)
-    sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
-    iterations: Count | Auto = setting(
-        "auto",
-        "Steps in which they are fitted to pictures, each of a picture or of rows of a large one; 0: none; auto: four passes over all pixels, at least 300 and"
-        " at most 900.",
-        advanced=True,
-    )
-    pictures: Literal["photographs", "asset"] = setting(
-        "photographs",
-        "What they are fitted to: the training photographs, or the asset's own renders, as in any case where region is foreground.",
-        advanced=True,
-    )
-    seed: Seed = setting(0, "Seed of the order of the pictures.", advanced=True)
 
 
 def gaussians_of(
@@ -164,6 +133,3 @@ def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     sizes = {"ply_bytes": outputs.ply.stat().st_size, "spz_bytes": outputs.spz.stat().st_size}
     write_json(outputs.report, {"gaussians": len(gaussians), "made": True, "sh_degree": gaussians.degree, "region": settings.region, **sizes})
     job.say(f"{len(gaussians)} Gaussians in {time.monotonic() - started:.0f} s", gaussians=len(gaussians))
-
-
-STAGE = Stage(name="splats", version=5, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)

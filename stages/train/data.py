@@ -12,6 +12,7 @@ import numpy as np
 from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
 from stages.scratch import Warn
+from stages.train.settings import refuse_planes_out_of_order
 
 if TYPE_CHECKING:
     from efficientnerf.training.pixels import PixelRows, Pixels
@@ -105,19 +106,6 @@ def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
         raise UsageError(f"{ranges}: rays would miss all of it. Leave both auto, or state planes around it.")
     if np.median(inside / (last - first)) < 1 - CUT_SHARE:
         warn(f"{ranges}: rays miss a part of it. Leave both auto, or state planes around it.")
-
-
-def refuse_planes_out_of_order(settings: TrainSettings) -> None:
-    """UsageError where one of train.near_plane and train.far_plane is stated without the other, for N_c samples lie between both; or where they are not in
-    order."""
-    from pipeline.errors import UsageError
-
-    near, far = given(settings.near_plane), given(settings.far_plane)
-    if near is None and far is None:
-        return
-    if near is None or far is None or near >= far:
-        found = f"train.near_plane={settings.near_plane}, train.far_plane={settings.far_plane}"
-        raise UsageError(f"{found}: expected two numbers, the second one greater, or auto for both.")
 
 
 def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | None:

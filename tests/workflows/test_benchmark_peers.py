@@ -16,7 +16,7 @@ from benchmarks.peers import __main__ as peers
 from benchmarks.scenes.__main__ import write_scene
 from benchmarks.scenes.catalogue import recipes
 from stages.formats.importers import IMPORTERS, detect
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 
 COUNTS = {"train": 3, "val": 1, "test": 2}
 # Renders the test images on white, of the pixels asked for, each a tenth nearer to grey than it is.

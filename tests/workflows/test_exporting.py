@@ -24,8 +24,8 @@ from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
 from stages.mesh.files import read_mesh
-from stages.mesh.run import MeshSettings
-from stages.points.run import PointsSettings
+from stages.mesh.settings import MeshSettings
+from stages.points.settings import PointsSettings
 from tests.stages.io.meshes import block
 from workflows import exporting
 from workflows.cli.resolve import Settings, table_of

@@ -18,7 +18,7 @@ from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, SplatsOutputs
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.writing import source_frame
-from stages.splats.run import SplatsSettings
+from stages.splats.settings import SplatsSettings
 from tests.stages.formats.gaussians import read_spz, scattered
 from workflows import exporting_splats
 from workflows.cli.resolve import Settings, table_of

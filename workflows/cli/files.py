@@ -13,7 +13,7 @@ from workflows.cli.options import common_options, crop_option, folder_type, forc
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.cameras import Camera
-    from stages.turntable.run import TurntableSettings
+    from stages.turntable.settings import TurntableSettings
     from workflows.cli.resolve import Settings
 
 TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
@@ -158,7 +158,7 @@ def render(
     from stages.framing.camera_paths import PATHS
     from stages.memory.need import refuse_more_than
     from stages.memory.rendering import frames_needed
-    from stages.turntable.run import TurntableSettings
+    from stages.turntable.settings import TurntableSettings
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
     from workflows.destination import check_files, check_folder, check_free, writing

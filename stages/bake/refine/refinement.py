@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from efficientnerf.asset.refinement.targets import Targets
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.cameras import Camera
-    from stages.bake.run import BakeSettings
+    from stages.bake.settings import BakeSettings
     from stages.io.scene import Scene
 
 CHECKPOINT_SECONDS = 30.0

@@ -28,7 +28,7 @@ from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import economy, memory, resolution
 from stages.bake import run as bake
 from stages.bake.refine import checkpoint, refinement
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.evaluate.views import ground_truth
 from stages.figures import plots
 from stages.io.field_file import load_renderer, save_model

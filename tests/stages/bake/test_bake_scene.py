@@ -28,7 +28,7 @@ from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import holes, pruning, resolution, whole_scene
 from stages.bake import run as bake
 from stages.bake.resolution import MAX_CELLS, MAX_MIB, budget_of, finest_of_cascades
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.framing.view_coverage import close_to_path
 from stages.io import field_file
 from stages.io.png import read_png, write_png

@@ -15,7 +15,7 @@ from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import NdcSpace
 from pipeline.stage import Job
 from stages.bake import pruning
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.bake.voxels import FEW_VIEWS_RATIO, WELL_SEEN_VIEWS, by_views, seen_by_few
 from stages.framing.scene_bounds import in_view
 from stages.framing.view_coverage import count_views, shows

@@ -24,7 +24,7 @@ from stages.bake import run as bake
 from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint, refinement
 from stages.bake.refine.checkpoint import Point
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.figures import plots
 from stages.train import run as train
 from tests.efficientnerf.balls import settings

@@ -24,7 +24,7 @@ from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.refine import refinement, timing
 from stages.bake.resolution import MAX_MIB, timed_budget
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.figures import plots
 from stages.train import run as train
 from stages.train.log import read_lines

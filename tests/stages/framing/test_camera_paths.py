@@ -24,7 +24,8 @@ from stages.framing.camera_paths import PATHS, orbit_of, pose_on_sphere, similar
 from stages.framing.captured import captured_metadata, captured_of
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
-from stages.turntable.run import TurntableSettings, cameras_of
+from stages.turntable.run import cameras_of
+from stages.turntable.settings import TurntableSettings
 from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree

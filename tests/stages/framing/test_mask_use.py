@@ -19,7 +19,7 @@ from stages.io import scene, working_images
 from stages.io.capture import Capture, Photo, Silhouettes
 from stages.io.scene import Scene
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.renamed_settings import moved, updated
 from stages.train.data import pixels_of
 from tests.stages import captures

@@ -20,7 +20,7 @@ from stages.masking import foreground
 from stages.masking.foreground import cleaned
 from stages.masking.subject import Subject, may_show, subject_of
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 
 RADIUS = 0.6

@@ -10,7 +10,7 @@ import pytest
 from pipeline.errors import StageFailed
 from pipeline.stage import Job
 from stages.points import run as points
-from stages.points.run import PointsSettings
+from stages.points.settings import PointsSettings
 
 from .test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 

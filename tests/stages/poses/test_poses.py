@@ -19,7 +19,8 @@ from stages.io import scene
 from stages.io.capture import Capture, Photo
 from stages.io.scene import Scene
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings, assign_splits
+from stages.poses.run import assign_splits
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS
 

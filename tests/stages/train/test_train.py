@@ -22,12 +22,13 @@ from stages.io.capture import SparsePoints
 from stages.io.field_file import load_exposure, load_renderer
 from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.train import data
 from stages.train import run as train
 from stages.train.averaged import as_taken
 from stages.train.data import depth_range, pixels_of, sparse_depth_of
 from stages.train.exposure import begin_exposure
+from stages.train.settings import STAGE
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -307,7 +308,7 @@ def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, di
 @pytest.mark.parametrize("planes", [{"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}])
 def test_planes_are_stated_both_and_in_order(planes: dict[str, float], scene: Path, tmp_path: Path) -> None:
     chosen = settings(**QUICK, **planes)
-    for refused in (lambda: train.STAGE.check({"train": chosen}), lambda: train.run(job(tmp_path, chosen, poses=scene))):
+    for refused in (lambda: STAGE.check({"train": chosen}), lambda: train.run(job(tmp_path, chosen, poses=scene))):
         with pytest.raises(UsageError, match=r"train\.near_plane=.*, train\.far_plane=.*: expected two numbers, the second one greater, or auto for both"):
             refused()
 
@@ -317,8 +318,8 @@ def test_planes_in_a_contracted_scene_are_refused_by_the_name_of_what_contracts_
     with pytest.raises(UsageError, match=r"poses\.space=contracted"):
         train.run(job(tmp_path / "a", chosen, poses=poses(tmp_path / "poses", space="contracted")))
     with pytest.raises(UsageError, match=r"poses\.space=contracted"):
-        train.STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
-    train.STAGE.check({"train": chosen, "poses": PosesSettings()})
+        STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
+    STAGE.check({"train": chosen, "poses": PosesSettings()})
 
 
 def test_planes_that_miss_the_scene_are_refused_and_those_that_cut_into_it_are_told(scene: Path) -> None:

@@ -18,7 +18,8 @@ from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages.framing.camera_paths import turntable_cameras
 from stages.io.png import read_png
-from stages.turntable.run import STAGE, TurntableSettings, render_turntable
+from stages.turntable.run import render_turntable
+from stages.turntable.settings import STAGE, TurntableSettings
 from tests.fakes import BallTree
 from tests.stages.spoilers import SPOILERS
 

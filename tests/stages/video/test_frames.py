@@ -19,7 +19,7 @@ from stages.io.capture import Capture
 from stages.io.material import find_material, photographs_of, with_frames
 from stages.io.photo import read_photo
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.sfm import reconstruction
 from stages.sfm.images import prepare_images
 from stages.video.frames import Chosen, Reader, frames_of, look

@@ -24,8 +24,8 @@ from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPO
 from stages.formats.exporters.splats.ply import read_splats
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
-from stages.mesh.run import MeshSettings
-from stages.turntable.run import TurntableSettings
+from stages.mesh.settings import MeshSettings
+from stages.turntable.settings import TurntableSettings
 from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
