@@ -14,8 +14,7 @@ from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPO
 if TYPE_CHECKING:
     import numpy as np
 
-    from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.asset.tree import NerfTree, Region
     from efficientnerf.surface.mesh import Mesh
     from pipeline.executors.memory import Limit
     from stages.formats.exporters.writing import SourceFrame

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from efficientnerf.asset.region import Region, inside_distance
+from efficientnerf.asset.region import inside_distance
+from efficientnerf.asset.tree import Region
 from efficientnerf.capture.cells import CENTRAL, CONNECTED, Cells, connected_parts, observed_cells
 from efficientnerf.capture.coverage import meeting_point
 from efficientnerf.capture.supports import Plane, find_supports, rays_that_end, with_feet

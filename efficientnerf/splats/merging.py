@@ -84,9 +84,8 @@ def greatest_weights(tree: NerfTree, cameras: Sequence[Camera], count: int = RAY
 
 def shown_voxels(tree: NerfTree, cameras: Sequence[Camera]) -> Shown:
     """The voxels that the cameras see."""
-    from efficientnerf.asset.cascades import voxel_cascades, voxel_sides
+    from efficientnerf.asset.cascades import voxel_cascades, voxel_coordinates, voxel_sides
     from efficientnerf.asset.region import voxel_centres
-    from efficientnerf.asset.tree import voxel_coordinates
 
     weight = greatest_weights(tree, cameras)
     voxels = np.flatnonzero(weight > LEAST_WEIGHT)

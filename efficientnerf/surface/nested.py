@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.asset.cascades import Cascade, cascade_tree, cascades_of, voxel_cascades
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, voxel_cascades
+from efficientnerf.asset.tree import Cascade, NerfTree
 from efficientnerf.surface.extraction import cleaned_surface, points, spread, surface
 from efficientnerf.surface.fusion import Fusion, fusion_of
 from efficientnerf.surface.isosurface import NoSurface, Progress
@@ -23,7 +23,7 @@ from efficientnerf.surface.visible_parts import Shown
 from efficientnerf.surface.volume import volume_of
 
 if TYPE_CHECKING:
-    from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import Region
     from efficientnerf.surface.agreement import AssetView
 
 MIN_FACES = 20

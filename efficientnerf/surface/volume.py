@@ -20,8 +20,7 @@ from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
 
 if TYPE_CHECKING:
-    from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.asset.tree import NerfTree, Region
 
 VOXELS_AT_ONCE = 2**20  # of bricks, while dense voxels are found
 FARTHEST = 50.0  # times the near plane's depth: the far limit where the asset does not say

@@ -10,7 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from efficientnerf.asset.field_samples import FieldSamples, Grid
-    from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import Region
     from efficientnerf.geometry.spaces import Space
     from stages.bake.resolution import Choice
 

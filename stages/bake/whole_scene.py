@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from efficientnerf.asset.bake import Visibility
     from efficientnerf.asset.field_samples import FieldSamples, Grid
-    from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import Region
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import Pixels
     from stages.bake.settings import BakeSettings
@@ -145,7 +145,7 @@ def cascades_needed(samples: FieldSamples, bounds: np.ndarray, stated: int | Non
 def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> Region:
     """The foreground region; the scene bounds where they were given by hand (poses.crop_box), and where the field says too little."""
     from efficientnerf.asset.field_samples import picture_places, surface_points
-    from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import Region
     from efficientnerf.capture.foreground import find_foreground
     from stages.io import scene
 

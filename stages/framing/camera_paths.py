@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from efficientnerf.asset.cascades import Cascade, cascades_of
+from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.region import inside_share
+from efficientnerf.asset.tree import Cascade
 from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput

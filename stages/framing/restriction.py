@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.asset.region import Region, cropped, foreground, voxel_centres
+from efficientnerf.asset.region import cropped, foreground, voxel_centres
+from efficientnerf.asset.tree import Region
 from pipeline.errors import UsageError
 from stages.framing.camera_paths import similarity_of
 

@@ -20,8 +20,7 @@ from stages.mesh.texture import facts_of, largest_photograph, textured, with_rel
 from stages.mesh.timing import Stopwatch
 
 if TYPE_CHECKING:
-    from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.asset.tree import NerfTree, Region
     from efficientnerf.surface.agreement import AssetView
     from efficientnerf.surface.mesh import Mesh
     from stages.formats.exporters.writing import SourceFrame

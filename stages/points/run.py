@@ -15,7 +15,7 @@ from stages.mesh.run import PARTS, orbit_points, remedy, whole_progress
 from stages.points.settings import PointsSettings
 
 if TYPE_CHECKING:
-    from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import Region
     from efficientnerf.surface.mesh import PointCloud
     from stages.formats.exporters.writing import SourceFrame
 

@@ -71,9 +71,8 @@ def save(job: Job, point: Point) -> None:
     """Replace the checkpoint."""
     from safetensors.numpy import save_file
 
-    from efficientnerf.asset.cascades import voxel_cascades
+    from efficientnerf.asset.cascades import voxel_cascades, voxel_coordinates
     from efficientnerf.asset.refinement.state import STATE
-    from efficientnerf.asset.tree import voxel_coordinates
 
     state = point.state
     state.fetch()
@@ -171,8 +170,8 @@ def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.n
 
 def _split_tree(tree: NerfTree, splits: int, found: Mapping[str, np.ndarray], density: np.ndarray, sh: np.ndarray) -> NerfTree:
     """A tree with the checkpoint's voxels on the grids of `tree`, which were split so often. ValueError where they are not in the order of a tree."""
-    from efficientnerf.asset.cascades import cascades_of, nested
-    from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
+    from efficientnerf.asset.cascades import cascades_of, nested, voxel_coordinates
+    from efficientnerf.asset.tree import tree_from_voxels
 
     at, of, finer = found["coordinates"], _cascades(found), 2**splits
     trees = []
@@ -242,8 +241,7 @@ def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) ->
 
 def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.ndarray:
     """Which voxels of the tree lie at coordinates (n, 3) of their cascades (n,); ValueError where one of them is not stored."""
-    from efficientnerf.asset.cascades import cascades_of, voxel_cascades
-    from efficientnerf.asset.tree import voxel_coordinates
+    from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates
 
     sizes = np.asarray([cascade.shape for cascade in cascades_of(tree)], np.int64) * tree.brick
     if (cascades >= len(sizes)).any() or (coordinates < 0).any() or (coordinates >= sizes[cascades]).any():
@@ -266,7 +264,6 @@ def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.
 
 def ancestors(baked: NerfTree, tree: NerfTree, splits: int) -> np.ndarray:
     """(n,) the voxel of a baked tree that each voxel of `tree`, which was split so often, was or lies in."""
-    from efficientnerf.asset.cascades import voxel_cascades
-    from efficientnerf.asset.tree import voxel_coordinates
+    from efficientnerf.asset.cascades import voxel_cascades, voxel_coordinates
 
     return places(baked, voxel_coordinates(tree) >> splits, voxel_cascades(tree))

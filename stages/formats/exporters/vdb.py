@@ -59,8 +59,7 @@ def write_volume(tree: NerfTree, path: Path, frame: SourceFrame = CAPTURE_IS_Z_U
 
 def grids_of(tree: NerfTree, frame: SourceFrame, path: Path) -> list[Grid]:
     """Density and colour of each cascade that holds something."""
-    from efficientnerf.asset.cascades import cascade_tree, cascades_of
-    from efficientnerf.asset.tree import voxel_coordinates
+    from efficientnerf.asset.cascades import cascade_tree, cascades_of, voxel_coordinates
 
     if tree.ndc is not None:
         raise UsageError(f"{path}: the asset's grid is of normalised device coordinates, which no volume has. Export its points or a mesh instead.")

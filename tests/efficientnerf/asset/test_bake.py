@@ -11,8 +11,9 @@ from torch import Tensor
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_values
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.queries import density_at, density_block
-from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate

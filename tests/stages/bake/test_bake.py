@@ -16,10 +16,11 @@ import torch
 
 from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.file import serialisation
 from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
 from efficientnerf.asset.rendering import render
-from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.rendering.compositing import activate
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.executors.memory import Limit

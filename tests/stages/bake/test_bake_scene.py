@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import field_samples, format
-from efficientnerf.asset.cascades import cascade_sides, cascades_of, subset, voxel_cascades
+from efficientnerf.asset.cascades import cascade_sides, cascades_of, subset, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.file.serialisation import bytes_per_voxel
 from efficientnerf.asset.refinement import schedule
 from efficientnerf.asset.refinement.schedule import Phase
 from efficientnerf.asset.rendering import render
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training.exposure.model import exposure_of

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.bake import Visibility, chosen_voxels, grid_of
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.refinement.state import initial_state
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import NdcSpace
 from pipeline.stage import Job

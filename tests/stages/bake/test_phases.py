@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import format
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.refinement import fit, schedule, splitting
 from efficientnerf.asset.refinement.schedule import Phase, stated_schedule
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs
 from stages.bake import pruning

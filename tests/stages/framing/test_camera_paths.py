@@ -13,9 +13,9 @@ import av
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import REGIONS, Region
+from efficientnerf.asset.region import REGIONS
 from efficientnerf.asset.rendering import MOST_PIXELS, Rendering
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError

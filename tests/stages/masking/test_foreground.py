@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region
+from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import Foreground
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import BadInput, UsageError

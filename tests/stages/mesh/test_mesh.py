@@ -12,8 +12,7 @@ import pytest
 import trimesh
 
 from efficientnerf.asset import format
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.asset.tree import Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from efficientnerf.surface.mesh import Mesh
 from pipeline.errors import CorruptArtifact, Interrupted, StageFailed, UsageError

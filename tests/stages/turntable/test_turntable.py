@@ -128,8 +128,7 @@ def test_the_stage_reads_an_asset_file(tmp_path: Path) -> None:
 
 
 def test_the_foreground_is_shown_unless_all_is_asked_for_and_framed_in_both(tmp_path: Path) -> None:
-    from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import tree_from_voxels
+    from efficientnerf.asset.tree import Region, tree_from_voxels
 
     indices = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), -1).reshape(-1, 3)
     tree = tree_from_voxels((4, 4, 4), 0.125, np.full(3, -1.0), indices, np.full(len(indices), 400.0), np.zeros((len(indices), 1, 3)))

@@ -16,8 +16,7 @@ from PIL import Image
 
 from efficientnerf.asset import format, region
 from efficientnerf.asset.cascades import cascade_grids, nested
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS

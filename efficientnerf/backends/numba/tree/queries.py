@@ -13,8 +13,7 @@ from efficientnerf.backends.numba.tree.walk import TreeGrid, corner_voxels, walk
 from efficientnerf.rendering.harmonics import basis_numpy
 
 if TYPE_CHECKING:
-    from efficientnerf.asset.cascades import Cascade
-    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.asset.tree import Cascade, NerfTree
 
 BLOCK = 1024  # points per task
 STEP_BACK = 0.5  # voxels
