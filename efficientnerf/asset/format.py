@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors.numpy import save as save_tensors
 
 from efficientnerf.asset.cascades import brick_ranges, bricks_of, cascades_of, check_cascades
 from efficientnerf.asset.file import packed, whole_scene
@@ -32,8 +33,6 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
 
     layout  one of WRITERS; by default `compact` where the harmonics are codes already, else `sparse`
     """
-    from safetensors.numpy import save as save_tensors
-
     if tree.outer or tree.environment is not None:
         _check_whole(tree)
     written = written_as(tree, layout)

@@ -8,15 +8,12 @@ B bricks, N stored voxels.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from efficientnerf.asset.cascades import brick_ranges, cascades_of, subset, voxel_sides
 from efficientnerf.asset.tree import NerfTree, Region
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.geometry.cameras import Similarity
 
 REGIONS = ("foreground", "all")
 

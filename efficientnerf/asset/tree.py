@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.backends.numba.tree.leaps import leaps as distances
 from efficientnerf.geometry.ndc import WORLD, Frame, Ndc
 from efficientnerf.rendering.harmonics import harmonics_count
 
@@ -179,8 +180,6 @@ class NerfTree:
 
 def leaps(occupied: np.ndarray) -> np.ndarray:
     """`NerfTree.leap` of coarse cells (X, Y, Z) bool."""
-    from efficientnerf.backends.numba.tree.leaps import leaps as distances
-
     return distances(occupied)
 
 

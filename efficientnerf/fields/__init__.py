@@ -8,13 +8,12 @@ hash  multiresolution hash grid        mlp  the paper's networks        nerf  th
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor, nn
+import torch
+from torch import Tensor, nn
 
-    from efficientnerf.fields.gradient_buffer import GradientBuffer
+from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 
 class Field(Protocol):

@@ -16,48 +16,49 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset import format
+from efficientnerf.asset.bake import grid_of
+from efficientnerf.asset.cascades import voxel_cascades
+from efficientnerf.asset.components import foreground_bricks
+from efficientnerf.asset.refinement import schedule
+from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import Pixels
 from pipeline.errors import StageFailed
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs
+from stages.bake.economy import packed_tree
+from stages.bake.memory import refuse_more_than_fits, rows_for_baking
 from stages.bake.metadata import metadata_of, sources_of
+from stages.bake.plan import Plan
+from stages.bake.refine.refinement import refined
+from stages.bake.refine.timing import Stopwatch
+from stages.bake.resolution import baked_resolution, size_limits
 from stages.bake.settings import BakeSettings, refuse_nerf
+from stages.bake.values import baked_tree
+from stages.bake.voxels import choose_voxels, voxel_space, with_min_views
+from stages.bake.whole_scene import bounds_are_given, choose_scene_voxels, room_of
 from stages.compiling import compiling_kernels
-from stages.cores import use_all_cores
+from stages.cores import count_cores, use_all_cores
+from stages.evaluate.views import constant_background
+from stages.io import scene
+from stages.io.field_file import load_renderer
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import Scene
+from stages.scratch import note, noted
+from stages.train.data import pixels_of
 
 SIZE_NOTE = "size_limit.json"
 PSNR_BYTES = 16  # by which a header grows at most, once the PSNR of what is written is known
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.refinement.targets import Targets
-    from efficientnerf.training.pixels import Pixels
-    from stages.bake.plan import Plan
-    from stages.io.scene import Scene
-
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from stages.bake.refine.timing import Stopwatch
-
     stopwatch = Stopwatch()
-    from efficientnerf.asset import format
-    from efficientnerf.asset.cascades import voxel_cascades
-    from efficientnerf.asset.components import foreground_bricks
-    from efficientnerf.asset.refinement import schedule
-    from stages.bake.economy import packed_tree
-    from stages.bake.memory import refuse_more_than_fits, rows_for_baking
-    from stages.bake.refine.refinement import refined
-    from stages.bake.values import baked_tree
-    from stages.bake.whole_scene import bounds_are_given
-    from stages.evaluate.views import constant_background
-    from stages.io import scene
-    from stages.io.field_file import load_renderer
-    from stages.io.refined_cameras import load_scene
-    from stages.train.data import pixels_of
 
     settings: BakeSettings = job.settings
     use_all_cores()
@@ -99,10 +100,6 @@ def run(job: Job) -> None:
 def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> float:
     """MiB that voxels are chosen by; where the size is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other
     cores."""
-    from stages.bake.resolution import size_limits
-    from stages.cores import count_cores
-    from stages.scratch import note, noted
-
     settings: BakeSettings = job.settings
     seconds = given(settings.time_budget)
     mib, timed = size_limits(settings, s, job.device, count_cores(), whole=whole, discretise=discretise)
@@ -119,8 +116,6 @@ def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> f
 
 def _room(settings: BakeSettings, m: Any, plan: Plan, mib: float, splits: int) -> int:
     """How many voxels the asset holds on the plan's grids once they were split so often."""
-    from stages.bake.whole_scene import room_of
-
     finer = 2**splits
     grids = [((x * finer, y * finer, z * finer), voxel / finer, low) for (x, y, z), voxel, low in plan.grids]
     return room_of(settings, m, grids, mib, environment=plan.samples is not None)
@@ -128,12 +123,6 @@ def _room(settings: BakeSettings, m: Any, plan: Plan, mib: float, splits: int) -
 
 def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: float, splits: int, *, whole: bool) -> Plan:
     """The voxels to bake, which will be split so often: cascades of a whole scene, or else one grid of what lies in the field's box."""
-    from efficientnerf.asset.bake import grid_of
-    from stages.bake.plan import Plan
-    from stages.bake.resolution import baked_resolution
-    from stages.bake.voxels import choose_voxels, voxel_space, with_min_views
-    from stages.bake.whole_scene import choose_scene_voxels
-
     space = voxel_space(job, m)
     if whole:
         return choose_scene_voxels(job, m, s, pixels, space, mib, splits)
@@ -159,7 +148,4 @@ def _check(job: Job, m: Any, plan: Plan) -> None:
 
 def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
     """What the tree is fitted to."""
-    from efficientnerf.asset.refinement.targets import Targets
-    from stages.evaluate.views import constant_background
-
     return Targets(pixels, constant_background(s), plan.environment, reaches_infinity=plan.space.reaches_infinity)

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from efficientnerf.evaluation.lpips import Lpips
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.evaluation.lpips import SMALLEST, Lpips
+from efficientnerf.evaluation.metrics import colour_fitted, psnr, ssim
+from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
@@ -36,6 +37,7 @@ from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
 from stages.evaluate.splats import EvaluatedSplats, splats_image, splats_metrics
 from stages.evaluate.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluate.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
+from stages.figures.plots import error_map, to_uint8
 from stages.io.scene import Scene, View
 from stages.train.averaged import Taken
 
@@ -60,8 +62,6 @@ def evaluate_view(
     points      that the asset's depth is compared with
     taken       `stages.train.averaged.as_taken`
     """
-    from stages.figures.plots import error_map, to_uint8
-
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     shown = partial(as_shown, job, view, taken)
     unbounded = constant_background(scene) is None
@@ -154,8 +154,6 @@ def floating(
     used    (H, W) bool, pixels that count
     excess  (H, W) the asset's squared error less the network's
     """
-    from efficientnerf.geometry.cameras import rays
-
     step = 1
     while len(range(0, camera.height, step)) * len(range(0, camera.width, step)) > FLOATER_RAYS:
         step += 1
@@ -178,8 +176,6 @@ def _share(part: np.ndarray, whole: np.ndarray) -> float | None:
 
 def lpips_metrics(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
     """LPIPS by name; None for images too small for the networks."""
-    from efficientnerf.evaluation.lpips import SMALLEST
-
     large = min(image.shape[:2]) >= SMALLEST
     return {name: metric(image, truth.colour, truth.mask) if large else None for name, metric in perceptual.items()}
 
@@ -191,8 +187,6 @@ def sample_shares(counts: Any) -> dict[str, float]:
 
 def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) -> dict[str, float | None]:
     """The figures of QUALITY; None where no pixel, or no whole SSIM window, can be compared."""
-    from efficientnerf.evaluation.metrics import colour_fitted, psnr, ssim
-
     used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
     boxed = None if inside is None else used & inside
     windows = used[5:-5, 5:-5]

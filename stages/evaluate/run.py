@@ -24,10 +24,12 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset import format
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.settings import given
 from pipeline.files import read_json, write_json
 from pipeline.stage import Job
@@ -47,12 +49,15 @@ from stages.evaluate.summary import in_words, quality, summary
 from stages.evaluate.trivial import BLURS
 from stages.evaluate.video import write_captured_path
 from stages.evaluate.views import constant_background, evaluation_views, evenly_spaced, stride_for
-from stages.io.scene import View
+from stages.figures.plots import contact_sheet, thumbnail_of
+from stages.io.field_file import load_renderer
+from stages.io.png import read_png, write_png
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import View, load
+from stages.memory.need import Need, refuse_what_does_not_fit
+from stages.memory.rendering import views_needed
 from stages.scratch import note, noted, once
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from stages.memory.need import Need
+from stages.train.averaged import as_taken
 
 SHEET_ROWS = 8
 THUMBNAIL = 320  # pixels, longest side
@@ -63,14 +68,9 @@ Measured = str | float | dict[str, int | float | list[float] | None] | None  # t
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from efficientnerf.asset import format
-    from stages.memory.need import refuse_what_does_not_fit
-
     inputs = inputs_of(EvaluateInputs, job.inputs)
 
     def load_field() -> Any:
-        from stages.io.field_file import load_renderer
-
         return load_renderer(inputs.train.folder, job.device)
 
     tree = format.load(inputs.bake.asset).to(job.device)
@@ -81,9 +81,6 @@ def run(job: Job) -> None:
 
 def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
     """What comparing its views with photographs takes of memory."""
-    from stages.io.scene import load
-    from stages.memory.rendering import views_needed
-
     cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
     scale = given(settings.field_image_scale)
     most = max(camera.width * camera.height for camera in cameras)
@@ -105,9 +102,6 @@ def evaluate(
     splats      the same
     refinement  of the asset, `refinement_of`
     """
-    from stages.io.refined_cameras import load_scene
-    from stages.train.averaged import as_taken
-
     settings: EvaluateSettings = job.settings
     scene = load_scene(job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage])
     views, split = evaluation_views(scene)
@@ -168,8 +162,6 @@ def _check(
     composited  whether there are metrics of the asset over the field's surroundings, too
     others      of "splats" and "sparse_points" those that there are
     """
-    from stages.io.png import read_png
-
     names = {*QUALITY, "width", "height", *perceptual}
     asset, network = measured["asset"], measured["network"]
     if measured["name"] != view.name or not names <= asset.keys() or with_field == (network is None):
@@ -200,9 +192,6 @@ def _thumbnails(folder: Path, k: int) -> list[Path]:
 
 
 def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> list[Path]:
-    from stages.figures.plots import thumbnail_of
-    from stages.io.png import write_png
-
     paths = _thumbnails(folder, k)
     for path, image in zip(paths, images, strict=True):
         write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), path, durable=False)
@@ -210,9 +199,6 @@ def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> list
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
-    from stages.figures.plots import contact_sheet
-    from stages.io.png import read_png
-
     shown = [drawn[k] for k in evenly_spaced(len(drawn), SHEET_ROWS)]
     rows = [[read_png(path) for path in _thumbnails(job.work, k)] for k in shown]
     labels = []

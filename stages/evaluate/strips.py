@@ -22,6 +22,8 @@ from stages.evaluate.comparison import as_shown, compare
 from stages.evaluate.mesh import EvaluatedMesh, mesh_image
 from stages.evaluate.summary import quality
 from stages.evaluate.views import ground_truth, stride_for, subsample, subsample_camera
+from stages.figures.plots import contact_sheet
+from stages.io.png import read_png
 from stages.io.scene import Scene, View
 from stages.scratch import Warn, note, noted
 from stages.train.averaged import Taken
@@ -68,8 +70,6 @@ def write_strips(
 def _write_strip(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
 ) -> dict[str, Any]:
-    from stages.figures.plots import contact_sheet
-
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     seen = field.render(subsample_camera(view.camera, stride), progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach)
     truth = truth.subsampled(stride)
@@ -87,8 +87,6 @@ def _write_strip(
 
 def _check(picture: Path, view: View, entry: Mapping[str, Any], outputs: Collection[str]) -> None:
     """Raises where this is no strip of the view, or its picture is missing or can't be read."""
-    from stages.io.png import read_png
-
     names = ("network", "asset", "mesh")
     if entry["view"] != view.name or not all({*FIGURES} <= entry[name].keys() for name in names) or min(entry["width"], entry["height"]) < 1:
         raise ValueError("no strip of this view")

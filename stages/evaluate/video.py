@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from efficientnerf.asset.rendering import Rendering
+from efficientnerf.capture.captured_path import captured_cameras
+from efficientnerf.geometry.cameras import Camera
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs
 from stages.evaluate.asset import EvaluatedAsset
+from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.io.scene import Scene
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.rendering import Rendering
-    from efficientnerf.geometry.cameras import Camera
 
 LONGEST = 480  # pixels, the longer side of the video
 FPS, CRF = 15, 20
@@ -23,11 +25,6 @@ def write_captured_path(asset: EvaluatedAsset, tree: Any, scene: Scene, frames: 
 
     tree  the asset's, whose metadata frames need
     """
-    import numpy as np
-
-    from efficientnerf.capture.captured_path import captured_cameras
-    from stages.figures.frames import RenderOptions, encode_frames, render_frames
-
     behind = scene.background or asset.behind
 
     def draw(tree: Any, camera: Camera, **more: Any) -> Rendering:

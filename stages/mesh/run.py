@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.format import load
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.settings import given
+from efficientnerf.surface.agreement import AssetView
+from efficientnerf.surface.isosurface import NoSurface
+from efficientnerf.surface.mesh import Mesh, face_areas, face_volumes, moved, topology
+from efficientnerf.surface.nested import scene_surface
 from pipeline.errors import StageFailed
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
 from stages.compiling import compiling_kernels
+from stages.figures.shading import IN_FRONT, render_sides
+from stages.formats.exporters import MESH_EXPORTERS
+from stages.formats.exporters.writing import SourceFrame, source_frame
+from stages.framing.restriction import restricted
+from stages.io.png import write_png
+from stages.memory.need import Need, refuse_what_does_not_fit
 from stages.mesh.check import asset_views, checked, level_of, shown_by, warning_of
+from stages.mesh.files import write_empty_meshes
+from stages.mesh.memory import surface_needed
 from stages.mesh.settings import MeshSettings, refuse_normal_map_without_texture
 from stages.mesh.texture import facts_of, largest_photograph, textured, with_relief
 from stages.mesh.timing import Stopwatch
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree, Region
-    from efficientnerf.surface.agreement import AssetView
-    from efficientnerf.surface.mesh import Mesh
-    from stages.formats.exporters.writing import SourceFrame
-    from stages.memory.need import Need
-
 
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
 STEPS = 500  # of the progress of each
@@ -44,9 +50,6 @@ def mesh_of(
     region  that the surface is clipped to
     dense   is given vertices and faces as they were before decimation
     """
-    from efficientnerf.surface.isosurface import NoSurface
-    from efficientnerf.surface.nested import scene_surface
-
     progress = whole_progress(progress, 1 + len(tree.outer))
     seen, fused = asset_views(tree, progress)
     if views is not None:
@@ -79,8 +82,6 @@ def mesh_of(
 
 def nothing(why: str) -> Mesh:
     """A mesh without faces."""
-    from efficientnerf.surface.mesh import Mesh
-
     return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.float32), {"no_surface": why})
 
 
@@ -118,18 +119,12 @@ def remedy(stage: str, threshold: float | None) -> str:
 
 def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:
     """A mesh of the training frame in the capture's."""
-    from efficientnerf.surface.mesh import moved
-
     back = frame.world_from_capture.inverse()
     return moved(mesh, back.scale, back.rotation, back.translation)
 
 
 def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
     """The report of a mesh in the capture's frame: counts, topology, bounds, area, volume, settings."""
-    from dataclasses import asdict
-
-    from efficientnerf.surface.mesh import face_areas, face_volumes, topology
-
     found = topology(mesh.vertices, mesh.faces)
     return {
         "vertices": len(mesh.vertices),
@@ -148,8 +143,6 @@ def preview_of(mesh: Mesh, metadata: Mapping[str, Any], *, clipped: bool) -> np.
 
     clipped  whether the mesh ends at a region's border. One that does not may reach far behind its subject: then the nearest four fifths are shown
     """
-    from stages.figures.shading import IN_FRONT, render_sides
-
     orbit = metadata.get("orbit", {})
     heading, elevation = float(orbit.get("heading", 0.0)), float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
     if not orbit.get("forward_facing", False):
@@ -159,9 +152,6 @@ def preview_of(mesh: Mesh, metadata: Mapping[str, Any], *, clipped: bool) -> np.
 
 def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: SourceFrame, job: Job) -> None:
     """The files of a mesh without faces, and a warning: what else a run makes of its asset does not depend on there being one."""
-    from stages.io.png import write_png
-    from stages.mesh.files import write_empty_meshes
-
     write_empty_meshes(outputs, frame)
     agreed, picture = checked(mesh, seen, job.safe_point)
     for path in (outputs.preview, outputs.check):
@@ -173,21 +163,12 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
 
 def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
     """What meshing and texturing it take of memory."""
-    from stages.mesh.memory import surface_needed
-
     texture = 0 if settings.texture == "off" else settings.texture_size
     return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
 
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from efficientnerf.asset.format import load
-    from stages.formats.exporters import MESH_EXPORTERS
-    from stages.formats.exporters.writing import source_frame
-    from stages.framing.restriction import restricted
-    from stages.io.png import write_png
-    from stages.memory.need import refuse_what_does_not_fit
-
     outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
     refuse_normal_map_without_texture(settings)
     watch = Stopwatch()

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from efficientnerf.asset.format import load
+from efficientnerf.asset.tree import Region
 from efficientnerf.settings import given
+from efficientnerf.surface.isosurface import NoSurface
+from efficientnerf.surface.mesh import PointCloud
+from efficientnerf.surface.nested import scene_points
 from pipeline.errors import StageFailed
 from pipeline.stage import Job
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of
 from stages.compiling import compiling_kernels
+from stages.formats.exporters import POINT_EXPORTERS
+from stages.formats.exporters.writing import SourceFrame, source_frame
+from stages.framing.restriction import restricted
+from stages.memory.need import refuse_what_does_not_fit
 from stages.mesh.check import asset_views, level_of, shown_by
+from stages.mesh.memory import surface_needed
 from stages.mesh.run import PARTS, orbit_points, remedy, whole_progress
 from stages.points.settings import PointsSettings
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import Region
-    from efficientnerf.surface.mesh import PointCloud
-    from stages.formats.exporters.writing import SourceFrame
 
 
 def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None], region: Region | None = None) -> PointCloud:
@@ -25,10 +30,6 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
 
     Raises StageFailed where there is none; `progress` takes (done, total, text).
     """
-    from efficientnerf.surface.isosurface import NoSurface
-    from efficientnerf.surface.mesh import PointCloud
-    from efficientnerf.surface.nested import scene_points
-
     progress = whole_progress(progress, 1 + len(tree.outer))
     views, fused = asset_views(tree, progress)
 
@@ -57,13 +58,6 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from efficientnerf.asset.format import load
-    from stages.formats.exporters import POINT_EXPORTERS
-    from stages.formats.exporters.writing import source_frame
-    from stages.framing.restriction import restricted
-    from stages.memory.need import refuse_what_does_not_fit
-    from stages.mesh.memory import surface_needed
-
     whole = load(inputs_of(PointsInputs, job.inputs).bake.asset)
     tree = restricted(whole, job.settings.region)
     frame = source_frame(tree.metadata)

@@ -11,7 +11,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from efficientnerf.geometry.cameras import resized
 from efficientnerf.settings import given
@@ -20,28 +22,27 @@ from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.cores import count_cores, in_order
+from stages.figures.contact_sheet import write_contact_sheet
 from stages.formats import importers
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
+from stages.framing import training_frame
+from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
+from stages.io import working_images
 from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
+from stages.io.pictures import UnreadableImage
 from stages.io.scene import SPLITS, Scene, View, save, save_points
+from stages.io.silhouettes import SmallPictures
+from stages.masking.photographs import cameras_of_photographs, mask_choice, masks_made_for
+from stages.masking.polarity import capture_kept_white
+from stages.poses.memory import reading_threads, refuse_large_photographs
 from stages.poses.settings import PosesSettings
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from stages.io.silhouettes import SmallPictures
+from stages.verdict.writing import judge
 
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
 
 
 def run(job: Job) -> None:
     """Write scene.json, images/, masks/, points.safetensors, verdict.json, pictures and report.json. Raises BadInput."""
-    from stages.figures.contact_sheet import write_contact_sheet
-    from stages.framing import training_frame
-    from stages.io.silhouettes import SmallPictures
-    from stages.poses.memory import refuse_large_photographs
-    from stages.verdict.writing import judge
-
     settings: PosesSettings = job.settings
     if job.source is None:
         raise BadInput("the poses stage needs a source: name a folder of photographs, a video, or a posed data set.")
@@ -111,10 +112,6 @@ def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
-    from stages.masking.foreground import with_foreground_masks
-    from stages.masking.photographs import cameras_of_photographs, masks_made_for
-    from stages.masking.polarity import capture_kept_white
-
     assert job.source is not None
     possible = _formats(job, settings)
     name = possible[0]
@@ -130,6 +127,8 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     else:
         capture = cameras_of_photographs(job, warn)
     if settings.mask_from == FOREGROUND:
+        from stages.masking.foreground import with_foreground_masks  # trains a field, for which the stage needs no torch else
+
         capture = with_foreground_masks(job, capture, warn)
     if settings.strict and capture.rejected:
         which = abbreviated([f"{image} ({why})" for image, why in capture.rejected])
@@ -154,9 +153,6 @@ def _format_of(capture: Capture) -> str:
 
 def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
     """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
-    from stages.framing.mask_use import doubts, find_mask_use, without_silhouette
-    from stages.masking.photographs import mask_choice
-
     renders = _may_be_renders(capture)
     use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, small, job.safe_point)
     for sentence in use.sentences:
@@ -175,10 +171,6 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
 
 def with_points_of_object(capture: Capture, small: SmallPictures) -> Capture:
     """Without the sparse points that lie outside of silhouettes."""
-    import numpy as np
-
-    from stages.framing.mask_use import points_of_object
-
     if not capture.silhouettes or capture.points is None:
         return capture
     return replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, small))))
@@ -190,10 +182,6 @@ def _may_be_renders(capture: Capture) -> bool:
 
 def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[Any]]:
     """Write the working images. Returns the capture without the images that cannot be decoded, and what was written for the others."""
-    from stages.io import working_images
-    from stages.io.pictures import UnreadableImage
-    from stages.poses.memory import reading_threads
-
     relative = working_images.image_paths([photo.camera for photo in capture.photos])
     how: dict[str, Any] = {"max_side": job.settings.max_image_size, "silhouettes": capture.silhouettes, "may_be_empty": _may_be_renders(capture)}
     kept: list[int] = []

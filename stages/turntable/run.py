@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from efficientnerf.asset import format
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import given
 from pipeline.stage import Job
 from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of
 from stages.compiling import compiling_kernels
+from stages.figures.frames import RenderOptions, encode_frames, render_frames
+from stages.framing.camera_paths import turntable_cameras
+from stages.framing.restriction import restricted
+from stages.memory.need import refuse_what_does_not_fit
+from stages.memory.rendering import frames_needed
 from stages.scratch import Warn
 from stages.turntable.settings import TurntableSettings
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
 
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from efficientnerf.asset import format
-    from stages.framing.restriction import restricted
-    from stages.memory.need import refuse_what_does_not_fit
-    from stages.memory.rendering import frames_needed
-
     s: TurntableSettings = job.settings
     whole = format.load(inputs_of(TurntableInputs, job.inputs).bake.asset)
     cameras, tree = cameras_of(whole, s, job.warn), restricted(whole, s.region).to(job.device)
@@ -36,8 +35,6 @@ def run(job: Job) -> None:
 def cameras_of(tree: Any, s: TurntableSettings, warn: Warn = lambda text: None) -> list[Camera]:
     """The cameras of the turntable's frames; `tree` has the interface of a NerfTree, with its region. A warning for each setting that their path has no use
     for."""
-    from stages.framing.camera_paths import turntable_cameras
-
     return turntable_cameras(
         tree, frames=s.frames, width=s.width, height=s.height, elevation=given(s.elevation), radius=given(s.radius), fov=given(s.fov), sway=given(s.sway),
         path=s.path, surroundings=s.region == "all" and tree.region is not None,
@@ -47,8 +44,6 @@ def cameras_of(tree: Any, s: TurntableSettings, warn: Warn = lambda text: None) 
 
 def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None, cameras: Sequence[Camera] | None = None) -> None:
     """Write frames and video, of the tree as it is. Frames are kept in job.work, so that a kill costs at most one; the video is encoded from the PNGs."""
-    from stages.figures.frames import RenderOptions, encode_frames, render_frames
-
     s: TurntableSettings = job.settings
     cameras = cameras_of(tree, s) if cameras is None else cameras
     options = RenderOptions(background=s.background, supersample=s.supersample, exr=s.exr, fps=s.fps, crf=s.crf)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 
 from efficientnerf.geometry.cameras import Camera, project, rays
 from pipeline.errors import BadInput
@@ -115,8 +116,6 @@ def read_depth(found: DepthFile, photo: Photo) -> np.ndarray:
 
 def _exr(path: Path) -> np.ndarray:
     """(H, W) float32, the one channel of an OpenEXR file, or its R, Y or Z. Raises UnreadableImage."""
-    import OpenEXR
-
     data, said = read_bytes(path, LARGEST_EXR), io.StringIO()
     try:
         with contextlib.redirect_stdout(said):  # it prints what is wrong with a file

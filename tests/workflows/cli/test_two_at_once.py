@@ -11,8 +11,8 @@ from pipeline.errors import RunLocked
 from pipeline.manifest import read_manifest
 from pipeline.run import Run
 from tests.workflows.command import Enerf
-from workflows.asset import Workflow
 from workflows.cli.request import Options, plan_run
+from workflows.workflow import Workflow
 
 
 def recorded(run: Path) -> dict[str, dict[str, object]]:
