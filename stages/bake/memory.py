@@ -14,8 +14,9 @@ from efficientnerf.asset.file.serialisation import most_voxels
 from efficientnerf.asset.refinement.error_map import MAX_CELLS
 from efficientnerf.asset.refinement.fit import PATCH_SIDE
 from efficientnerf.geometry.spaces import Space
+from efficientnerf.model import Model
 from efficientnerf.settings import given
-from efficientnerf.training.pixels import PixelRows
+from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
@@ -75,7 +76,7 @@ def free_on_device(device: str) -> int:
 
 
 def needed(
-    settings: BakeSettings, trained: Any, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool,
+    settings: BakeSettings, trained: TrainSettings, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool,
     whole: bool, device: str,
 ) -> Need:  # fmt: skip
     """What baking takes.
@@ -101,7 +102,7 @@ def needed(
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
@@ -140,7 +141,7 @@ def most_needed(
 def _finest_cells(settings: BakeSettings, trained: Trained, s: Scene, *, whole: bool) -> tuple[int, int]:
     """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
     bounds, discretise = trained.space.bounds, given(trained.settings.discretise)
-    finest = finest_choice(settings, trained, s).resolution
+    finest = finest_choice(settings, trained.settings, s).resolution
     if not whole:
         return finest, math.prod(grid_of(bounds, finest, settings.brick_size)[0])
     count = given(settings.cascades) or MAX_CASCADES
@@ -149,7 +150,7 @@ def _finest_cells(settings: BakeSettings, trained: Trained, s: Scene, *, whole: 
     return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
-def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
+def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: Pixels, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
     pixels        as they were placed

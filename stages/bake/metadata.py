@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.capture.forward_facing import ForwardFacing
+from efficientnerf.model import Model
 from pipeline.hashes import sha256_of
 from pipeline.stage import Job
 from stages.artifacts import BakeInputs, inputs_of
@@ -22,7 +23,7 @@ def sources_of(job: Job) -> dict[str, str]:
     return {path.name: sha256_of(path) for path in (inputs.poses.scene, inputs.train.field)}
 
 
-def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
+def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:
     """What an asset needs to be used without its run."""
     try:
         tool = version("efficientnerf")

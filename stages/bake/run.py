@@ -26,6 +26,7 @@ from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.asset.components import foreground_bricks
 from efficientnerf.asset.refinement import schedule
 from efficientnerf.asset.refinement.targets import Targets
+from efficientnerf.model import Model
 from efficientnerf.settings import given
 from efficientnerf.training.pixels import Pixels
 from pipeline.errors import StageFailed
@@ -114,14 +115,14 @@ def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> f
     return timed
 
 
-def _room(settings: BakeSettings, m: Any, plan: Plan, mib: float, splits: int) -> int:
+def _room(settings: BakeSettings, m: Model, plan: Plan, mib: float, splits: int) -> int:
     """How many voxels the asset holds on the plan's grids once they were split so often."""
     finer = 2**splits
     grids = [((x * finer, y * finer, z * finer), voxel / finer, low) for (x, y, z), voxel, low in plan.grids]
     return room_of(settings, m, grids, mib, environment=plan.samples is not None)
 
 
-def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: float, splits: int, *, whole: bool) -> Plan:
+def _plan(job: Job, m: Model, s: Scene, pixels: Pixels, mib: float, splits: int, *, whole: bool) -> Plan:
     """The voxels to bake, which will be split so often: cascades of a whole scene, or else one grid of what lies in the field's box."""
     space = voxel_space(job, m)
     if whole:
@@ -133,7 +134,7 @@ def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: float, splits: int, *
     return Plan(choice, space, [(shape, voxel, np.asarray(space.bounds[0], np.float64))], [indices], len(visibility.cells))
 
 
-def _check(job: Job, m: Any, plan: Plan) -> None:
+def _check(job: Job, m: Model, plan: Plan) -> None:
     """Say what is baked; StageFailed where nothing is."""
     resolution = plan.choice.resolution
     if job.settings.lookup == "nearest" and m.settings.discretise not in ("off", resolution):

@@ -15,6 +15,7 @@ from efficientnerf.asset.cascades import nested
 from efficientnerf.asset.field_samples import density_as_seen
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.spaces import Space
+from efficientnerf.model import Model
 from pipeline.stage import Job
 from stages.bake.plan import Plan
 from stages.bake.scratch import read_arrays, write_arrays
@@ -24,7 +25,7 @@ from stages.scratch import once, unusable
 
 
 def baked_values(
-    job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space, name: str = "block"
+    job: Job, m: Model, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space, name: str = "block"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Density (N,) and harmonics (N, K, 3) of voxels (N, 3); blocks of an earlier attempt are read.
 
@@ -56,7 +57,7 @@ def baked_values(
     return density, sh
 
 
-def baked_tree(job: Job, m: Any, s: Scene, plan: Plan, metadata: dict[str, Any]) -> NerfTree:
+def baked_tree(job: Job, m: Model, s: Scene, plan: Plan, metadata: dict[str, Any]) -> NerfTree:
     """The tree with the field's values."""
     settings: BakeSettings = job.settings
     trees = []

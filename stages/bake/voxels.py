@@ -6,7 +6,6 @@ N voxels.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,10 @@ from efficientnerf.asset.bake import Visibility
 from efficientnerf.asset.file import serialisation
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import NdcSpace, Space
+from efficientnerf.model import Model
 from efficientnerf.settings import given
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job
 from stages.bake.resolution import MIN_RESOLUTION, Choice, affordable_resolution, baked_resolution, finest_resolution, refuse_without_room
 from stages.bake.scratch import read_arrays, write_arrays
@@ -39,7 +40,7 @@ def well_seen_views(count: int) -> int:
 
 
 
-def voxel_space(job: Job, m: Any) -> Space:
+def voxel_space(job: Job, m: Model) -> Space:
     """The field's space, in a frame where voxels are cubes."""
     depth, discretise, space = given(job.settings.ndc_voxel_depth), given(m.settings.discretise), m.space
     if not isinstance(space, NdcSpace):
@@ -53,7 +54,7 @@ def voxel_space(job: Job, m: Any) -> Space:
     return space if depth == 1 else space.with_voxel_depth(depth)
 
 
-def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
+def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
     """The asset's resolution; the visibility of the voxels to bake, which will be split so often to have it, and their coordinates (N, 3)."""
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick_size
@@ -62,7 +63,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
         shape, _ = bake.grid_of(bounds, resolution, brick)
         return serialisation.most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, shape, brick)
 
-    finest = choice = finest_choice(settings, m, s)
+    finest = choice = finest_choice(settings, m.settings, s)
     fixed = (given(settings.resolution) or given(m.settings.discretise)) is not None
     least = finest.resolution if fixed else MIN_RESOLUTION
     refuse_without_room(settings, mib, least, room(least), environment=False)
@@ -117,16 +118,16 @@ def seen_by_few(job: Job, s: Scene, ndc: Ndc, points: np.ndarray) -> np.ndarray:
     return count_views(ndc.world(points), [view.camera for view in views], kept_pixels(job.inputs["poses"], views)) < well_seen_views(len(views))
 
 
-def finest_choice(settings: BakeSettings, m: Any, s: Scene) -> Choice:
+def finest_choice(settings: BakeSettings, trained: TrainSettings, s: Scene) -> Choice:
     """The resolution that is stated, or else the finest in question."""
     stated: int | None = given(settings.resolution)
-    discretise: int | None = given(m.settings.discretise)
+    discretise: int | None = given(trained.discretise)
     if (fixed := stated or discretise) is not None:
         return Choice(fixed, "bake.resolution" if stated else "train.discretise")
     return finest_resolution(s, given(settings.max_resolution))
 
 
-def _visibility(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visibility:
+def _visibility(job: Job, m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visibility:
     """The visibility of voxels, computed or from an earlier attempt."""
     settings: BakeSettings = job.settings
     kinds = {"cells": ("int64", 1), "greatest": ("float32", 2)}
@@ -176,7 +177,7 @@ def just_below(weight: np.float32) -> float:
 CENTRES_PER_BLOCK = 2**20
 
 
-def with_min_views(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
+def with_min_views(m: Model, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
     """The voxels that at least train.min_views training images have in view, in contracted scenes. The density voxels, which training masked
     elsewhere (`stages.framing.view_coverage`), are larger, and what they hold would stick out as a rim."""
     if not m.space.contracted or m.settings.min_views == "off":

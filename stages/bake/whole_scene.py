@@ -13,7 +13,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from efficientnerf.asset.file.serialisation import most_voxels
 from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_foreground
 from efficientnerf.geometry.spaces import Space
+from efficientnerf.model import Model
 from efficientnerf.settings import given
 from efficientnerf.training.pixels import Pixels
 from pipeline.errors import BadInput, CorruptArtifact
@@ -76,7 +76,7 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
     return [np.stack([low, low + np.asarray(shape) * brick * voxel]) for shape, voxel, low in grids]
 
 
-def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> Plan:
+def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> Plan:
     """The cascades, their voxels, which will be split so often, the region and the environment."""
     settings: BakeSettings = job.settings
     stated, discretise = given(settings.resolution), given(m.settings.discretise)
@@ -124,7 +124,7 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
     return Plan(choice, space, grids, indices, sum(len(one.cells) for one in seen), weights, samples, region, environment)
 
 
-def room_of(settings: BakeSettings, m: Any, grids: Sequence[Grid], mib: float, *, environment: bool = True) -> int:
+def room_of(settings: BakeSettings, m: Model, grids: Sequence[Grid], mib: float, *, environment: bool = True) -> int:
     """How many voxels an asset of so many MiB holds, beside the cells of these grids and an environment map."""
     cells = sum(math.prod(shape) for shape, _, _ in grids)
     rows = settings.environment_size if environment else 0
@@ -204,7 +204,7 @@ def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], ind
     return indices
 
 
-def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
+def keep_clear(job: Job, m: Model, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
     """The voxels that are not close to the path of the training cameras, and that are not poorly seen."""
     views = scene.views_of(s, "train")
     masks, filled = kept_pixels(job.inputs["poses"], views), filled_points(job.inputs["poses"], len(views))
@@ -223,7 +223,7 @@ def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> n
     return indices[np.concatenate(kept)] if kept else indices
 
 
-def _samples(job: Job, m: Any, pixels: Pixels) -> FieldSamples:
+def _samples(job: Job, m: Model, pixels: Pixels) -> FieldSamples:
     """The field's samples, taken or from an earlier attempt."""
     settings: BakeSettings = job.settings
     stored = read_arrays(job.work / "samples", KINDS, job.warn)

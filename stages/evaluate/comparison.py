@@ -27,6 +27,7 @@ import torch
 from efficientnerf.evaluation.lpips import SMALLEST, Lpips
 from efficientnerf.evaluation.metrics import colour_fitted, psnr, ssim
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
@@ -50,7 +51,7 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 
 def evaluate_view(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: FieldRenderer | None, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
     perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: ReliablePoints | None = None,
     taken: Taken | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
@@ -68,7 +69,7 @@ def evaluate_view(
     metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
     images: list[np.ndarray] = []
     seen = None
-    if with_field or (unbounded and asset.inner is None):
+    if field is not None and (with_field or (unbounded and asset.inner is None)):
         small_camera = subsample_camera(view.camera, stride)
         limits = asset.limits if with_field else None
         seen = field.render(small_camera, progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach, limits=limits)

@@ -30,6 +30,7 @@ import numpy as np
 
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.settings import given
 from pipeline.files import read_json, write_json
 from pipeline.stage import Job
@@ -70,7 +71,7 @@ Measured = str | float | dict[str, int | float | list[float] | None] | None  # t
 def run(job: Job) -> None:
     inputs = inputs_of(EvaluateInputs, job.inputs)
 
-    def load_field() -> Any:
+    def load_field() -> FieldRenderer:
         return load_renderer(inputs.train.folder, job.device)
 
     tree = format.load(inputs.bake.asset).to(job.device)
@@ -91,7 +92,7 @@ def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, d
 
 
 def evaluate(
-    asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job, mesh: EvaluatedMesh, splats: EvaluatedSplats | None = None,
+    asset: EvaluatedAsset, tree: NerfTree, load_field: Callable[[], FieldRenderer], job: Job, mesh: EvaluatedMesh, splats: EvaluatedSplats | None = None,
     refinement: Mapping[str, int] | None = None,
 ) -> None:
     """Write metrics, pictures and video. Metrics and thumbnails of each view are kept in job.work, so that a kill costs at most one view.

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs, PosesOutputs
 from stages.evaluate.asset import EvaluatedAsset, render_asset
@@ -42,7 +43,7 @@ def strip_views(figures: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
 
 
 def write_strips(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, load_field: Callable[[], Any], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]],
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, load_field: Callable[[], FieldRenderer], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]],
     job: Job, warn: Warn, taken: Taken | None = None,
 ) -> list[dict[str, Any]]:
     """Write the strips of the chosen views; returns their entries of metrics.json. A strip is kept in job.work, so that a kill costs at most one."""
@@ -68,7 +69,7 @@ def write_strips(
 
 
 def _write_strip(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: FieldRenderer, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
 ) -> dict[str, Any]:
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     seen = field.render(subsample_camera(view.camera, stride), progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach)

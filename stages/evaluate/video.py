@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset.rendering import Rendering
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.capture.captured_path import captured_cameras
 from efficientnerf.geometry.cameras import Camera
 from pipeline.stage import Job
@@ -20,14 +21,14 @@ LONGEST = 480  # pixels, the longer side of the video
 FPS, CRF = 15, 20
 
 
-def write_captured_path(asset: EvaluatedAsset, tree: Any, scene: Scene, frames: int, job: Job) -> None:
+def write_captured_path(asset: EvaluatedAsset, tree: NerfTree, scene: Scene, frames: int, job: Job) -> None:
     """Write the video. Frames are kept in job.work, so that a kill costs at most one.
 
     tree  the asset's, whose metadata frames need
     """
     behind = scene.background or asset.behind
 
-    def draw(tree: Any, camera: Camera, **more: Any) -> Rendering:
+    def draw(tree: NerfTree, camera: Camera, **more: Any) -> Rendering:
         rendering: Rendering = asset.render(camera, background=behind, **more)
         return replace(rendering, opacity=np.ones_like(rendering.opacity))  # whatever is behind has been drawn
 

@@ -139,7 +139,7 @@ def _baking(own: Any, run: Path) -> int:
     _, mib = size_limits(own, s, "cpu", count_cores(), whole=whole, discretise=given(m.settings.discretise))
     voxels = int(MAX_OVERSHOOT * most_voxels(int(mib * MIB), own.layout, m.fine.degree, (1, 1, 1), own.brick_size))
     if not whole and s.forward is None:  # surfaces have as many as their area; density voxels that show are around them
-        finest, side = finest_choice(own, m, s).resolution, len(m.voxels.values)
+        finest, side = finest_choice(own, m.settings, s).resolution, len(m.voxels.values)
         voxels = min(voxels, finest**3, math.ceil(int(m.voxels.count_occupied()) * max(1.0, finest / side) ** 2))
     values = 4 * (1 + 3 * harmonics_count(m.fine.degree))
     return (values + 2 * (2 * values + VOXEL)) * voxels + min(int(mib * MIB), values * voxels)

@@ -40,7 +40,7 @@ FACES = {"20k": 20_000, "100k": 100_000, "500k": 500_000}  # of mesh.max_faces
 
 
 def mesh_of(
-    tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
+    tree: NerfTree, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
     dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Mesh:  # fmt: skip
     """The tree's surface in the training frame; `progress` takes (done, total, text). Raises StageFailed where there is none at a density that was asked for;

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from efficientnerf.asset.format import load
-from efficientnerf.asset.tree import Region
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.settings import given
 from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import PointCloud
@@ -25,7 +24,9 @@ from stages.mesh.run import PARTS, orbit_points, remedy, whole_progress
 from stages.points.settings import PointsSettings
 
 
-def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None], region: Region | None = None) -> PointCloud:
+def points_of(
+    tree: NerfTree, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None], region: Region | None = None
+) -> PointCloud:
     """Points on the tree's surface, clipped to a region, in the capture's frame.
 
     Raises StageFailed where there is none; `progress` takes (done, total, text).

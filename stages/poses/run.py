@@ -88,7 +88,7 @@ def run(job: Job) -> None:
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
 
-def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], framed: Any) -> tuple[View, ...]:
+def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], framed: training_frame.TrainingFrame) -> tuple[View, ...]:
     """Of the photographs, in the training frame."""
     world = framed.world_from_capture
     return tuple(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from efficientnerf.asset import format
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import given
 from pipeline.stage import Job
@@ -32,7 +33,7 @@ def run(job: Job) -> None:
     render_turntable(tree, job, cameras=cameras)
 
 
-def cameras_of(tree: Any, s: TurntableSettings, warn: Warn = lambda text: None) -> list[Camera]:
+def cameras_of(tree: NerfTree, s: TurntableSettings, warn: Warn = lambda text: None) -> list[Camera]:
     """The cameras of the turntable's frames; `tree` has the interface of a NerfTree, with its region. A warning for each setting that their path has no use
     for."""
     return turntable_cameras(
@@ -42,7 +43,7 @@ def cameras_of(tree: Any, s: TurntableSettings, warn: Warn = lambda text: None) 
     )  # fmt: skip
 
 
-def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None, cameras: Sequence[Camera] | None = None) -> None:
+def render_turntable(tree: NerfTree, job: Job, draw: Callable[..., Any] | None = None, cameras: Sequence[Camera] | None = None) -> None:
     """Write frames and video, of the tree as it is. Frames are kept in job.work, so that a kill costs at most one; the video is encoded from the PNGs."""
     s: TurntableSettings = job.settings
     cameras = cameras_of(tree, s) if cameras is None else cameras
