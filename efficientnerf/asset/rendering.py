@@ -61,7 +61,7 @@ def render(
     behind = _background(background)
     on_device = dispatch.tree_backend(tree) == "triton"
     if on_device and tree.ndc is None:
-        from efficientnerf.backends.triton import tree as cuda_tree
+        from efficientnerf.backends.triton import tree as cuda_tree  # needs Triton, which is there on CUDA alone
 
         parts = cuda_tree.render_image(cuda_tree.device_tree_of(tree), camera, background=background, supersample=supersample)
         rendering = Rendering(*(part.cpu().numpy() for part in parts))

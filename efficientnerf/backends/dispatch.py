@@ -77,7 +77,7 @@ def triton_usable() -> bool:
     if not torch.cuda.is_available():
         return False
     try:
-        from efficientnerf.backends.triton.adam import adam as probe
+        from efficientnerf.backends.triton.adam import adam as probe  # whether Triton is there is found out here
     except ImportError as error:
         warnings.warn(f"Triton cannot be imported ({error}); plain torch is used on CUDA, many times slower. Install triton.", Notice, stacklevel=3)
         return False

@@ -144,7 +144,7 @@ def _possible(file: _Bounded, formats: Sequence[str]) -> tuple[str, ...]:
     if head[4:8] == b"ftyp" and (b"avif" in brands or b"avis" in brands) and "AVIF" in formats:
         return ("AVIF",)
     if head[4:8] == b"ftyp" and "HEIF" in formats:
-        import pillow_heif
+        import pillow_heif  # other pictures are never decoded by it
 
         pillow_heif.register_heif_opener()
         return ("HEIF",)

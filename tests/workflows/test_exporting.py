@@ -51,7 +51,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for file in (outputs.ply, outputs.glb, outputs.obj):
         MESH_EXPORTERS[file.suffix](mesh, file, source_frame(METADATA))
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(MADE))))
-    monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: fresh)
+    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
     monkeypatch.setattr(exporting, "_meshed", lambda export, tree, border, frame, wanted, progress: pytest.fail(f"made again, with {wanted}"))
     return path
 
@@ -97,7 +97,7 @@ def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dic
 def test_a_normal_map_is_left_out_where_it_is_not_asked_for(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = replace(MADE, normal_map=True)
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(made))))
-    monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: fresh)
+    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
     outputs = MeshOutputs.of_run(run)
     mesh = read_mesh(outputs)
     assert mesh.texture is not None
@@ -123,7 +123,7 @@ def test_a_normal_map_wants_a_texture_to_lie_beside(run: Path) -> None:
 
 
 def test_a_stale_mesh_is_not_taken(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: SimpleNamespace(fresh=False, manifest=None))
+    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: SimpleNamespace(fresh=False, manifest=None))
     with pytest.raises(pytest.fail.Exception, match="made again"):
         export(run, "mesh.glb")
 

@@ -13,7 +13,6 @@ from workflows.cli.options import common_options, folder_type, json_option, quie
 from workflows.cli.output import closing, write_json
 from workflows.cli.progress import display, size
 from workflows.cli.target import open_run
-from workflows.loading import describe_asset, load_asset
 from workflows.report.signature import altered_pages
 
 
@@ -33,6 +32,8 @@ def verify(what: Path, as_json: bool, quiet: bool) -> None:
 
 
 def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
+    from workflows.loading import describe_asset, load_asset  # a run is verified without reading its asset
+
     try:
         load_asset(path)
     except CorruptArtifact as error:

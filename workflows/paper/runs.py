@@ -228,7 +228,7 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
         render(tree, camera, background=background)
         return time.perf_counter() - begun
 
-    from efficientnerf.backends.triton.tree import device_tree_of, render_image
+    from efficientnerf.backends.triton.tree import device_tree_of, render_image  # needs Triton
 
     torch.cuda.synchronize()
     begun = time.perf_counter()

@@ -13,7 +13,7 @@ from workflows.report.signature import PAGES, is_own, viewer_is_missing
 def write_pages(run: Run, stages: Sequence[Stage]) -> None:
     """Write them of what the run holds now."""
     from workflows.report.page import write_report  # torch, for the viewer: a run with nothing to do writes no page
-    from workflows.report.viewer import write_run_viewer
+    from workflows.report.viewer import write_run_viewer  # likewise
 
     write_run_viewer(run)
     write_report(run, stages)

@@ -54,7 +54,7 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
     return count
 
 
-def _yuv(frame: np.ndarray) -> av.VideoFrame:  # type: ignore[name-defined]
+def _yuv(frame: np.ndarray) -> av.VideoFrame:
     """The frame in Rec. 709 YCbCr 4:2:0, studio range, padded to even sides."""
     height, width = frame.shape[:2]
     even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

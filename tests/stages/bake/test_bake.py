@@ -31,7 +31,6 @@ from stages.bake import run as bake
 from stages.bake.refine import checkpoint, refinement
 from stages.bake.settings import BakeSettings
 from stages.evaluate.views import ground_truth
-from stages.figures import plots
 from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from stages.train import run as train
@@ -55,7 +54,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baking, "POINTS_PER_BLOCK", 8192)
     monkeypatch.setattr(baking, "RAYS_PER_BLOCK", 512)
-    monkeypatch.setattr(plots, "curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:
@@ -278,7 +277,7 @@ def test_a_device_without_room_leaves_the_fit_to_the_host(total_variation: float
     made.device = "cuda"
     needed = (604 + beside) * len(tree.density_values) + 4 * 5**3 * len(tree.voxel_index) + 12 * 60 + 2 * 64 * 4
     for free, where in ((needed, there), (needed - 1, targets)):
-        monkeypatch.setattr(memory, "free_on_device", lambda device, free=free: free)
+        monkeypatch.setattr("stages.bake.refine.refinement.free_on_device", lambda device, free=free: free)
         assert refinement.targets_on_device(made, tree, targets) is where
     assert ["refined on the CPU" in event["text"] for event in events if event["event"] == "warning"] == [True]
     made.device = "cpu"
@@ -397,7 +396,7 @@ def test_bytes_beyond_the_usual_size_of_a_packed_asset_give_no_more_voxels(input
     asked: list[float] = []
     plan, pack = bake._plan, economy.packed_tree
     monkeypatch.setattr(bake, "_plan", lambda job, m, s, pixels, mib, *rest, **named: asked.append(mib) or plan(job, m, s, pixels, mib, *rest, **named))
-    monkeypatch.setattr(economy, "packed_tree", lambda job, tree, targets, size: asked.append(size / 2**20) or pack(job, tree, targets, size))
+    monkeypatch.setattr("stages.bake.run.packed_tree", lambda job, tree, targets, size: asked.append(size / 2**20) or pack(job, tree, targets, size))
     made = job(tmp_path, dataclasses.replace(stated, samples_per_voxel=1, visibility_rays=4000, refine_steps=2, refine_rays_per_batch=512), **inputs)
     run(made)
     report = json.loads((made.out / "report.json").read_text())

@@ -26,7 +26,6 @@ from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint, refinement
 from stages.bake.refine.checkpoint import Point
 from stages.bake.settings import BakeSettings
-from stages.figures import plots
 from stages.train import run as train
 from tests.efficientnerf.balls import settings
 from tests.efficientnerf.trees import random_cascades, random_tree
@@ -52,7 +51,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(autouse=True)
 def split_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schedule, "PHASES", PHASES)
-    monkeypatch.setattr(plots, "curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:

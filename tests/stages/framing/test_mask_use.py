@@ -315,7 +315,7 @@ def test_features_outside_of_silhouettes(
 ) -> None:
     """They count where the background moves with the object, and not where the silhouettes contradict what they tell, nor for other masks."""
     find = Found(*right)
-    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find)
+    monkeypatch.setattr("stages.masking.photographs.find_cameras", find)
     made, said, _ = run(photographs_with(tmp_path / "source", draw, turned=turned), tmp_path)
     assert find.asked == asked
     if draw is off_centre:
@@ -333,7 +333,7 @@ def test_colours_below_transparent_pixels_are_surroundings(blank: bool, asked: l
         colour = np.where(cover[..., None] > 0, captures.picture(index), 0) if blank else captures.picture(index)
         captures.write_picture(tmp_path / "source" / camera.name, np.dstack([colour.astype(np.uint8), cover]))
     find = Found("surroundings", "object")
-    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find)
+    monkeypatch.setattr("stages.masking.photographs.find_cameras", find)
     made, said, _ = run(tmp_path / "source", tmp_path)
     assert find.asked == asked
     assert (made.background, made.space) == (WHITE, "box")

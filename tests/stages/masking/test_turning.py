@@ -111,7 +111,7 @@ def test_few_photographs_by_the_subject_alone_are_no_reason_to_leave_the_rest_ou
 ) -> None:
     """Photographs with a camera, share of the matches that agree, and the angle between the first and the last camera's view."""
     paths = {f"{n:02d}.png": tmp_path / f"{n:02d}.png" for n in range(20)}
-    monkeypatch.setattr("stages.masking.turning.masks_of_turning_subject", lambda *_, **__: paths)
+    monkeypatch.setattr("stages.masking.photographs.masks_of_turning_subject", lambda *_, **__: paths)
     searched = []
 
     def find(name: str, masks: Mapping[str, Path | None]) -> Capture:

@@ -46,7 +46,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_curve(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Drawing the curve takes longer than this little training; one test wants it."""
     if "curve" not in request.node.name:
-        monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+        monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:

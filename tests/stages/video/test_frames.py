@@ -20,7 +20,6 @@ from stages.io.material import find_material, photographs_of, with_frames
 from stages.io.photo import read_photo
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
-from stages.sfm import reconstruction
 from stages.sfm.images import prepare_images
 from stages.video.frames import Chosen, Reader, frames_of, look
 from stages.video.reading import opened
@@ -159,7 +158,7 @@ def test_cameras_are_found_for_the_chosen_frames(tmp_path: Path, monkeypatch: py
         seen.update(names)
         return Capture("photographs", (), None, rejected=((next(iter(names)), "no reason"),))
 
-    monkeypatch.setattr(reconstruction, "find_cameras", find)
+    monkeypatch.setattr("stages.masking.photographs.find_cameras", find)
     job, _ = job_for(source, tmp_path, frames=5)
     capture = poses.read(job, job.settings, job.warn)
     assert 3 <= len(seen) <= 5

@@ -29,7 +29,7 @@ from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
 from workflows.cli.files import EXR, REGIONS, TEXTURES
-from workflows.cli.main import enerf as enerf_commands
+from workflows.cli.main import COMMANDS
 from workflows.exporting import faces_from_text
 
 Enerf = Callable[..., Result]
@@ -119,7 +119,7 @@ def test_the_list_names_every_format(enerf: Enerf) -> None:
     assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
     assert sum("pip install 'efficientnerf[usd]'" in line for line in lines) == 2
     assert sum("pip install 'efficientnerf[las]'" in line for line in lines) == 2
-    assert all(row["command"].split()[1] in enerf_commands.commands for row in rows)
+    assert all(row["command"].split()[1] in COMMANDS for row in rows)
     assert len(lines) == 4 * len(rows)
 
 

@@ -216,7 +216,7 @@ def test_mistakes_are_told_by_the_command_line(enerf: Enerf, place: Path, monkey
     def wrong(*_: object) -> None:
         raise Mistakes("fleet.toml: 2 mistakes; nothing was run:", ("line 1: one\x1b", "line 2: two"))
 
-    monkeypatch.setattr("workflows.cli.resolve.preset_names", wrong)
+    monkeypatch.setattr("workflows.cli.presets.preset_names", wrong)
     told = enerf("presets", "--json")
     assert told.code == 2
     assert told.err == "enerf: fleet.toml: 2 mistakes; nothing was run:\n  line 1: one\\x1b\n  line 2: two\n"

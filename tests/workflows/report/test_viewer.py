@@ -12,7 +12,6 @@ import pytest
 from efficientnerf.asset.format import save
 from pipeline.run import Run
 from stages.io.pictures import opened
-from stages.viewer import page as viewer_page
 from stages.viewer.captured import PHOTOGRAPHS, SIDE, captured_views, photograph
 from tests.efficientnerf.trees import random_tree
 from tests.stages.balls import poses
@@ -60,7 +59,7 @@ def test_there_is_no_page_of_no_asset_a_damaged_one_or_one_too_large(run: Run, m
     asset = run.path / "bake/asset.nerftree"
     assert write_run_viewer(run) is not None
     with monkeypatch.context() as patch:
-        patch.setattr(viewer_page, "LARGEST", 100)
+        patch.setattr("workflows.report.viewer.LARGEST", 100)
         assert write_run_viewer(run, anew=True) is None
     assert not (run.path / "viewer.html").exists()
     assert write_run_viewer(run) is not None
@@ -83,7 +82,7 @@ def test_a_page_that_could_not_be_made_is_missing_until_it_is(run: Run, monkeypa
     (run.path / "viewer.html").unlink()
     assert not has_pages(run, ())
     with monkeypatch.context() as patch:
-        patch.setattr(viewer_page, "LARGEST", 100)
+        patch.setattr("workflows.report.signature.LARGEST", 100)
         assert has_pages(run, ())  # it gets none
     (run.path / "bake/asset.nerftree").unlink()
     assert has_pages(run, ())
