@@ -1,4 +1,5 @@
-"""Who may import whom, how large folders, functions and signatures may be, over the syntax trees; that imports stand at the top; and that what must start quickly imports nothing heavy."""
+"""Who may import whom and where, how large folders, functions and signatures may be, over the syntax trees; and that what must start quickly imports
+nothing heavy."""
 
 from __future__ import annotations
 
@@ -25,8 +26,10 @@ ALLOWED = {
 KERNELS = ("efficientnerf/backends/numba", "efficientnerf/backends/triton", "efficientnerf/structures")  # compiled code, and what launches it
 MODULES_A_FOLDER, LINES, ARGUMENTS = 15, 60, 12
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
-DOOR = ("stages.artifacts", "efficientnerf.settings", "efficientnerf.training.settings", "workflows.asset", "workflows.budget", "workflows.cli.main",
-        "workflows.cli.run", "workflows.cli.status", "workflows.cli.verify", "workflows.cli.presets", "workflows.fleet.child", "stages.sfm.pair_workers")  # fmt: skip
+DOOR = (
+    "stages.artifacts", "efficientnerf.settings", "efficientnerf.training.settings", "workflows.asset", "workflows.budget", "workflows.cli.main",
+    "workflows.cli.run", "workflows.cli.status", "workflows.cli.verify", "workflows.cli.presets", "workflows.fleet.child", "stages.sfm.pair_workers",
+)  # fmt: skip
 # Imports within functions, each with its reason beside it: of extras, of Triton, of pycolmap, which other libraries must precede, of what most runs need not.
 LATE = {
     "efficientnerf/asset/refinement/fit.py": 1,
@@ -41,6 +44,7 @@ LATE = {
     "stages/figures/drawing.py": 3,
     "stages/formats/exporters/las.py": 1,
     "stages/formats/exporters/usd.py": 3,
+    "stages/formats/importers/depth.py": 1,
     "stages/io/decoders/raw.py": 2,
     "stages/io/network_file.py": 1,
     "stages/io/photo.py": 1,

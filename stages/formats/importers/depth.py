@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 
 from efficientnerf.geometry.cameras import Camera, project, rays
 from pipeline.errors import BadInput
@@ -116,6 +115,8 @@ def read_depth(found: DepthFile, photo: Photo) -> np.ndarray:
 
 def _exr(path: Path) -> np.ndarray:
     """(H, W) float32, the one channel of an OpenEXR file, or its R, Y or Z. Raises UnreadableImage."""
+    import OpenEXR  # only where depth is read: folders are recognised without it
+
     data, said = read_bytes(path, LARGEST_EXR), io.StringIO()
     try:
         with contextlib.redirect_stdout(said):  # it prints what is wrong with a file
