@@ -5,23 +5,34 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
+import torch
+
+from efficientnerf.asset.bake import grid_of
+from efficientnerf.asset.file.serialisation import most_voxels
+from efficientnerf.asset.refinement.error_map import MAX_CELLS
+from efficientnerf.asset.refinement.fit import PATCH_SIDE
+from efficientnerf.geometry.spaces import Space
+from efficientnerf.model import Model
+from efficientnerf.settings import given
+from efficientnerf.training.pixels import PixelRows, Pixels
+from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
+from stages.bake.plan import Plan
+from stages.bake.pruning import most_children
+from stages.bake.resolution import MAX_CASCADES
+from stages.bake.resolution import MAX_CELLS as MAX_COARSE_CELLS
+from stages.bake.settings import BakeSettings
+from stages.bake.voxels import MAX_OVERSHOOT, finest_choice
+from stages.bake.whole_scene import grids_of
 from stages.cores import count_cores
+from stages.io.scene import Scene, View
 from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
 from stages.train.data import channels_of, count_pixels
 from stages.train.memory import DENSITY_VOXEL, PIXELS, parameters, pixels_needed, place_pixels
 from stages.train.pixel_file import PixelFile
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.pixels import PixelRows
-    from efficientnerf.training.settings import TrainSettings
-    from stages.bake.plan import Plan
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene, View
 
 COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement
 PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, those in the order of the file or decoded, two in the refinement
@@ -61,13 +72,11 @@ def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick
 
 def free_on_device(device: str) -> int:
     """Bytes available on a CUDA device: free ones, and those that this process has reserved but not allocated."""
-    import torch
-
     return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
 def needed(
-    settings: BakeSettings, trained: Any, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool,
+    settings: BakeSettings, trained: TrainSettings, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool,
     whole: bool, device: str,
 ) -> Need:  # fmt: skip
     """What baking takes.
@@ -80,10 +89,6 @@ def needed(
     stored    whether the pixels are in a file
     whole     whether a whole scene is baked
     """
-    from efficientnerf.asset.refinement.error_map import MAX_CELLS
-    from efficientnerf.asset.refinement.fit import PATCH_SIDE
-    from efficientnerf.settings import given
-
     pixels = pixels_needed(views, channels, stored=stored)
     rays = min(settings.visibility_rays, count_pixels(tuple(views)))
     return Need({
@@ -97,7 +102,7 @@ def needed(
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
@@ -122,10 +127,6 @@ def most_needed(
     splits   how often voxels will be split
     returns  voxels along the finest grid in question; how many are baked at most; and a function from a number of voxels to what it takes
     """
-    from efficientnerf.asset.file.serialisation import most_voxels
-    from stages.bake.pruning import most_children
-    from stages.bake.voxels import MAX_OVERSHOOT
-
     finest, cells = _finest_cells(settings, trained, s, whole=whole)
     room = most_voxels(int(mib * 2**20), settings.layout, trained.degree, (1, 1, 1), settings.brick_size)
     voxels = min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3)
@@ -139,30 +140,22 @@ def most_needed(
 
 def _finest_cells(settings: BakeSettings, trained: Trained, s: Scene, *, whole: bool) -> tuple[int, int]:
     """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
-    from efficientnerf.asset.bake import grid_of
-    from efficientnerf.settings import given
-    from stages.bake.resolution import MAX_CASCADES, MAX_CELLS
-    from stages.bake.voxels import finest_choice
-    from stages.bake.whole_scene import grids_of
-
     bounds, discretise = trained.space.bounds, given(trained.settings.discretise)
-    finest = finest_choice(settings, trained, s).resolution
+    finest = finest_choice(settings, trained.settings, s).resolution
     if not whole:
         return finest, math.prod(grid_of(bounds, finest, settings.brick_size)[0])
     count = given(settings.cascades) or MAX_CASCADES
     cells = sum(math.prod(shape) for shape, _, _ in grids_of(bounds, finest, settings.brick_size, count, None))
     stated = given(settings.resolution) or given(settings.max_resolution) or discretise
-    return finest, cells if stated else min(cells, 2 * MAX_CELLS)  # coarse cells are more by those that make grids fit each other
+    return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
-def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
+def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: Pixels, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
     pixels        as they were placed
     splits, room  how often voxels will be split, and how many there is room for then
     """
-    from stages.bake.pruning import most_children
-
     whole, voxels = plan.samples is not None, plan.voxels
     if splits:
         voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))

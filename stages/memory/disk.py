@@ -13,9 +13,27 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from efficientnerf.asset.file.serialisation import most_voxels
+from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.settings import given
+from pipeline.errors import PipelineError
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
+from stages.bake.resolution import size_limits
+from stages.bake.voxels import MAX_OVERSHOOT, finest_choice
+from stages.cores import count_cores
+from stages.evaluate.views import constant_background
+from stages.formats.importers import detect
+from stages.formats.importers.source import IMAGE_SUFFIXES
+from stages.io.field_file import load_renderer
+from stages.io.pictures import UnreadableImage, read_header
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import load, views_of
 from stages.memory.need import MIB
+from stages.sfm.ladder import features_for
+from stages.train.data import count_pixels
+from stages.train.hash_resolution import with_auto_sizes
+from stages.train.memory import parameters
+from stages.video.panorama import VIEWS
 
 LEAST = MIB  # logs, plots, manifests, previews of small pictures
 # Bytes. Of a pixel of a working image; of a feature with its matches; of a parameter of the field, and of a checkpoint, with Adam's moments; of a density
@@ -70,10 +88,6 @@ def _frames(own: Any) -> int:
 
 def _working_images(own: Any, sources: Sequence[Path]) -> int:
     """Working images, and what structure from motion reads: copies of photographs, or the frames of videos. Videos count where there are no images."""
-    from stages.formats.importers.source import IMAGE_SUFFIXES
-    from stages.sfm.ladder import features_for
-    from stages.video.panorama import VIEWS
-
     pictures = [path for source in sources for path in files_below(source) if path.suffix.lower() in IMAGE_SUFFIXES]
     count = (len(pictures) or own.frames) * (VIEWS if own.lens == "equirectangular" else 1)
     finding = _cameras_are_found(own, sources)
@@ -86,8 +100,6 @@ def _working_images(own: Any, sources: Sequence[Path]) -> int:
 
 def _pixels(pictures: Sequence[Path], side: int) -> float:
     """Mean pixels of the pictures once they are no larger than `side`; of some of them."""
-    from stages.io.pictures import UnreadableImage, read_header
-
     found = []
     for path in pictures[:: -(-len(pictures) // HEADERS) or 1]:
         with contextlib.suppress(UnreadableImage, OSError):  # the stage says so
@@ -98,9 +110,6 @@ def _pixels(pictures: Sequence[Path], side: int) -> float:
 
 def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
     """Whether structure from motion has to find them, as far as can be told before."""
-    from pipeline.errors import PipelineError
-    from stages.formats.importers import detect
-
     if own.format != "auto" or len(sources) != 1:
         return own.format in ("auto", "photographs")
     with contextlib.suppress(PipelineError, OSError):  # the stage says so
@@ -109,11 +118,6 @@ def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
 
 
 def _training(own: Any, run: Path, memory: int | None) -> int:
-    from stages.io.scene import load, views_of
-    from stages.train.data import count_pixels
-    from stages.train.hash_resolution import with_auto_sizes
-    from stages.train.memory import parameters
-
     folder = PosesOutputs.of_run(run)
     pixels = 4 * DECODED * _bytes_below([folder.images])
     if folder.scene.is_file():
@@ -127,15 +131,6 @@ def _training(own: Any, run: Path, memory: int | None) -> int:
 
 def _baking(own: Any, run: Path) -> int:
     """The values of the voxels as they are baked, the state of their refinement, twice while it is written, and the asset."""
-    from efficientnerf.asset.file.serialisation import most_voxels
-    from efficientnerf.rendering.harmonics import harmonics_count
-    from stages.bake.resolution import size_limits
-    from stages.bake.voxels import MAX_OVERSHOOT, finest_choice
-    from stages.cores import count_cores
-    from stages.evaluate.views import constant_background
-    from stages.io.field_file import load_renderer
-    from stages.io.refined_cameras import load_scene
-
     trained = TrainOutputs.of_run(run)
     if not trained.field.is_file():
         return int(BAKED * (given(own.max_mib) or ASSET_MIB) * MIB)
@@ -144,7 +139,7 @@ def _baking(own: Any, run: Path) -> int:
     _, mib = size_limits(own, s, "cpu", count_cores(), whole=whole, discretise=given(m.settings.discretise))
     voxels = int(MAX_OVERSHOOT * most_voxels(int(mib * MIB), own.layout, m.fine.degree, (1, 1, 1), own.brick_size))
     if not whole and s.forward is None:  # surfaces have as many as their area; density voxels that show are around them
-        finest, side = finest_choice(own, m, s).resolution, len(m.voxels.values)
+        finest, side = finest_choice(own, m.settings, s).resolution, len(m.voxels.values)
         voxels = min(voxels, finest**3, math.ceil(int(m.voxels.count_occupied()) * max(1.0, finest / side) ** 2))
     values = 4 * (1 + 3 * harmonics_count(m.fine.degree))
     return (values + 2 * (2 * values + VOXEL)) * voxels + min(int(mib * MIB), values * voxels)

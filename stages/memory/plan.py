@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from efficientnerf.asset.format import outline
+from efficientnerf.asset.refinement import schedule
 from efficientnerf.settings import given
 from stages.artifacts import (
     BakeInputs,
@@ -26,10 +28,30 @@ from stages.artifacts import (
     inputs_of,
     needs_of,
 )
+from stages.bake.memory import Trained, most_needed
+from stages.bake.resolution import size_limits
 from stages.cores import count_cores
+from stages.evaluate import run as evaluate
+from stages.evaluate.views import constant_background
+from stages.formats.importers.source import IMAGE_SUFFIXES
 from stages.io.capture import FOREGROUND
+from stages.io.field_file import space_of
+from stages.io.pictures import UnreadableImage, read_header
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import load, views_of
+from stages.masking.first_training import FIRST, RAYS, SIDE
 from stages.memory.disk import files_below
-from stages.memory.need import Need
+from stages.memory.need import Need, libraries
+from stages.memory.rendering import frames_needed
+from stages.mesh import run as mesh
+from stages.mesh.memory import surface_needed
+from stages.poses.memory import features_needed, video_needed
+from stages.sfm.ladder import features_for
+from stages.splats import run as splats
+from stages.train.data import channels_of, count_pixels
+from stages.train.hash_resolution import with_auto_sizes
+from stages.train.memory import first_training_needed, training_needed
+from stages.video.reading import UnreadableVideo, opened
 
 HEADERS = 150  # of photographs that are read, evenly spaced
 
@@ -49,14 +71,6 @@ def memory_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mapp
 
 def _poses(own: Any, sources: Sequence[Path]) -> Need:
     """As if no cameras were known: of a set with cameras less is taken."""
-    from stages.formats.importers.source import IMAGE_SUFFIXES
-    from stages.io.pictures import UnreadableImage, read_header
-    from stages.masking.first_training import FIRST, RAYS, SIDE
-    from stages.poses.memory import features_needed, video_needed
-    from stages.sfm.ladder import features_for
-    from stages.train.memory import first_training_needed
-    from stages.video.reading import UnreadableVideo, opened
-
     files = [path for source in sources for path in files_below(source)]
     pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     sizes: list[tuple[int, int]] = []
@@ -78,12 +92,6 @@ def _poses(own: Any, sources: Sequence[Path]) -> Need:
 
 
 def _train(run: Path, settings: Mapping[str, Any], device: str) -> Need:
-    from stages.io.field_file import space_of
-    from stages.io.scene import load, views_of
-    from stages.train.data import count_pixels
-    from stages.train.hash_resolution import with_auto_sizes
-    from stages.train.memory import training_needed
-
     folder = PosesOutputs.of_run(run).folder
     s = load(folder)
     views = views_of(s, "train")
@@ -91,16 +99,6 @@ def _train(run: Path, settings: Mapping[str, Any], device: str) -> Need:
 
 
 def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
-    from efficientnerf.asset.refinement import schedule
-    from stages.bake.memory import Trained, most_needed
-    from stages.bake.resolution import size_limits
-    from stages.evaluate.views import constant_background
-    from stages.io.field_file import space_of
-    from stages.io.refined_cameras import load_scene
-    from stages.io.scene import views_of
-    from stages.train.data import channels_of, count_pixels
-    from stages.train.hash_resolution import with_auto_sizes
-
     own, folder = settings["bake"], PosesOutputs.of_run(run).folder
     s = load_scene(folder, TrainOutputs.of_run(run).folder)
     views, whole = views_of(s, "train"), constant_background(s) is None
@@ -113,15 +111,10 @@ def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
 
 
 def _mesh(run: Path, settings: Mapping[str, Any], _: str) -> Need:
-    from stages.mesh import run as mesh
-
     return mesh.needed(_asset(run), settings["mesh"], inputs_of(MeshInputs, _folders(MeshInputs, run)))
 
 
 def _splats(run: Path, settings: Mapping[str, Any], _: str) -> Need:
-    from stages.memory.need import libraries
-    from stages.splats import run as splats
-
     own = settings["splats"]
     if own.make == "off":
         return Need({"libraries": libraries()})
@@ -129,26 +122,18 @@ def _splats(run: Path, settings: Mapping[str, Any], _: str) -> Need:
 
 
 def _evaluate(run: Path, settings: Mapping[str, Any], device: str) -> Need:
-    from stages.evaluate import run as evaluate
-
     return evaluate.needed(_asset(run), settings["evaluate"], inputs_of(EvaluateInputs, _folders(EvaluateInputs, run)), device)
 
 
 def _turntable(run: Path, settings: Mapping[str, Any], device: str) -> Need:
-    from stages.memory.rendering import frames_needed
-
     return frames_needed(_asset(run), settings["turntable"].width * settings["turntable"].height, device)
 
 
 def _points(run: Path, settings: Mapping[str, Any], _: str) -> Need:
-    from stages.mesh.memory import surface_needed
-
     return surface_needed(_asset(run), settings["points"].num_points)
 
 
 def _asset(run: Path) -> Any:
-    from efficientnerf.asset.format import outline
-
     return outline(BakeOutputs.of_run(run).asset)
 
 

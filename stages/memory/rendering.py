@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.surface.shading import AT_ONCE
 from stages.memory.need import MIB, Need, libraries
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
 
 # Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of a
 # test view with its photograph, renders, errors and windows of SSIM.
@@ -22,8 +21,6 @@ FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose 
 
 def tree_bytes(tree: NerfTree) -> int:
     """Bytes of a tree and of what renderers make of it."""
-    from efficientnerf.asset.palettes import PaletteHarmonics
-
     harmonics = tree.harmonics
     colours = 16 * len(tree.density_values)  # as seen from a camera
     stored = harmonics.base.nbytes + harmonics.codes.nbytes if isinstance(harmonics, PaletteHarmonics) else harmonics.nbytes
@@ -46,8 +43,6 @@ def views_needed(tree: NerfTree, cameras: Sequence[Camera], rays: int, field: in
     field  bytes of the field's file
     mesh   bytes of the mesh that is measured
     """
-    from efficientnerf.surface.shading import AT_ONCE
-
     most = max((camera.width * camera.height for camera in cameras), default=0)
     return Need({
         "a view": most * (COMPARED + DRAWN),

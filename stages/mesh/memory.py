@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.fusion import MARGIN
+from efficientnerf.surface.isosurface import BLOCK, pool_of
+from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
 from stages.memory.need import SURFACES, Need, libraries
 from stages.memory.rendering import tree_bytes
 from stages.mesh.check import CAPTURED, FUSED, LONGER_SIDE, ORBIT
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 # Bytes. Of a stored voxel: vertices and faces while they are joined, cleaned and decimated, as many as a thin shell has; of a cell in which enclosed space
 # is found, and of a voxel of the bricks that these are made from; of a point with what its colour is looked up by.
@@ -26,10 +26,6 @@ DENSE_VOXEL, DENSE_CELLS = 250, 8 * 256**3
 def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False) -> Need:
     """What it takes to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
     and with a normal map where `dense`."""
-    from efficientnerf.surface.fusion import MARGIN
-    from efficientnerf.surface.isosurface import BLOCK, pool_of
-    from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
-
     views = CAPTURED + ORBIT + FUSED
     pool = pool_of(volume_of(tree))
     cells = [-(-side // pool) + 2 for side in tree.resolution]

@@ -8,6 +8,10 @@ from pipeline.executors.memory import available_now
 from pipeline.stage import Job
 from stages.io.photo import working_size
 from stages.memory.need import IMAGING, MIB, Need, refuse_what_does_not_fit
+from stages.sfm.learned.matches import AT_ONCE
+from stages.sfm.learned.networks import LONGEST
+from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
+from stages.sfm.pairs import BLOCK_SIZE
 
 # Bytes. Of a pixel of the photograph that is decoded, turned, reduced and written; of a pixel of a photograph in which features are detected, on a thread
 # of its own (SIFT's first octave), four times as many where that is twice as large; of an image's descriptors while they are matched.
@@ -35,11 +39,6 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     features  of a photograph, at most
     networks  whether photographs without a camera are matched by networks
     """
-    from stages.sfm.learned.matches import AT_ONCE
-    from stages.sfm.learned.networks import LONGEST
-    from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
-    from stages.sfm.pairs import BLOCK_SIZE
-
     reduced = {working_size(*size, max_side) for size in sizes}
     most = max((width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced), default=0)
     decoded = decoding_needed(sizes).terms

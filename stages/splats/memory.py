@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from efficientnerf.asset.tree import NerfTree
 from stages.memory.need import Need, libraries
 from stages.memory.rendering import tree_bytes
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 # Bytes. Of a parameter: value, gradient, two moments, and one more while Gaussians are merged and written; of a stored voxel while they are merged; of a
 # pixel of a picture: its colours and mask; of a pixel of the one that is drawn: colours, transmittance, gradients and the Gaussians that cover its tile.

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from efficientnerf.fields.hash import FEATURES, grids, level_sizes
 from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.spaces import Space, space_from
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE, PixelRows
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
@@ -15,10 +19,7 @@ from stages.artifacts import PosesOutputs
 from stages.io.scene import View
 from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
 from stages.train.data import MOST_OBSERVATIONS, channels_of, count_pixels
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.pixels import PixelRows
+from stages.train.pixel_file import PixelFile
 
 PIXELS = "training pixels"
 # Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes;
@@ -34,8 +35,6 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
 
     stored  whether the pixels are in a file
     """
-    from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE
-
     cameras = [view.camera for view in views]
     total = count_pixels(tuple(views))
     lenses = {(camera.width, camera.height, camera.model, camera.params) for camera in cameras}
@@ -53,8 +52,6 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
 
 def parameters(settings: TrainSettings) -> int:
     """Parameters of both fields, about."""
-    from efficientnerf.fields.hash import FEATURES, grids, level_sizes
-
     hidden = settings.num_layers * settings.hidden_dim**2 + settings.coarse_num_layers * settings.coarse_hidden_dim**2
     if settings.field != "hash":
         return hidden
@@ -111,8 +108,6 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
     remedy  as for `refuse_what_does_not_fit`
     stored  whether in a file
     """
-    from stages.train.pixel_file import PixelFile
-
     refuse_what_does_not_fit(job, need, remedy)
     if not stored:
         return None
@@ -157,10 +152,6 @@ def first_training_needed(count: int, side: int, settings: TrainSettings, rays: 
     settings  without "auto" where `stages.train.hash_resolution` has numbers
     rays      in which the subject is looked for
     """
-    import numpy as np
-
-    from efficientnerf.geometry.spaces import space_from
-
     space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=True)
     camera = Camera("", side, side, "SIMPLE_PINHOLE", (side, side / 2, side / 2), np.eye(4))
     intervals = space.max_intervals(space.sampled_length(None) / (given(settings.num_coarse_samples) or space.num_coarse_samples))

@@ -14,16 +14,16 @@ from PIL import Image
 from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit
 from stages.artifacts import MeshOutputs
-from stages.bake import run as bake
-from stages.bake.run import BakeSettings
-from stages.evaluate import run as evaluate
+from stages.bake import settings as bake
+from stages.bake.settings import BakeSettings
+from stages.evaluate import settings as evaluate
 from stages.memory.plan import memory_needed
-from stages.mesh import run as mesh
-from stages.points import run as points
+from stages.mesh import settings as mesh
+from stages.points import settings as points
 from stages.poses.memory import features_needed
-from stages.splats import run as splats
-from stages.train import run as train
-from stages.turntable import run as turntable
+from stages.splats import settings as splats
+from stages.train import settings as train
+from stages.turntable import settings as turntable
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
 from workflows.asset import STAGES
@@ -49,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, int]]
     for module in (train, bake):
         stage = module.STAGE
         made = job(folder / stage.name, OWN[stage.name], **{need: place / need for need in stage.needs})
-        module.run(made)
+        stage.run(made)
         shutil.copytree(made.out, place / stage.name)
         said[stage.name] = made.facts["memory"]["needed"]
     for name in ("mesh", "splats"):
@@ -64,7 +64,7 @@ def test_it_is_what_the_stage_says_that_it_needs(run: tuple[Path, dict[str, int]
     short = job(tmp_path, OWN[stage.name], **{need: place / need for need in stage.needs})
     short.stage, short.memory = stage.name, Limit(1, "--memory")
     with pytest.raises(TooLittleMemory) as caught:
-        module.run(short)
+        stage.run(short)
     assert memory_needed(stage.name, place, (), OWN) == caught.value.needed
 
 
