@@ -51,7 +51,7 @@ CHECKPOINT_SECONDS = 30.0
 ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
-MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, 6  # see `refinement_steps`
+MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, (6, 15)  # see `usual_steps`
 UNREFINED = 0.1  # of the steps that are usual: with fewer the asset is hardly refined
 ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
@@ -195,7 +195,7 @@ def refined(
     settings = job.settings
     splits = count_splits(phases)
     most = min(len(tree.density_values) * 4**splits, room(splits))
-    steps, seconds = refinement_steps(settings, most, whole=_is_whole(tree)), given(settings.time_budget)
+    steps, seconds = refinement_steps(settings, most, len(targets.pixels) if _is_whole(tree) else None), given(settings.time_budget)
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets, splits, room)
@@ -308,13 +308,19 @@ def _is_whole(tree: NerfTree) -> bool:
     return tree.background is None and tree.ndc is None
 
 
-def refinement_steps(settings: BakeSettings, voxels: int, *, whole: bool) -> int:
-    """Steps of the refinement of so many voxels, of a whole scene or of another; the usual ones where bake.time_budget stands in place of a number of them."""
+def refinement_steps(settings: BakeSettings, voxels: int, pixels: int | None) -> int:
+    """Steps of the refinement; the usual ones where bake.time_budget stands in place of a number of them. Arguments as of `usual_steps`."""
     if settings.time_budget == "off" and (stated := given(settings.refine_steps)) is not None:
         return stated
-    return usual_steps(voxels, settings.refine_rays_per_batch, whole=whole)
+    return usual_steps(voxels, settings.refine_rays_per_batch, pixels)
 
 
-def usual_steps(voxels: int, rays: int, *, whole: bool) -> int:
-    """Steps of so many rays where nothing is stated."""
-    return max(MIN_STEPS, math.ceil((SCENE_STEP_RAYS_PER_VOXEL if whole else STEP_RAYS_PER_VOXEL) * voxels / rays))
+def usual_steps(voxels: int, rays: int, pixels: int | None) -> int:
+    """Steps of so many rays where nothing is stated.
+
+    pixels  of all training images of a whole scene, whose few photographs are soon overfitted: a ray for each, between 6 and 15 for each voxel; None: another
+            scene, 15 for each voxel
+    """
+    least, most = SCENE_STEP_RAYS_PER_VOXEL
+    wanted = STEP_RAYS_PER_VOXEL * voxels if pixels is None else min(max(pixels, least * voxels), most * voxels)
+    return max(MIN_STEPS, math.ceil(wanted / rays))

@@ -285,12 +285,12 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
 
 def test_steps_of_the_fit_follow_the_voxels_or_what_was_asked_for() -> None:
     chosen = BakeSettings(refine_rays_per_batch=1000)
-    assert [refinement.refinement_steps(chosen, voxels, whole=False) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
-    assert [refinement.refinement_steps(chosen, voxels, whole=True) for voxels in (1, 10**6)] == [320, 6000]
+    assert [refinement.refinement_steps(chosen, voxels, None) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
+    assert [refinement.refinement_steps(chosen, 10**6, pixels) for pixels in (10**5, 10**7, 10**9)] == [6000, 10000, 15000]
     asked = dataclasses.replace(chosen, refine_steps=7)
-    assert {refinement.refinement_steps(asked, 10**7, whole=cut_out) for cut_out in (True, False)} == {7}
+    assert {refinement.refinement_steps(asked, 10**7, pixels) for pixels in (None, 10**9)} == {7}
     for steps in (0, 7):  # a time budget takes the place of any number, of none too: what is thick is learned then as ever
-        assert refinement.refinement_steps(dataclasses.replace(asked, refine_steps=steps, time_budget=40.0), 10**6, whole=False) == 15000
+        assert refinement.refinement_steps(dataclasses.replace(asked, refine_steps=steps, time_budget=40.0), 10**6, None) == 15000
 
 
 @pytest.mark.parametrize(("layout", "most"), [("compact", 1), ("sparse", 1), ("compact", 64)])
