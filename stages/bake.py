@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -137,12 +136,11 @@ def run(job: Job) -> None:
     from efficientnerf.asset import format
     from efficientnerf.asset.cascades import voxel_cascades
     from efficientnerf.asset.components import foreground_bricks
-    from efficientnerf.asset.refinement import schedule
     from stages.baking.economy import packed_tree
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.values import baked_tree
-    from stages.baking.whole_scene import bounds_are_given
+    from stages.baking.whole_scene import bounds_are_given, room_of
     from stages.evaluation.views import constant_background
     from stages.io import scene
     from stages.io.field_file import load_renderer
@@ -157,17 +155,15 @@ def run(job: Job) -> None:
     whole = constant_background(s) is None
     mib, views = _size_limit(job, s, whole=whole, discretise=given(m.settings.discretise)), scene.views_of(s, "train")
     most = given(settings.max_mib) or mib  # of the file
-    phases = schedule.PHASES
-    splits = schedule.count_splits(phases)
-    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole), job.inputs["train"])
-    plan = _plan(job, m, s, pixels, mib, splits, whole=whole)
-    room = partial(_room, settings, m, plan, mib)
+    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, whole=whole), job.inputs["train"])
+    plan = _plan(job, m, s, pixels, mib, whole=whole)
+    capacity = room_of(settings, m, plan.grids, mib, environment=whole)
     _check(job, m, plan)
-    refuse_more_than_fits(job, m, views, pixels, plan, mib, splits, room)
+    refuse_more_than_fits(job, m, views, pixels, plan, mib)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
     targets = _targets(s, pixels, plan)
-    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, phases, room, stopwatch, plan.samples)
+    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, capacity, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
     metrics = {"training_psnr": report["psnr_after"]}
@@ -218,30 +214,19 @@ def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> f
     return timed
 
 
-def _room(settings: BakeSettings, m: Any, plan: Plan, mib: float, splits: int) -> int:
-    """How many voxels the asset holds on the plan's grids once they were split so often."""
-    from stages.baking.whole_scene import room_of
-
-    finer = 2**splits
-    grids = [((x * finer, y * finer, z * finer), voxel / finer, low) for (x, y, z), voxel, low in plan.grids]
-    return room_of(settings, m, grids, mib, environment=plan.samples is not None)
-
-
-def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: float, splits: int, *, whole: bool) -> Plan:
-    """The voxels to bake, which will be split so often: cascades of a whole scene, or else one grid of what lies in the field's box."""
+def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: float, *, whole: bool) -> Plan:
+    """The voxels to bake: cascades of a whole scene, or else one grid of what lies in the field's box."""
     from efficientnerf.asset.bake import grid_of
     from stages.baking.plan import Plan
-    from stages.baking.resolution import baked_resolution
     from stages.baking.voxels import choose_voxels, voxel_space, with_min_views
     from stages.baking.whole_scene import choose_scene_voxels
 
     space = voxel_space(job, m)
     if whole:
-        return choose_scene_voxels(job, m, s, pixels, space, mib, splits)
-    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib, splits)
-    resolution = baked_resolution(choice.resolution, splits)
-    indices = with_min_views(m, s, indices, resolution)
-    shape, voxel = grid_of(space.bounds, resolution, job.settings.brick_size)
+        return choose_scene_voxels(job, m, s, pixels, space, mib)
+    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib)
+    indices = with_min_views(m, s, indices, choice.resolution)
+    shape, voxel = grid_of(space.bounds, choice.resolution, job.settings.brick_size)
     return Plan(choice, space, [(shape, voxel, np.asarray(space.bounds[0], np.float64))], [indices], len(visibility.cells))
 
 

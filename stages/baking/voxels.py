@@ -53,11 +53,11 @@ def voxel_space(job: Job, m: Any) -> Space:
     return space if depth == 1 else space.with_voxel_depth(depth)
 
 
-def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
-    """The asset's resolution; the visibility of the voxels to bake, which will be split so often to have it, and their coordinates (N, 3)."""
+def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float) -> tuple[Choice, Visibility, np.ndarray]:
+    """The asset's resolution; the visibility of the voxels to bake, and their coordinates (N, 3)."""
     from efficientnerf.asset import bake
     from efficientnerf.asset.file import serialisation
-    from stages.baking.resolution import MIN_RESOLUTION, affordable_resolution, baked_resolution, refuse_without_room
+    from stages.baking.resolution import MIN_RESOLUTION, affordable_resolution, refuse_without_room
 
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick_size
@@ -71,7 +71,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     least = finest.resolution if fixed else MIN_RESOLUTION
     refuse_without_room(settings, mib, least, room(least), environment=False)
     if fixed:
-        shape, voxel = bake.grid_of(bounds, baked_resolution(choice.resolution, splits), brick)
+        shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         visibility = by_views(job, s, visibility, shape, voxel, space)
         return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
@@ -94,11 +94,10 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
         return last
 
     choice = affordable_resolution(finest, lambda at: len(at_resolution(at)[2]), lambda at: int(OVERSHOOT * room(at)))
-    baked = baked_resolution(choice.resolution, splits)
-    _, coarse, indices = at_resolution(baked)
+    _, coarse, indices = at_resolution(choice.resolution)
     most = MAX_OVERSHOOT * room(choice.resolution)
     if len(indices) > most:
-        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, baked, brick)[0], most)
+        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, choice.resolution, brick)[0], most)
     return choice, coarse, indices
 
 

@@ -53,10 +53,10 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
     return [np.stack([low, low + np.asarray(shape) * brick * voxel]) for shape, voxel, low in grids]
 
 
-def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> Plan:
-    """The cascades, their voxels, which will be split so often, the region and the environment."""
+def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float) -> Plan:
+    """The cascades, their voxels, the region and the environment."""
     from efficientnerf.asset.field_samples import cascade_visibility, environment_beyond, seen_weights
-    from stages.baking.resolution import MIN_RESOLUTION, Choice, affordable_resolution, baked_resolution, finest_of_cascades, refuse_without_room
+    from stages.baking.resolution import MIN_RESOLUTION, Choice, affordable_resolution, finest_of_cascades, refuse_without_room
     from stages.baking.voxels import MAX_OVERSHOOT, OVERSHOOT
 
     settings: BakeSettings = job.settings
@@ -96,7 +96,7 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
     else:
         finest = finest_of_cascades(s, bounds, count, settings.brick_size, given(settings.max_resolution))
         choice = affordable_resolution(finest, lambda at: sum(map(len, at_resolution(at)[3])), lambda at: int(OVERSHOOT * room(at)))
-    _, grids, seen, indices = at_resolution(baked_resolution(choice.resolution, splits))
+    _, grids, seen, indices = at_resolution(choice.resolution)
     indices = heaviest_of(job, seen, grids, indices, MAX_OVERSHOOT * room(choice.resolution))
     indices = [keep_clear(job, m, s, part, grid) for part, grid in zip(indices, grids, strict=True)]
     mean = pixels.images[samples.pixel[:: max(1, len(samples.pixel) // 4096)]][:, :3].mean(axis=0) / 255.0

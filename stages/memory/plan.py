@@ -91,7 +91,6 @@ def _train(run: Path, settings: Mapping[str, Any], device: str) -> Need:
 
 
 def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
-    from efficientnerf.asset.refinement import schedule
     from stages.baking.memory import Trained, most_needed
     from stages.baking.resolution import size_limits
     from stages.evaluation.views import constant_background
@@ -106,9 +105,8 @@ def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
     views, whole = views_of(s, "train"), constant_background(s) is None
     trained = with_auto_sizes(settings["train"], s, count_pixels(views))
     mib = size_limits(own, s, device, count_cores(), whole=whole, discretise=given(trained.discretise))[1]
-    splits = schedule.count_splits(schedule.PHASES)
     known = Trained(trained, space_of(s), trained.sh_degree)
-    _, voxels, at_most = most_needed(own, known, s, views, channels_of(folder, views), mib, splits, whole, device)
+    _, voxels, at_most = most_needed(own, known, s, views, channels_of(folder, views), mib, whole, device)
     return at_most(voxels, stored=False)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.cascades import subset, voxel_cascades
-from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
+from efficientnerf.asset.refinement.schedule import stated_schedule
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state, subset_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from pipeline.stage import Job
@@ -19,7 +19,7 @@ from stages.baking.checkpoint import Point
 from stages.baking.pruning import Pruned
 from tests.efficientnerf.trees import random_cascades
 
-SCHEDULE = stated_schedule(PHASES, 12)
+SCHEDULE = stated_schedule(12)
 
 
 def job(folder: Path) -> Job:

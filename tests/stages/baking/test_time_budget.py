@@ -84,7 +84,7 @@ def assert_same(one: NerfTree, other: NerfTree) -> None:
 def repeated(folder: Path, inputs: dict[str, Path], schedule: list[dict[str, Any]]) -> NerfTree:
     """The asset of a recorded schedule."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refinement, "stated_schedule", lambda phases, steps: recorded_schedule(phases, schedule))
+        patch.setattr(refinement, "stated_schedule", lambda steps: recorded_schedule(schedule))
         made = job(folder, replace(QUICK, time_budget="off"), **inputs)
         bake.run(made)
     assert fitted(made)["schedule"] == schedule
@@ -143,17 +143,17 @@ def test_a_budget_that_is_over_ends_in_an_asset_all_the_same(inputs: dict[str, P
 
 @pytest.mark.parametrize("steps", [0, 1, 7, 12])
 def test_the_way_that_is_done_grows_to_one_and_does_not_jump(steps: int) -> None:
-    schedule = stated_schedule(PHASES, steps)
+    schedule = stated_schedule(steps)
     assert schedule.begin(len(PHASES)) == steps
     done = [schedule.fraction(step) for step in range(steps + 1)]
     if steps > 1:
         np.testing.assert_allclose(np.diff(done), 1 / steps, atol=0.5 / steps)
     assert done[-1] == pytest.approx(1.0 if steps else 0.0)
-    assert recorded_schedule(PHASES, schedule.state()) == schedule
+    assert recorded_schedule(schedule.state()) == schedule
 
 
 def test_while_the_number_of_steps_is_not_known_nothing_depends_on_it() -> None:
-    open_ended = RefinementSchedule(PHASES, (Schedule(10), timing.timed_schedule()))
+    open_ended = RefinementSchedule((Schedule(10), timing.timed_schedule()))
     for iterations in (50, 500):
         known = open_ended.with_phase(1, replace(timing.timed_schedule(), iterations=iterations))
         assert [known.fraction(step) for step in range(10 + timing.HOLD + 1)] == [open_ended.fraction(step) for step in range(10 + timing.HOLD + 1)]
