@@ -20,7 +20,6 @@ from stages.io import scene, working_images
 from stages.io.capture import Capture, Photo, Silhouettes
 from stages.io.scene import Scene
 from stages.poses import PosesSettings
-from stages.renamed_settings import moved, updated
 from stages.training.data import pixels_of
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH
@@ -338,12 +337,6 @@ def test_colours_below_transparent_pixels_are_surroundings(blank: bool, asked: l
     assert find.asked == asked
     assert (made.background, made.space) == (WHITE, "box")
     assert any(text.startswith("alpha channels are silhouettes: 6 of 6 photographs keep one object") for text in said)
-
-
-def test_the_old_setting_is_answered_and_read() -> None:
-    assert moved("poses", "alpha") == "poses.alpha is now poses.masks, composite is now silhouette, mask is now ignore."
-    for before, after in {"composite": "silhouette", "mask": "ignore", "auto": "auto"}.items():
-        assert updated("poses", PosesSettings, {"alpha": before}) == {"masks": after}
 
 
 @pytest.mark.parametrize("how", ["nerfstudio", "colmap"])

@@ -52,11 +52,10 @@ def status(run_folder: Path, as_json: bool) -> None:
     from pipeline.text import printable
     from workflows.cli.output import listing, write_json
     from workflows.cli.progress import duration, size
-    from workflows.cli.target import check_names, open_run
+    from workflows.cli.target import open_run
     from workflows.inspection.status import run_status
 
     run = open_run(run_folder)
-    check_names(run)
     found = run_status(run, survey(workflow().stages, run))
     if as_json:
         write_json(found, indent=1)
@@ -141,12 +140,11 @@ def report(run_folder: Path, as_json: bool) -> None:
     """Write RUN/report.html: files, renders, metrics and settings of RUN; and RUN/viewer.html, which shows its asset in a browser. 'enerf run' writes
     both when it is done."""
     from workflows.cli.output import closing, write_json
-    from workflows.cli.target import check_names, open_run
+    from workflows.cli.target import open_run
     from workflows.report.page import write_report
     from workflows.report.viewer import write_run_viewer
 
     run = open_run(run_folder)
-    check_names(run)
     viewer = write_run_viewer(run, anew=True)
     path = write_report(run, workflow().stages)
     if as_json:

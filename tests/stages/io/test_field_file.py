@@ -17,7 +17,6 @@ from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact
 from stages.artifacts import TrainOutputs
 from stages.io.field_file import EXPOSURE, load_exposure, load_renderer, read_tensors, save_model, write_tensors
-from stages.renamed_settings import RENAMED
 from tests.efficientnerf.balls import cameras, pose, untrained
 
 CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3))
@@ -115,18 +114,6 @@ def test_exposures_lie_beside_the_field(tmp_path: Path) -> None:
             load_exposure(tmp_path)
     save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field)
     assert load_exposure(tmp_path) is None
-
-
-def test_a_field_of_before_release_0_1_is_read(tmp_path: Path) -> None:
-    m = untrained(finest_resolution="auto")
-    save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field)
-    tensors, about = read_tensors(tmp_path / TrainOutputs.field)
-    old = {new: old for old, new in RENAMED["train"].items()}
-    chosen = {"time_budget": 0.0, "discretise": 0, "finest_resolution": 0, "distortion_loss_weight": None, "far_plane": 0.0}  # auto and off, as it was
-    settings = {old.get(name, name): chosen.get(name, value) for name, value in about["settings"].items()}
-    assert {"hidden", "log2_table", "warm_up"} <= settings.keys()
-    write_tensors(tensors, {**{k: v for k, v in about.items() if k != "sha256"}, "settings": settings}, tmp_path / TrainOutputs.field)
-    assert load_renderer(tmp_path).model.settings == m.settings
 
 
 def with_metadata(path: Path, text: str) -> None:

@@ -77,22 +77,6 @@ def test_going_on_keeps_what_was_recorded(enerf: Enerf, toys: Path, tmp_path: Pa
     assert recorded(run)["train"] == {"iterations": 3, "rate": 0.5, "seed": 0, "fail": ""}
 
 
-def test_a_run_of_before_release_0_1_says_how_to_go_on(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    enerf("run", toys, "--out", run, "--preset", "tiny")
-    recorded = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    recorded["settings"]["train"] |= {"hidden": 64, "layers": 2}
-    (run / "run.json").write_text(json.dumps(recorded), encoding="utf-8")
-    for arguments in (["run", "--out", run], ["stage", "train", run], ["status", run], ["report", run]):
-        result = enerf(*arguments)
-        assert result.code == 2
-        for words in ("train.hidden is now train.hidden_dim. 1 more", f"enerf run --out {run} --preset tiny"):
-            assert words in result.err
-    assert enerf("verify", run).code == 0
-    assert enerf("run", "--out", run, "--preset", "tiny").code == 0
-    assert enerf("status", run).code == 0
-
-
 def test_a_source_may_move_but_not_change(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
     run, other = tmp_path / "run", tmp_path / "other"
     enerf("run", toys, "--out", run)

@@ -14,7 +14,6 @@ from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from pipeline.run import Run
 from pipeline.runner import refuse_what_cannot_work
-from stages.renamed_settings import REMOVED, RENAMED
 from stages.settings import describe_settings
 from workflows.asset import STAGES
 from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
@@ -185,45 +184,6 @@ def test_times_are_read(text: str, seconds: float) -> None:
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"--budget .*expected a time, as in 90s, 10m or 1h30m"):
         seconds_of(text)
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ("train.hidden=64", "train.hidden is now train.hidden_dim."),
-        ("bake.final_rate=1", "bake.final_rate is now bake.lr_final_ratio."),
-        ("train.coarse=voxels", "train.coarse was removed: pivots are always chosen by the coarse field."),
-        ("train.rate_hold=5", "train.rate_hold was removed"),
-    ],
-)
-def test_old_names_are_answered_with_the_new_ones(option: str, words: str) -> None:
-    settings = Settings({stage.name: stage.settings for stage in STAGES})
-    with pytest.raises(UnknownSetting, match=re.escape(words)) as caught:
-        settings.put_option(option)
-    assert caught.value.exit_code == 2
-    stage, _, name = option.partition("=")[0].partition(".")
-    with pytest.raises(UnknownSetting, match=re.escape(words)):
-        settings.put_table({stage: {name: 1}}, "--config mine.toml")
-
-
-def test_the_table_of_old_names_leads_to_settings_of_today() -> None:
-    for stage in STAGES:
-        known = {info.name for info in describe_settings(stage.settings)}
-        for old, new in RENAMED.get(stage.name, {}).items():
-            assert new in known
-            assert old not in known, "an old name cannot be used again: recorded settings could not be told apart"
-        assert not known & REMOVED.get(stage.name, {}).keys()
-
-
-def test_recorded_settings_of_before_are_read_under_their_new_names() -> None:
-    types = {stage.name: stage.settings for stage in STAGES}
-    old = {"hidden": 64, "log2_table": 0, "budget": 0.0, "samples": 0, "distortion": None, "near": 0.0, "far": 0.0, "crop_steps": 0, "rate_hold": 0}
-    settings = Settings(types)
-    assert settings.put_recorded({"train": old, "evaluate": {"views": 0, "lpips": "none"}, "turntable": {"exr": "none", "fov": None}}) == []
-    train, evaluate, turntable = (settings.resolved()[name] for name in ("train", "evaluate", "turntable"))
-    assert (train.hidden_dim, train.log2_hashmap_size, train.time_budget, train.sample_batch_size) == (64, "auto", "off", "off")
-    assert (train.distortion_loss_weight, train.far_plane, train.precrop_steps) == ("auto", "auto", 0)
-    assert (evaluate.field_views, evaluate.lpips, turntable.exr, turntable.fov) == ("all", "off", "off", "auto")
 
 
 @pytest.mark.parametrize(
