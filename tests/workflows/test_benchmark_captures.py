@@ -7,12 +7,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks import captures as benchmark
-from stages.figures.plots import contact_sheet
 from tests.stages import captures
 
 TINY = ["--preset", "tiny", "--iterations", "8", "--set", "bake.refine_steps=1", "--set", "evaluate.captured_path_frames=2", "--set", "turntable.frames=1"]
@@ -104,27 +101,3 @@ def test_existing_runs_are_tabulated_and_compared(made: Path, tmp_path: Path) ->
     assert row["result"] == {"grade": "poor", "summary": "Fog.", "problems": ["fog"]}
     assert (row["refuted_priors"], row["second_chance"]) == (["near_planes"], "exposure")
     assert "poor (fog)" in (tmp_path / "out/captures.md").read_text()
-
-
-def test_a_picture_is_photograph_asset_and_mesh_of_the_median_view(tmp_path: Path) -> None:
-    colours = [(200, 0, 0), (0, 0, 0), (0, 200, 0), (0, 0, 200)]  # photograph, network, asset, mesh
-    (tmp_path / "evaluate").mkdir()
-    for name, shift in (("median", 0), ("worst", 40)):
-        panels = [np.full((450, 600, 3), np.add(colour, shift), np.uint8) for colour in colours]
-        contact_sheet([panels], [["label"] * 4], tmp_path / f"evaluate/strip_{name}.png", thumbnail=600)
-    assert benchmark.write_picture(tmp_path, tmp_path / "out/picture.webp")
-    with Image.open(tmp_path / "out/picture.webp") as picture:
-        assert picture.height == 225
-        found = [picture.convert("RGB").getpixel((x, 112)) for x in (150, 454, 758)]
-    np.testing.assert_allclose(found, [colours[0], colours[2], colours[3]], atol=6)
-    assert not benchmark.write_picture(tmp_path / "out", tmp_path / "out/none.webp")
-
-
-def test_sets_are_found_by_name(tmp_path: Path) -> None:
-    found = benchmark.sources_of(["fern", "snowmiku"], [tmp_path / "mine", tmp_path / "cup/images"], tmp_path)
-    assert found == {
-        "fern": tmp_path / "fern_4/images_4", "snowmiku": tmp_path / "snowmiku/photos", "mine": tmp_path / "mine", "cup": tmp_path / "cup/images",
-    }  # fmt: skip
-    assert list(benchmark.sources_of([], [], tmp_path)) == list(benchmark.SETS)
-    with pytest.raises(SystemExit, match="nothing: no such set"):
-        benchmark.sources_of(["nothing"], [], tmp_path)

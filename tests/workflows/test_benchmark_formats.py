@@ -57,12 +57,3 @@ def test_readers_of_others(tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), pixels[..., ::-1])
     np.testing.assert_array_equal(readers.picture_by_opencv(tmp_path / "a.png").pixels, pixels)
-
-
-def test_a_reader_that_is_not_there_is_said(tmp_path: Path) -> None:
-    tools = readers.Tools(None, None)
-    for call in (lambda: readers.splats_by_transform(tmp_path, tools), lambda: readers.points_by_copc(tmp_path, tools),
-                 lambda: readers.volume_by_openvdb(tmp_path, {}, tools)):  # fmt: skip
-        with pytest.raises(readers.Missing):
-            call()
-    assert "missing" in readers.validated(tmp_path, tools)

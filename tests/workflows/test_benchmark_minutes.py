@@ -53,19 +53,6 @@ def test_every_source_counts_as_a_version_and_nothing_else(tmp_path: Path) -> No
         seen.add(minutes.code_version(tmp_path))
 
 
-def test_the_table_says_what_differs_between_rows() -> None:
-    rows = [row(), row(budget=5, code="two"), row(method="nerfacto", ssim=None, peak_mib=None, stride=8, load=(2.0, 1, 1))]
-    lines = minutes.in_markdown(rows).splitlines()
-    assert {line.count("|") for line in lines[:5]} == {len(minutes.COLUMNS) + 1}
-    assert lines[2] == "| chair | efficientnerf | 1 | 33.46 | 0.9877 | 12.3 | 1,234 | 61 | 200 views |"
-    assert lines[4] == "| chair | nerfacto | 1 | 33.46 |  | 12.3 |  | 61 | 200 views, every 8th in x and y |"
-    assert lines[6].endswith("2 versions of the code: one, two.")
-    assert lines[8] == "Other work was running at the beginning of: chair 1."
-    assert len(minutes.in_markdown([row()]).splitlines()) == 3
-    measured = [row(load=(2.0, 1, 1), others=0.02), row(budget=5, others=0.94)]
-    assert minutes.in_markdown(measured).splitlines()[4:] == ["", "So many cores were busy with other work meanwhile: chair 5 (0.9)."]
-
-
 @pytest.mark.skipif(not machine.STAT.exists(), reason="no /proc/stat")
 def test_what_processors_worked_grows_by_what_this_process_works() -> None:
     begin, own = busy_seconds(), time.process_time()
@@ -75,20 +62,6 @@ def test_what_processors_worked_grows_by_what_this_process_works() -> None:
     end = busy_seconds()
     assert end is not None
     assert end - begin > 0.2
-
-
-@pytest.mark.parametrize("text", [None, "", "cpu one two", "cpu 1 2 3"])
-def test_where_the_system_does_not_say_what_processors_worked_there_is_no_figure(text: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if text is not None:
-        (tmp_path / "stat").write_text(text)
-    monkeypatch.setattr(machine, "STAT", tmp_path / "stat")
-    assert busy_seconds() is None
-
-
-@pytest.mark.parametrize("text", ["", minutes.BEGIN, f"{minutes.END} {minutes.BEGIN}", f"{minutes.BEGIN}{minutes.END}{minutes.BEGIN}{minutes.END}"])
-def test_a_document_without_one_pair_of_marks_is_left_alone(text: str) -> None:
-    with pytest.raises(ValueError, match="once each and in this order"):
-        minutes.put_between_marks(text, "table")
 
 
 def test_rows_are_measured_once_for_a_version_of_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,9 +101,3 @@ def test_rows_are_measured_once_for_a_version_of_the_code(tmp_path: Path, monkey
     quality_over_minutes.main([*call, "--minutes", "1"])
     assert asked[7:] == [("a", 1, ""), ("b", 1, "")]
     assert [r["minutes"] for r in json.loads((out / "quality_over_minutes.json").read_text())["rows"]] == [1, 5, 1] * 2
-
-
-def test_a_set_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"nothing: no folder .*Made scenes: object, court, window, gloss"):
-        quality_over_minutes.source_of("nothing", tmp_path, tmp_path)
-    assert quality_over_minutes.source_of("still_life", tmp_path, tmp_path)[0].is_dir()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import trimesh
 from benchmarks.scenes.catalogue import look_at
 from benchmarks.scenes.shapes import Box, Capsule, Disc, Ground, Material, Shape, Sphere
 from benchmarks.scenes.triangles import mesh_of, triangles
-from benchmarks.surface import Surface, aligned, distances, footprint, image_scores, own_figures, scores
+from benchmarks.surface import Surface, aligned, distances, footprint, image_scores, scores
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
@@ -74,20 +73,6 @@ def test_frames_are_aligned_by_a_similarity() -> None:
 
 def test_a_pixel_is_as_wide_as_its_distance_says() -> None:
     assert footprint(CAMERAS, np.zeros(3)) == pytest.approx(2.5 * np.hypot(1, 0.3) / (1.2 * 64))
-
-
-def test_a_run_s_own_figures_are_those_of_its_reports(tmp_path: Path) -> None:
-    assert own_figures(tmp_path) == {}
-    for name, document in (
-        ("mesh/report.json", {"silhouette_iou": 0.98, "area": 1.0}),
-        ("evaluate/metrics.json", {"asset": {"psnr": 30.0, "ssim": 0.9}, "mesh": {"psnr": 28.0, "psnr_vertex_colours": 27.0}}),
-    ):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_text(json.dumps(document))
-    expected = {"asset": {"silhouette_iou": 0.98}, "held_back": {"asset_psnr": 30.0, "psnr": 28.0, "psnr_vertex_colours": 27.0}}
-    assert own_figures(tmp_path) == expected
-    (tmp_path / "evaluate/metrics.json").write_text(json.dumps({"asset": {"psnr": 30.0}, "mesh": None}))
-    assert own_figures(tmp_path) == {"asset": expected["asset"]}
 
 
 @pytest.mark.parametrize(
