@@ -1,4 +1,4 @@
-"""Formats that a capture can come in: one file each, by family (apps, photogrammetry, datasets), a plain dict as the table.
+"""Formats that a capture can come in: one file each, or an entry in `datasets`; a plain dict as the table.
 
 Nothing heavy is imported until something is read.
 """
@@ -28,12 +28,14 @@ class Importer:
     posed    whether the format states cameras; else they are found from the photographs
     renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
     dialect  passed on to `recognises` and `read` where one module reads several formats
+    entry    of the module's table DATASETS, where that has the functions
     """
 
     module: str
     posed: bool = True
     renders: bool = False
     dialect: str | None = None
+    entry: str | None = None
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         """Whether a folder holds files of this format; BadInput where they cannot be read."""
@@ -58,7 +60,8 @@ class Importer:
         return paths
 
     def _function(self, name: str) -> Callable[..., Any]:
-        return getattr(import_module(f"{__name__}.{self.module}"), name)
+        module = import_module(f"{__name__}.{self.module}")
+        return getattr(module if self.entry is None else module.DATASETS[self.entry], name)
 
     @property
     def _dialect(self) -> tuple[str, ...]:
@@ -85,20 +88,20 @@ IMPORTERS: dict[str, Importer] = {
     "blender": Importer("transforms", renders=True, dialect="blender"),
     "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
     "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
-    "scannetpp": Importer("datasets.scannetpp"),
+    "scannetpp": Importer("datasets", entry="scannetpp"),
     "polycam": Importer("apps.polycam"),
     "record3d": Importer("apps.record3d"),
     "3d-scanner-app": Importer("apps.scanner_app"),
     "metashape": Importer("photogrammetry.metashape"),
     "realitycapture": Importer("photogrammetry.realitycapture"),
     "opensfm": Importer("photogrammetry.opensfm"),
-    "kapture": Importer("photogrammetry.kapture"),
+    "kapture": Importer("datasets", entry="kapture"),
     "llff": Importer("llff"),
     "colmap": Importer("colmap"),
-    "mvsnet": Importer("datasets.mvsnet"),
-    "idr": Importer("datasets.idr"),
-    "nsvf": Importer("datasets.nsvf", renders=True),
-    "tanks-and-temples": Importer("datasets.tanks"),
+    "mvsnet": Importer("datasets", entry="mvsnet"),
+    "idr": Importer("datasets", entry="idr"),
+    "nsvf": Importer("datasets", renders=True, entry="nsvf"),
+    "tanks-and-temples": Importer("datasets", entry="tanks-and-temples"),
     "photographs": Importer("photographs", posed=False),
 }
 FORMATS = ("auto", *IMPORTERS)
