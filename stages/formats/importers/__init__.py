@@ -28,7 +28,7 @@ class Importer:
     posed    whether the format states cameras; else they are found from the photographs
     renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
     dialect  passed on to `recognises` and `read` where one module reads several formats
-    entry    of the module's table DATASETS, where that has the functions
+    entry    the `ListFormat` of the module, where it has one in place of these functions
     """
 
     module: str
@@ -61,7 +61,7 @@ class Importer:
 
     def _function(self, name: str) -> Callable[..., Any]:
         module = import_module(f"{__name__}.{self.module}")
-        return getattr(module if self.entry is None else module.DATASETS[self.entry], name)
+        return getattr(module if self.entry is None else getattr(module, self.entry), name)
 
     @property
     def _dialect(self) -> tuple[str, ...]:
@@ -88,20 +88,20 @@ IMPORTERS: dict[str, Importer] = {
     "blender": Importer("transforms", renders=True, dialect="blender"),
     "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
     "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
-    "scannetpp": Importer("datasets", entry="scannetpp"),
-    "polycam": Importer("apps.polycam"),
-    "record3d": Importer("apps.record3d"),
+    "scannetpp": Importer("datasets", entry="SCANNETPP"),
+    "polycam": Importer("apps.polycam", entry="FORMAT"),
+    "record3d": Importer("apps.record3d", entry="FORMAT"),
     "3d-scanner-app": Importer("apps.scanner_app"),
-    "metashape": Importer("photogrammetry.metashape"),
-    "realitycapture": Importer("photogrammetry.realitycapture"),
-    "opensfm": Importer("photogrammetry.opensfm"),
-    "kapture": Importer("datasets", entry="kapture"),
+    "metashape": Importer("photogrammetry.metashape", entry="FORMAT"),
+    "realitycapture": Importer("photogrammetry.realitycapture", entry="FORMAT"),
+    "opensfm": Importer("photogrammetry.opensfm", entry="FORMAT"),
+    "kapture": Importer("datasets", entry="KAPTURE"),
     "llff": Importer("llff"),
     "colmap": Importer("colmap"),
-    "mvsnet": Importer("datasets", entry="mvsnet"),
-    "idr": Importer("datasets", entry="idr"),
-    "nsvf": Importer("datasets", renders=True, entry="nsvf"),
-    "tanks-and-temples": Importer("datasets", entry="tanks-and-temples"),
+    "mvsnet": Importer("datasets", entry="MVSNET"),
+    "idr": Importer("datasets", entry="IDR"),
+    "nsvf": Importer("datasets", renders=True, entry="NSVF"),
+    "tanks-and-temples": Importer("datasets", entry="TANKS"),
     "photographs": Importer("photographs", posed=False),
 }
 FORMATS = ("auto", *IMPORTERS)

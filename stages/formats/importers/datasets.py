@@ -30,13 +30,14 @@ from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.colmap_model import FISHEYE, as_traced, count_parameters
 from stages.formats.importers.frames import Frame
+from stages.formats.importers.listed import Listed, ListFormat
 from stages.formats.importers.llff import npy_header
 from stages.formats.importers.matrices import decomposed, from_world, pinhole_frame
-from stages.formats.importers.source import MAX_FRAMES, ImportSettings, Source, images_in
+from stages.formats.importers.source import MAX_FRAMES, Source, images_in
 from stages.formats.importers.texts import head, number, numbers, read_text
 from stages.formats.importers.transforms import read_document
 from stages.formats.importers.transforms_camera import lens_of, pose_of
-from stages.io.capture import Capture, SparsePoints
+from stages.io.capture import SparsePoints
 from stages.io.json_file import LARGEST_NUMBER, finite, read_json
 
 MAX_CAMERA_BYTES = 1 << 16  # of a text file with one camera
@@ -45,56 +46,6 @@ MAX_POINTS = 5_000_000
 MAX_RIGS = 8  # within each other
 DTU_LIGHT = 3  # of seven: each view has it
 _AGAIN = "Write or download the data set again, or choose another format with --as."
-
-
-@dataclass
-class Listed:
-    """What a data set lists.
-
-    where   what messages call it
-    texts   the files that state the cameras
-    more    further arguments of `frames.capture_of`
-    """
-
-    where: str
-    frames: list[Frame]
-    texts: list[Path]
-    more: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """How one format is read; see `stages.formats.importers.Importer`.
-
-    expected  what a folder of it holds, for messages
-    signs     files by which a folder is recognised: none, where it is of another format
-    listed    what these say
-    """
-
-    kind: str
-    expected: str
-    signs: Callable[[Source], Sequence[Path]]
-    listed: Callable[[Source, Sequence[Path]], Listed]
-
-    def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
-        return bool(self.signs(Source(folder, allow_outside)))
-
-    def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
-        """What states the cameras, the images and their masks. Raises BadInput."""
-        source, found = self._read(folder, settings)
-        return [*found.texts, *frames.files_of(source, found.frames)]
-
-    def read(self, folder: Path, settings: ImportSettings) -> Capture:
-        """Raises BadInput."""
-        source, found = self._read(folder, settings)
-        return frames.capture_of(source, found.frames, settings, kind=self.kind, where=found.where, **found.more)
-
-    def _read(self, folder: Path, settings: ImportSettings) -> tuple[Source, Listed]:
-        source = Source(folder, settings.allow_outside)
-        signs = self.signs(source)
-        if not signs:
-            raise BadInput(f"{source.root}: no data set of {self.kind}: expected {self.expected}. Choose another format with --as.")
-        return source, self.listed(source, signs)
 
 
 def _folder(base: Path, names: Sequence[str]) -> Path:
@@ -108,7 +59,7 @@ def _images(base: Path, names: Sequence[str]) -> list[Path]:
 
 
 # ScanNet++. File -> folders of images and of masks.
-SCANNETPP = {
+SCANNETPP_LISTS = {
     "nerfstudio/transforms.json": (("resized_images", "images", "original_images"), ("resized_anon_masks", "masks")),
     "nerfstudio/transforms_undistorted.json": (("resized_undistorted_images", "undistorted_images"), ("resized_undistorted_masks", "undistorted_anon_masks")),
 }
@@ -116,7 +67,9 @@ SCANNETPP = {
 
 def _scannetpp_files(source: Source) -> Sequence[Path]:
     """The lists, those whose images are there first."""
-    found = [(base / name, folders) for base in (source.root, source.root / "dslr") for name, (folders, _) in SCANNETPP.items() if (base / name).is_file()]
+    found = [
+        (base / name, folders) for base in (source.root, source.root / "dslr") for name, (folders, _) in SCANNETPP_LISTS.items() if (base / name).is_file()
+    ]
     found.sort(key=lambda one: not any((one[0].parents[1] / folder).is_dir() for folder in one[1]))
     return [source.check_inside(path) for path, _ in found]
 
@@ -124,7 +77,7 @@ def _scannetpp_files(source: Source) -> Sequence[Path]:
 def _scannetpp(source: Source, signs: Sequence[Path]) -> Listed:
     file, base, where = signs[0], signs[0].parents[1], source.name_of(signs[0])
     document = read_document(source.real(file))
-    images, masks = (_folder(base, names) for names in SCANNETPP[f"nerfstudio/{file.name}"])
+    images, masks = (_folder(base, names) for names in SCANNETPP_LISTS[f"nerfstudio/{file.name}"])
     more = document.get("test_frames", [])
     if not isinstance(more, list):
         raise BadInput(f"{where}: test_frames is no list. {_AGAIN}")
@@ -144,7 +97,7 @@ def _scannetpp(source: Source, signs: Sequence[Path]) -> Listed:
         place = f"{where}: frame {index} ({printable(image, frames.MAX_NAME)})"
         listed.append(Frame(image, images, place, _with_lens(document | entry, pose_of(entry, place), place), mask=mask, split=splits.get(image, split)))
     texts = [file, lists] if lists.is_file() else [file]
-    return Listed(where, listed, texts, {"rejected": bad, "up": np.array([0.0, 0.0, 1.0]), "metric": True})
+    return Listed(where, listed, texts, more={"rejected": bad, "up": np.array([0.0, 0.0, 1.0]), "metric": True})
 
 
 def _with_lens(stated: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
@@ -214,7 +167,7 @@ def _kapture(source: Source, signs: Sequence[Path]) -> Listed:
         place = f"{where} ({printable(name, frames.MAX_NAME)})"
         listed.append(Frame(name, source.root / "sensors/records_data", place, frames.stated(camera)))
         frames.check_count(len(listed), RECORDS)
-    return Listed(RECORDS, listed, list(signs), {"rejected": unposed, "points": lambda places: _kapture_points(source, places)})
+    return Listed(RECORDS, listed, signs, more={"rejected": unposed, "points": lambda places: _kapture_points(source, places)})
 
 
 def _rows(source: Source, name: str, least: int) -> Iterator[tuple[str, list[str]]]:
@@ -317,7 +270,7 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
         folders = [source.root / name for name in ("images", "blended_images", "image", "rgb", ".")]
         beside = next((folder for folder in folders if source.find(stem, folder).how == "listed"), source.root)
         listed.append(Frame(stem, beside, where, camera, bare=True))
-    return Listed(source.name_of(place), listed, list(signs), {"facts": {"cameras": source.name_of(place)}})
+    return Listed(source.name_of(place), listed, signs, more={"facts": {"cameras": source.name_of(place)}})
 
 
 # IDR
@@ -344,7 +297,7 @@ def _idr(source: Source, signs: Sequence[Path]) -> Listed:
         k = k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         mask = source.check_inside(masks[index]) if masks else None
         listed.append(Frame(image.name, image.parent, place, pinhole_frame(k, pose, place), mask=mask))
-    return Listed(where, listed, list(signs), {"bounds": _idr_bounds(matrices, where), "facts": {"cameras": where}})
+    return Listed(where, listed, signs, more={"bounds": _idr_bounds(matrices, where), "facts": {"cameras": where}})
 
 
 def _idr_bounds(matrices: dict[str, np.ndarray], where: str) -> np.ndarray | None:
@@ -416,11 +369,11 @@ def _nsvf(source: Source, signs: Sequence[Path]) -> Listed:
         listed.append(Frame(path.stem, beside, where, camera, bare=True, split=split.get(path.name[:2])))
     box = source.root / "bbox.txt"
     if not box.is_file():
-        return Listed("pose", listed, list(signs))
+        return Listed("pose", listed, signs)
     corners = numbers(read_text(source.real(box), MAX_CAMERA_BYTES).split()[:6], 6, box.name).reshape(2, 3)
     if not (corners[0] < corners[1]).all():
         raise BadInput(f"{box.name}: {corners.tolist()}; expected the lower corner, then the upper one. {_AGAIN}")
-    return Listed("pose", listed, [*signs, box], {"bounds": corners})
+    return Listed("pose", listed, [*signs, box], more={"bounds": corners})
 
 
 def _intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
@@ -497,17 +450,12 @@ def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
         pose = lenses.rigid(numbers(words[19 * row + 3 : 19 * row + 19], 16, place).reshape(4, 4), place)
         image = images[int(index)]
         listed.append(Frame(image.name, image.parent, place, pinhole_frame(k, pose, source.name_of(lens), stated)))
-    return Listed(where, listed, [signs[0], lens], {"facts": {"intrinsics": source.name_of(lens)}})
+    return Listed(where, listed, [signs[0], lens], more={"facts": {"intrinsics": source.name_of(lens)}})
 
 
-DATASETS = {
-    data.kind: data
-    for data in (
-        Dataset("scannetpp", f"{' or '.join(SCANNETPP)}, here or in dslr/", _scannetpp_files, _scannetpp),
-        Dataset("kapture", f"{SENSORS}, which begins with '# kapture format', and {RECORDS}", _kapture_files, _kapture),
-        Dataset("mvsnet", "cams/00000000_cam.txt and so on", _mvsnet_files, _mvsnet),
-        Dataset("idr", "cameras_sphere.npz or cameras.npz", _idr_files, _idr),
-        Dataset("nsvf", "intrinsics.txt and pose/<name>.txt", _nsvf_files, _nsvf),
-        Dataset("tanks-and-temples", "one trajectory (.log) beside the folder of images", _tanks_files, _tanks),
-    )
-}
+SCANNETPP = ListFormat("scannetpp", f"{' or '.join(SCANNETPP_LISTS)}, here or in dslr/", _scannetpp_files, _scannetpp)
+KAPTURE = ListFormat("kapture", f"{SENSORS}, which begins with '# kapture format', and {RECORDS}", _kapture_files, _kapture)
+MVSNET = ListFormat("mvsnet", "cams/00000000_cam.txt and so on", _mvsnet_files, _mvsnet)
+IDR = ListFormat("idr", "cameras_sphere.npz or cameras.npz", _idr_files, _idr)
+NSVF = ListFormat("nsvf", "intrinsics.txt and pose/<name>.txt", _nsvf_files, _nsvf)
+TANKS = ListFormat("tanks-and-temples", "one trajectory (.log) beside the folder of images", _tanks_files, _tanks)
