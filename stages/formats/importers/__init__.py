@@ -91,7 +91,7 @@ IMPORTERS: dict[str, Importer] = {
     "scannetpp": Importer("datasets", entry="SCANNETPP"),
     "polycam": Importer("apps.polycam", entry="FORMAT"),
     "record3d": Importer("apps.record3d", entry="FORMAT"),
-    "3d-scanner-app": Importer("apps.scanner_app"),
+    "3d-scanner-app": Importer("apps.scanner_app", entry="FORMAT"),
     "metashape": Importer("photogrammetry.metashape", entry="FORMAT"),
     "realitycapture": Importer("photogrammetry.realitycapture", entry="FORMAT"),
     "opensfm": Importer("photogrammetry.opensfm", entry="FORMAT"),

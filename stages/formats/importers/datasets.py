@@ -147,10 +147,12 @@ class _Devices:
 
 
 def _kapture_files(source: Source) -> Sequence[Path]:
-    path = source.root / SENSORS
-    if not path.is_file() or "kapture format" not in head(source.real(path), 200):
-        return []
     return [source.root / name for name in (SENSORS, RECORDS, TRAJECTORIES, RIGS, POINTS, OBSERVATIONS) if (source.root / name).is_file()]
+
+
+def _is_kapture(source: Source, signs: Sequence[Path]) -> bool:
+    path = source.root / SENSORS
+    return path in signs and "kapture format" in head(source.real(path), 200)
 
 
 def _kapture(source: Source, signs: Sequence[Path]) -> Listed:
@@ -454,7 +456,7 @@ def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
 
 
 SCANNETPP = ListFormat("scannetpp", f"{' or '.join(SCANNETPP_LISTS)}, here or in dslr/", _scannetpp_files, _scannetpp)
-KAPTURE = ListFormat("kapture", f"{SENSORS}, which begins with '# kapture format', and {RECORDS}", _kapture_files, _kapture)
+KAPTURE = ListFormat("kapture", f"{SENSORS} and {RECORDS}", _kapture_files, _kapture, _is_kapture)
 MVSNET = ListFormat("mvsnet", "cams/00000000_cam.txt and so on", _mvsnet_files, _mvsnet)
 IDR = ListFormat("idr", "cameras_sphere.npz or cameras.npz", _idr_files, _idr)
 NSVF = ListFormat("nsvf", "intrinsics.txt and pose/<name>.txt", _nsvf_files, _nsvf)

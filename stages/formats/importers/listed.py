@@ -39,18 +39,22 @@ class Listed:
 class ListFormat:
     """See `stages.formats.importers.Importer`.
 
-    expected  what a folder of this format holds, for messages
-    signs     files by which a folder is recognised; none where it is of another format
-    listed    what the source states; BadInput where it cannot be read
+    expected    what a folder of this format holds, for messages
+    signs       files that a folder of this format has
+    listed      what the source states; BadInput where it cannot be read
+    recognised  whether they are of this format, where their being there does not tell
     """
 
     kind: str
     expected: str
     signs: Callable[[Source], Sequence[Path]]
     listed: Callable[[Source, Sequence[Path]], Listed]
+    recognised: Callable[[Source, Sequence[Path]], bool] = lambda source, signs: True
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
-        return bool(self.signs(Source(folder, allow_outside)))
+        source = Source(folder, allow_outside)
+        signs = self.signs(source)
+        return bool(signs) and self.recognised(source, signs)
 
     def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
         """What states the cameras, the images, their masks and depth maps. Raises BadInput."""
