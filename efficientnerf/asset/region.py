@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.cameras import Similarity
 
-REGIONS = ("foreground", "all")
-
 
 @dataclass(frozen=True, eq=False)
 class Region:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from workflows.cli.resolve import Settings
 
 TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
-REGIONS = ("foreground", "all")  # efficientnerf.asset.region.REGIONS, which a test compares; that import is heavy
+REGIONS = ("foreground", "all")
 EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
 Crop = tuple[float, float, float, float, float, float] | None
 

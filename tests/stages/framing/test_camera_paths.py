@@ -13,13 +13,13 @@ import av
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import REGIONS, Region
+from efficientnerf.asset.region import Region
 from efficientnerf.asset.rendering import MOST_PIXELS, Rendering
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError
-from stages.figures.frames import RenderOptions, render_path
+from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.framing.camera_paths import PATHS, orbit_of, pose_on_sphere, similarity_of, turntable_cameras
 from stages.framing.captured import captured_metadata, captured_of
 from stages.io.camera_path import read_camera_path
@@ -218,14 +218,15 @@ def test_a_path_is_drawn(tmp_path: Path) -> None:
     tree = BallTree(similarity=SIMILARITY)
     cameras = read_camera_path(path_file(tmp_path), SIMILARITY, width=40).cameras
     steps: list[tuple[int, int]] = []
-    options = RenderOptions(background="transparent", exr="all", video="path.mp4", fps=24)
-    written = render_path(tree, cameras, tmp_path / "out", options, lambda done, total: steps.append((done, total)), BallTree.render)
-    names = ["frame_0000.png", "frame_0000.exr", "frame_0001.png", "frame_0001.exr", "path.mp4"]
+    options = RenderOptions(background="transparent", exr="all", fps=24)
+    written = render_frames(tree, cameras, tmp_path / "out", options, lambda done, total: steps.append((done, total)), draw=BallTree.render)
+    names = ["frame_0000.png", "frame_0000.exr", "frame_0001.png", "frame_0001.exr"]
     assert [path.name for path in written] == names
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(names)
     assert steps == [(0, 2), (1, 2), (2, 2)]
     assert read_png(written[0]).shape == (32, 40, 4)
-    with av.open(str(written[-1])) as container:
+    encode_frames([path for path in written if path.suffix == ".png"], tmp_path / "path.mp4", options)
+    with av.open(str(tmp_path / "path.mp4")) as container:
         first = next(container.decode(video=0)).to_ndarray(format="rgb24")
     assert first[:4, :4].min() > 250, "what is transparent lies on white in the video"
 
@@ -233,7 +234,7 @@ def test_a_path_is_drawn(tmp_path: Path) -> None:
 def test_an_unknown_background_is_refused_before_anything_is_drawn(tmp_path: Path) -> None:
     cameras = turntable_cameras(BallTree(), frames=1, width=16, height=16)
     with pytest.raises(UsageError, match="background"):
-        render_path(BallTree(), cameras, tmp_path / "out", RenderOptions(background="paper"))
+        render_frames(BallTree(), cameras, tmp_path / "out", RenderOptions(background="paper"))
     assert not (tmp_path / "out").exists()
 
 
@@ -280,9 +281,9 @@ def test_an_environment_is_behind_frames_unless_a_background_is_asked_for(tmp_pa
         return Rendering(blue, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32), np.zeros((*shape, 3), np.float32))
 
     for background, expected in (("auto", [0, 0, 255]), ("white", [255, 255, 255]), ("#ff0000", [255, 0, 0]), ("transparent", [0, 0, 0, 0])):
-        render_path(tree, [camera], tmp_path / background, RenderOptions(background=background, video=None, exr="off"), draw=draw)
+        render_frames(tree, [camera], tmp_path / background, RenderOptions(background=background, video=None, exr="off"), draw=draw)
         assert read_png(tmp_path / background / "frame_0000.png")[0, 0].tolist() == expected
-    render_path(replace(tree, environment=None), [camera], tmp_path / "none", RenderOptions(video=None, exr="off"), draw=draw)
+    render_frames(replace(tree, environment=None), [camera], tmp_path / "none", RenderOptions(video=None, exr="off"), draw=draw)
     assert read_png(tmp_path / "none" / "frame_0000.png")[0, 0].tolist() == [255, 255, 255]
 
 
@@ -415,7 +416,7 @@ def test_coverage_of_cameras_round_a_point() -> None:
 
 def test_paths_of_the_setting_are_those_that_there_are() -> None:
     assert typing.get_args(typing.get_type_hints(TurntableSettings)["path"]) == PATHS
-    assert typing.get_args(typing.get_type_hints(TurntableSettings)["region"]) == REGIONS
+    assert typing.get_args(typing.get_type_hints(TurntableSettings)["region"]) == ("foreground", "all")
 
 
 @pytest.mark.parametrize("path", ["orbit", "sway"])

@@ -14,7 +14,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from efficientnerf.asset import format, region
+from efficientnerf.asset import format
 from efficientnerf.asset.cascades import cascade_grids, nested
 from efficientnerf.asset.region import Region
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -29,7 +29,7 @@ from stages.turntable.run import TurntableSettings
 from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
-from workflows.cli.files import EXR, REGIONS, TEXTURES
+from workflows.cli.files import EXR, TEXTURES
 from workflows.cli.main import enerf as enerf_commands
 from workflows.exporting import faces_from_text
 
@@ -314,10 +314,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "scene.nerftree"
     format.save(replace(nested(trees, np.tile(np.float32([0, 1, 0]), (8, 16, 1))), region=around, metadata=metadata), path, "sparse")
     return path
-
-
-def test_regions_that_can_be_asked_for_are_those_that_there_are() -> None:
-    assert REGIONS == region.REGIONS
 
 
 def test_exports_take_the_foreground_unless_all_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
