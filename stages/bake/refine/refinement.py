@@ -133,7 +133,7 @@ class Refinement:
                 job.say(f"{budget.schedule.iterations} steps with {phase} fit into the budget")
             fraction = point.schedule.fraction(state.step)
             shown = self.log.record(state, phase, fraction, settings.refine_rays_per_batch, error, took, last=state.step == end)
-            self._report(fraction, phase, shown)
+            self._report(phase, shown)
             if clock() - self.written > CHECKPOINT_SECONDS:
                 self._save()
             try:
@@ -145,7 +145,7 @@ class Refinement:
                 break
             step_began = clock()
 
-    def _report(self, fraction: float, phase: str, shown: dict[str, Any]) -> None:
+    def _report(self, phase: str, shown: dict[str, Any]) -> None:
         """Progress: in steps, or in seconds where there is a budget."""
         schedule, step = self.point.schedule, self.point.state.step
         done, total = (step, schedule.begin(len(schedule.each))) if self.budget is None else (self.stopwatch.seconds, self.budget)

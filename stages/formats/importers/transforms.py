@@ -127,7 +127,7 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     kind = kind or dialect(source)
     where = ", ".join(file.name for file in json_files(folder))
     listing = _list_frames(source)
-    photos, unreadable, remarks, lens_warnings = _photos(source, listing, kind)
+    photos, unreadable, remarks, lens_warnings = _photos(source, listing)
     rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *((name, why) for name, why, _ in unreadable)]
     warnings = missing_images_warning(where, listing.total, len(photos), listing.missing, settings.strict, _REMEDY)
     if len(photos) < MIN_IMAGES:
@@ -226,7 +226,7 @@ def _plain(name: str) -> str:
     return name.removeprefix("./").replace("\\", "/")
 
 
-def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str, Path]], dict[str, list[str]], list[str]]:
+def _photos(source: Source, listing: _Listing) -> tuple[list[Photo], list[tuple[str, str, Path]], dict[str, list[str]], list[str]]:
     """Photos, the unreadable as (name, reason, file), what `lenses.fit_to_images` remarks, and warnings."""
     photos: list[Photo] = []
     rejected: list[tuple[str, str, Path]] = []
