@@ -19,7 +19,7 @@ from typing import Any
 
 from workflows.paper import tables
 from workflows.paper.result import PAPER, Request, Result, Table
-from workflows.paper.structures.table import structures
+from workflows.paper.table7 import structures
 
 __all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
 

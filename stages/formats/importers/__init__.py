@@ -1,4 +1,4 @@
-"""Formats that a capture can come in: one file each, or an entry in `datasets`; a plain dict as the table.
+"""Formats that a capture can come in: one file each, or an entry in `datasets.published`; a plain dict as the table.
 
 Nothing heavy is imported until something is read.
 """
@@ -88,20 +88,20 @@ IMPORTERS: dict[str, Importer] = {
     "blender": Importer("transforms", renders=True, dialect="blender"),
     "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
     "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
-    "scannetpp": Importer("datasets", entry="SCANNETPP"),
+    "scannetpp": Importer("datasets.published", entry="SCANNETPP"),
     "polycam": Importer("apps.polycam", entry="FORMAT"),
     "record3d": Importer("apps.record3d", entry="FORMAT"),
     "3d-scanner-app": Importer("apps.scanner_app", entry="FORMAT"),
     "metashape": Importer("photogrammetry.metashape", entry="FORMAT"),
     "realitycapture": Importer("photogrammetry.realitycapture", entry="FORMAT"),
     "opensfm": Importer("photogrammetry.opensfm", entry="FORMAT"),
-    "kapture": Importer("datasets", entry="KAPTURE"),
+    "kapture": Importer("datasets.published", entry="KAPTURE"),
     "llff": Importer("llff"),
     "colmap": Importer("colmap"),
-    "mvsnet": Importer("datasets", entry="MVSNET"),
-    "idr": Importer("datasets", entry="IDR"),
-    "nsvf": Importer("datasets", renders=True, entry="NSVF"),
-    "tanks-and-temples": Importer("datasets", entry="TANKS"),
+    "mvsnet": Importer("datasets.published", entry="MVSNET"),
+    "idr": Importer("datasets.published", entry="IDR"),
+    "nsvf": Importer("datasets.published", renders=True, entry="NSVF"),
+    "tanks-and-temples": Importer("datasets.published", entry="TANKS"),
     "photographs": Importer("photographs", posed=False),
 }
 FORMATS = ("auto", *IMPORTERS)

@@ -10,7 +10,7 @@ import pytest
 from workflows.cli.main import main
 from workflows.paper.document import make
 from workflows.paper.result import Repetitions, Request
-from workflows.paper.structures.table import COLUMNS, NAMES, Case
+from workflows.paper.table7 import COLUMNS, NAMES, Case
 
 ONCE = Repetitions(cachings=1, queries=1)
 
@@ -37,7 +37,7 @@ def test_table_7_compares_all_structures(tmp_path: Path) -> None:
 
 
 def test_the_torch_versions_fill_the_same_table() -> None:
-    from workflows.paper.structures import table
+    from workflows.paper import table7 as table
 
     rows, note = table._measure(Case(32, 0.2), 1000, table._in_torch("cpu"), ONCE)
     assert [row["structure"] for row in rows] == list(NAMES.values())

@@ -29,10 +29,10 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.colmap_model import FISHEYE, as_traced, count_parameters
+from stages.formats.importers.datasets.matrices import decomposed, from_world, pinhole_frame
 from stages.formats.importers.frames import Frame
 from stages.formats.importers.listed import Listed, ListFormat
 from stages.formats.importers.llff import npy_header
-from stages.formats.importers.matrices import decomposed, from_world, pinhole_frame
 from stages.formats.importers.source import MAX_FRAMES, Source, images_in
 from stages.formats.importers.texts import head, number, numbers, read_text
 from stages.formats.importers.transforms import read_document
