@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from efficientnerf.asset.format import load, outline
 from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit
 from stages.artifacts import MeshOutputs
@@ -19,9 +18,7 @@ from stages.bake import run as bake
 from stages.bake.run import BakeSettings
 from stages.evaluate import run as evaluate
 from stages.memory.plan import memory_needed
-from stages.memory.rendering import tree_bytes
 from stages.mesh import run as mesh
-from stages.mesh.memory import surface_needed
 from stages.points import run as points
 from stages.poses.memory import features_needed
 from stages.splats import run as splats
@@ -29,9 +26,8 @@ from stages.train import run as train
 from stages.turntable import run as turntable
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
-from workflows.asset import NAMES, STAGES, WORKFLOW
+from workflows.asset import STAGES
 
-GOLDEN = Path(__file__).parents[2] / "data" / "golden"
 GIB = 2**30
 DEFAULTS: dict[str, Any] = {stage.name: stage.settings() for stage in STAGES}
 QUICK = {"iterations": 4, "sample_batch_size": 1024, "occupancy_warmup_steps": 2, "preview_every": "off"}
@@ -82,13 +78,6 @@ def test_training_and_baking_take_no_more_than_was_foretold(run: tuple[Path, dic
     assert (memory_needed("bake", place, (), larger) or 0) > at_most + GIB
 
 
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_without_what_it_reads_nothing_is_foretold_but_of_the_first_stage(tmp_path: Path, device: str) -> None:
-    found = {name: memory_needed(name, tmp_path / "run", (tmp_path,), DEFAULTS, device) for name in NAMES}
-    assert [name for name, needed in found.items() if needed is not None] == ["poses"]
-    assert WORKFLOW.memory is memory_needed
-
-
 def test_photographs_are_foretold_by_their_headers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     for number in range(3):
@@ -102,12 +91,3 @@ def test_photographs_are_foretold_by_their_headers(tmp_path: Path, monkeypatch: 
     larger = memory_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS)
     assert larger is not None
     assert larger > expected + GIB // 2
-
-
-@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.nerftree")), ids=lambda path: path.stem)
-def test_the_outline_of_an_asset_takes_what_the_asset_does(path: Path) -> None:
-    whole, claimed = load(path), outline(path)
-    assert tree_bytes(claimed) == tree_bytes(whole)
-    assert surface_needed(claimed, 1000, 512, 10**6, dense=True) == surface_needed(whole, 1000, 512, 10**6, dense=True)
-    assert (claimed.resolution, claimed.degree, len(claimed.outer)) == (whole.resolution, whole.degree, len(whole.outer))
-    assert claimed.harmonics_count == whole.harmonics_count
