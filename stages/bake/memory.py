@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,7 +21,6 @@ from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
 from stages.bake.plan import Plan
-from stages.bake.pruning import most_children
 from stages.bake.resolution import MAX_CASCADES
 from stages.bake.resolution import MAX_CELLS as MAX_COARSE_CELLS
 from stages.bake.settings import BakeSettings
@@ -102,13 +101,13 @@ def needed(
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     settings, channels = job.settings, channels_of(job.inputs["poses"], views)
-    finest, voxels, at_most = most_needed(settings, Trained(m.settings, m.space, m.fine.degree), s, views, channels, mib, splits, whole, job.device)
+    finest, voxels, at_most = most_needed(settings, Trained(m.settings, m.space, m.fine.degree), s, views, channels, mib, whole, job.device)
     stored = not has_room(job, at_most(voxels, stored=False))
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
@@ -119,17 +118,16 @@ def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: 
 
 
 def most_needed(
-    settings: BakeSettings, trained: Trained, s: Scene, views: Sequence[View], channels: int, mib: float, splits: int, whole: bool, device: str
+    settings: BakeSettings, trained: Trained, s: Scene, views: Sequence[View], channels: int, mib: float, whole: bool, device: str
 ) -> tuple[int, int, AtMost]:
     """What baking takes at most, before its voxels are counted.
 
     mib      that the asset may have
-    splits   how often voxels will be split
     returns  voxels along the finest grid in question; how many are baked at most; and a function from a number of voxels to what it takes
     """
     finest, cells = _finest_cells(settings, trained, s, whole=whole)
     room = most_voxels(int(mib * 2**20), settings.layout, trained.degree, (1, 1, 1), settings.brick_size)
-    voxels = min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3)
+    voxels = min(MAX_OVERSHOOT * room, cells * settings.brick_size**3)
 
     def at_most(count: int, *, stored: bool) -> Need:
         about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": trained.degree, "whole": whole, "device": device}
@@ -150,17 +148,13 @@ def _finest_cells(settings: BakeSettings, trained: Trained, s: Scene, *, whole: 
     return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
-def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: Pixels, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
+def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: Pixels, plan: Plan, mib: float) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
-    pixels        as they were placed
-    splits, room  how often voxels will be split, and how many there is room for then
+    pixels  as they were placed
     """
     whole, voxels = plan.samples is not None, plan.voxels
-    if splits:
-        voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
-    bricks = -(-plan.bricks * voxels // max(plan.voxels, 1))
-    about: dict[str, Any] = {"cells": plan.cells * 8**splits, "bricks": bricks, "voxels": voxels, "degree": m.fine.degree, "whole": whole, "device": job.device}
+    about: dict[str, Any] = {"cells": plan.cells, "bricks": plan.bricks, "voxels": voxels, "degree": m.fine.degree, "whole": whole, "device": job.device}
     need = needed(job.settings, m.settings, views, pixels.images.shape[1], **about, stored=isinstance(pixels.images, PixelFile))
     harmonics = (m.fine.degree + 1) ** 2
     remedy = f"Lower bake.max_mib ({mib:g}) or bake.resolution ({plan.choice.resolution}): {voxels:,} voxels with {harmonics} harmonics are too many."

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from efficientnerf.asset.format import outline
-from efficientnerf.asset.refinement import schedule
 from efficientnerf.settings import given
 from stages.artifacts import (
     BakeInputs,
@@ -104,9 +103,8 @@ def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
     views, whole = views_of(s, "train"), constant_background(s) is None
     trained = with_auto_sizes(settings["train"], s, count_pixels(views))
     mib = size_limits(own, s, device, count_cores(), whole=whole, discretise=given(trained.discretise))[1]
-    splits = schedule.count_splits(schedule.PHASES)
     known = Trained(trained, space_of(s), trained.sh_degree)
-    _, voxels, at_most = most_needed(own, known, s, views, channels_of(folder, views), mib, splits, whole, device)
+    _, voxels, at_most = most_needed(own, known, s, views, channels_of(folder, views), mib, whole, device)
     return at_most(voxels, stored=False)
 
 

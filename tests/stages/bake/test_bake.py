@@ -18,7 +18,7 @@ from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format
 from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.file import serialisation
-from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
+from efficientnerf.asset.refinement.schedule import stated_schedule
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.rendering.compositing import activate
@@ -38,7 +38,7 @@ from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
 from tests.stages.spoilers import SPOILERS
 
-TWELVE = stated_schedule(PHASES, 12)
+TWELVE = stated_schedule(12)
 QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512, lr_final_ratio=0.3)
 
 
