@@ -26,7 +26,7 @@ from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
-from stages.bake import memory, resolution
+from stages.bake import memory, resolution, whole_scene
 from stages.bake import run as bake
 from stages.bake.refine import checkpoint, refinement
 from stages.bake.settings import BakeSettings
@@ -272,7 +272,8 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
     monkeypatch.setattr(resolution, "VOXEL_PIXELS", 0.2)
     sizes = {}
     for room in (10**7, 20_000):
-        monkeypatch.setattr(serialisation, "most_voxels", lambda *asked, room=room, **beside: room)
+        for module in (serialisation, whole_scene):
+            monkeypatch.setattr(module, "most_voxels", lambda *asked, room=room, **beside: room)
         made = job(tmp_path / str(room), fitted, **inputs)
         run(made)
         report = json.loads((made.out / "report.json").read_text())
