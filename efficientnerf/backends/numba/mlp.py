@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tiles import (
+from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.numba.vector.products import (
     LANES,
     ROWS,
     Matrix,

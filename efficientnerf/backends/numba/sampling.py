@@ -14,7 +14,8 @@ import numpy as np
 from efficientnerf.backends.numba import intervals
 from efficientnerf.backends.numba.intervals import LANES
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.vector.maths import lowest_bit
+from efficientnerf.backends.numba.vector.memory import pointer
 from efficientnerf.geometry.spaces import FARTHEST
 
 BLOCK = 64  # rays per task
@@ -69,14 +70,14 @@ def _find_valid(  # type: ignore[no-untyped-def]
         p_state = pointer(state)
         for _ in range(max_intervals):
             if contracted:
-                masks = intervals.next_intervals_contracted(p_state, grid, side, step, farthest)
+                masks = intervals.next_intervals(p_state, grid, side, step, farthest, True)
             else:
-                masks = intervals.next_intervals_bounded(p_state, grid, side, step, farthest)
+                masks = intervals.next_intervals(p_state, grid, side, step, farthest, False)
             if masks == 0:
                 break
             valid = masks >> LANES
             while valid != 0:
-                lane = intervals.lowest_bit(valid)
+                lane = lowest_bit(valid)
                 valid &= valid - 1
                 r = begin + lane
                 starts[r, counts[r]] = state[intervals.START, lane]

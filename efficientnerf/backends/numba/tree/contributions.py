@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import SampleBuffer, TreeGrid, corner_weight, walk, walk_pointers
+from efficientnerf.backends.numba.vector.memory import pointer
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.queries import normal_at
 from efficientnerf.backends.numba.tree.walk import SampleBuffer, tree_grid, walk_on, walk_pointers
+from efficientnerf.backends.numba.vector.memory import pointer
 from efficientnerf.rendering.harmonics import basis_numpy
 
 if TYPE_CHECKING:

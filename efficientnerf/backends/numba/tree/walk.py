@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.leaps import leaps
+from efficientnerf.backends.numba.vector.memory import pointer
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.walk import TreeGrid
+from efficientnerf.backends.numba.vector.memory import pointer
 
 
 class Cells(NamedTuple):

@@ -20,10 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import fmuladd, pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree_training.cells import Cells, tree_pointers
-from efficientnerf.backends.numba.tree_training.corners import add_spread, mixed
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
     FIRST_BLOCKS,
@@ -37,7 +35,9 @@ from efficientnerf.backends.numba.tree_training.packets import (
     walk_ray,
 )
 from efficientnerf.backends.numba.tree_training.scalars import cast_like, sigmoid
-from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
+from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corners
+from efficientnerf.backends.numba.vector.maths import fma
+from efficientnerf.backends.numba.vector.memory import fetch_add, pointer, prefetch
 
 CHUNK = 32  # packets
 BIN_BITS = 15  # voxels of a bin, power of two
@@ -126,9 +126,9 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
         at, row = 4 * np.int64(packet.stored[2 * n]), width * np.int64(packet.stored[2 * n + 1])
         red, green, blue = basis[0] * sh[row], basis[0] * sh[row + 1], basis[0] * sh[row + 2]
         for k in range(1, terms):
-            red = fmuladd(basis[k], sh[row + 3 * k], red)
-            green = fmuladd(basis[k], sh[row + 3 * k + 1], green)
-            blue = fmuladd(basis[k], sh[row + 3 * k + 2], blue)
+            red = fma(basis[k], sh[row + 3 * k], red)
+            green = fma(basis[k], sh[row + 3 * k + 1], green)
+            blue = fma(basis[k], sh[row + 3 * k + 2], blue)
         packet.colour[at], packet.colour[at + 1], packet.colour[at + 2], packet.colour[at + 3] = red, green, blue, 1
     return found
 
@@ -136,7 +136,7 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _shade(n, packet):  # type: ignore[no-untyped-def]
     """Colour of a sample, sigmoids of what is interpolated between the corners that are stored; kept in `packet.shade`."""
-    red, green, blue, total = mixed(packet.colour, packet.slots, packet.weights, 8 * n)
+    red, green, blue, total = mix_corners(packet.colour, packet.slots, packet.weights, 8 * n, 1, 4)
     inverse = cast_like(1, total) / total if total > 0 else 0 * total
     r, g, b = sigmoid(red * inverse), sigmoid(green * inverse), sigmoid(blue * inverse)
     packet.shade[4 * n], packet.shade[4 * n + 1], packet.shade[4 * n + 2], packet.shade[4 * n + 3] = r, g, b, inverse
@@ -173,10 +173,8 @@ def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-u
         green += weight * g
         blue += weight * b
         scale = weight * inverse
-        add_spread(
-            packet.gradient, packet.slots, packet.weights, 8 * n, kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)),
-            kind(by_blue * scale * b * (1 - b)), kind(by_depth * light[3 * n + 2]),
-        )  # fmt: skip
+        by_logits = kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)), kind(by_blue * scale * b * (1 - b))
+        spread_corners(packet.gradient, packet.slots, packet.weights, 8 * n, 1, (*by_logits, kind(by_depth * light[3 * n + 2])))
     return loss
 
 
@@ -249,7 +247,7 @@ def _work(task, cells, first, origins, directions, bases, density, sh, targets, 
     ends, left = np.empty(16, np.int64), np.empty(16, np.float64)
     own_numbers, own_gradient = np.empty((128 * CHUNK, 2), np.int32), np.empty((128 * CHUNK, 4), density.dtype)
     place = np.empty(begin.shape[1] - 1, np.int64)
-    chunk = take_next(pointer(task))
+    chunk = fetch_add(pointer(task), 0, 1)
     while chunk * CHUNK < packets:
         written, bins = 0, begin[chunk]
         bins[:] = 0
@@ -268,7 +266,7 @@ def _work(task, cells, first, origins, directions, bases, density, sh, targets, 
         counts[chunk] = written
         if written <= capacity:
             _sort_records(written, own_numbers, own_gradient, bins, chunk * capacity, numbers, gradient, place)
-        chunk = take_next(pointer(task))
+        chunk = fetch_add(pointer(task), 0, 1)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.walk import box_distances, most_samples
 from efficientnerf.backends.numba.tree_training.scalars import absorbed, cast_like
-from efficientnerf.backends.numba.tree_training.tasks import prefetch
+from efficientnerf.backends.numba.vector.memory import pointer, prefetch
 
 FIRST_BLOCKS, FIRST_SAMPLES = 128, 1024  # that a packet has room for before it grows
 WORDS = 16  # of 4 bytes in a cache line
