@@ -13,10 +13,10 @@ from efficientnerf.asset.refinement import device as refinement
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.rule import DECAY, EPSILON
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.layout import Hyperparameters, Moments, RayTargets
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients
 from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.backends.triton import tree_gradients, tree_packets, tree_steps
 from efficientnerf.geometry.cameras import rays
 
@@ -66,7 +66,7 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
     grid, density, sh = refinement.values_of(tree, torch.device(device))
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp, none = torch.zeros(len(density), dtype=torch.int32, device=device), torch.zeros(0, device=device)
-    moments = tree_steps.Moments(none, none, torch.zeros_like(density), torch.zeros_like(density), torch.zeros_like(stamp))
+    moments = Moments(none, none, torch.zeros_like(density), torch.zeros_like(density), torch.zeros_like(stamp))
     neighbours = tree_steps.Neighbours(none, torch.zeros(0, 6, dtype=torch.int32, device=device))
 
     def ray_by_ray() -> None:
@@ -78,7 +78,7 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
         tree_packets.loss_and_gradients(grid, there[2], sent, density, sh, targets, sums, stamp, 1)
 
     def step() -> None:  # of no length, so that every repetition does the same
-        rule = tree_steps.Hyperparameters(0.0, 0.0, 1.0, DECAY, EPSILON)
+        rule = Hyperparameters(0.0, 0.0, 1.0, DECAY, EPSILON)
         tree_steps.step(grid, (density, sh), sums, moments, stamp, rule, neighbours, number=1, rays=count)
 
     of_packets, of_all = voxels_met(tree, origins, directions, host, first)

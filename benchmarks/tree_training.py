@@ -95,11 +95,12 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
     from efficientnerf.asset.refinement.targets import step_rng
     from efficientnerf.asset.refinement.tiles import tiles_met
+    from efficientnerf.backends.layout import Moments
     from efficientnerf.backends.numba.tree.walk import tree_grid
     from efficientnerf.backends.numba.tree_training import gradients
     from efficientnerf.backends.numba.tree_training.cells import cells_of
     from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
-    from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
+    from efficientnerf.backends.numba.tree_training.steps import step, values_of
     from efficientnerf.training.patches import PatchGrid
 
     tree, targets = loaded(run)

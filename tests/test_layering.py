@@ -117,6 +117,12 @@ def test_no_modules_import_each_other_in_a_ring() -> None:
     assert cycle(import_graph()) == []
 
 
+def test_kernels_of_triton_import_none_of_numba() -> None:
+    """What both take lies in `efficientnerf.backends.layout`."""
+    wrong = [(path.name, name) for path in modules("efficientnerf/backends/triton") for name in imported(path) if name.startswith("efficientnerf.backends.numba")]
+    assert wrong == []
+
+
 def test_no_folder_holds_more_modules_than_can_be_surveyed() -> None:
     folders = [path.parent for package in OURS for path in modules(package) if path.name != "__init__.py"]
     assert {str(folder.relative_to(ROOT)) for folder in folders if folders.count(folder) > MODULES_A_FOLDER} == set()

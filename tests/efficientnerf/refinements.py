@@ -14,13 +14,12 @@ from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
+from efficientnerf.backends.layout import EARLY_STOP, Hyperparameters, Moments, RayTargets
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, Records, packets_of
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
-from efficientnerf.backends.numba.tree_training.steps import Moments, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
+from efficientnerf.backends.numba.tree_training.steps import sum_gradients, values_of
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 

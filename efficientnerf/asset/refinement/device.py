@@ -20,14 +20,14 @@ from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.layout import Hyperparameters, Moments
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training.cells import cells_of
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients, tree_packets
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
-from efficientnerf.backends.triton.tree_steps import Moments, Neighbours, step
+from efficientnerf.backends.triton.tree_steps import Neighbours, step
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.readback import LAG

@@ -15,13 +15,14 @@ from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.layout import Moments
 from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients
 from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
-from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
+from efficientnerf.backends.numba.tree_training.steps import step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.patches import PatchGrid
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.layout import RayTargets
 from efficientnerf.rendering import environment
 from efficientnerf.training.pixels import Pixels
 

@@ -22,10 +22,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.layout import RayTargets
 from efficientnerf.backends.triton.harmonics import basis_columns
-from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, Scene, Sums, Upstream, by_sample, fixed_point_scale
-from efficientnerf.backends.triton.tree_march import Cascades, march_cascades
+from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Scene, Sums, Upstream, Voxels, by_sample, fixed_point_scale
+from efficientnerf.backends.triton.tree_march import Rays, march_cascades
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, sigmoid, zeros_vec3
 
 RAYS = 16  # of a program
@@ -227,34 +227,32 @@ def _loss(colour, left, seen, behind, arriving, opacity, opacity_weight):  # typ
 
 @triton.jit(do_not_specialize=["number", "terms"])
 def _packets(  # type: ignore[no-untyped-def]
-    first_ray, origins, directions, views, seen, background, arriving, opacity, owner, shapes, first, place, index, density, sh, loss, sum_thickness, sum_sh,
-    stamp, nx, ny, nz, step, voxel, min_weight, opacity_weight, number, terms, scale,
+    first, rays, targets, cascades, voxels, loss, sums, stamp, number, terms, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, RAYS: tl.constexpr,
 ):  # fmt: skip
     """Losses (R,) of a packet's rays; adds `scale` times the gradients of their sum by optical thickness (N,) and harmonics (N, 3 K), as integers."""
-    begin, end = tl.load(first_ray + tl.program_id(0)), tl.load(first_ray + tl.program_id(0) + 1)
+    begin, end = tl.load(first + tl.program_id(0)), tl.load(first + tl.program_id(0) + 1)
     r = begin + tl.arange(0, RAYS)
     live = r < end
-    origin, direction = load_vec3(origins, r, live), load_vec3(directions, r, live)
+    origin, direction = load_vec3(rays.origins, r, live), load_vec3(rays.directions, r, live)
     column = tl.arange(0, ROW)
-    bases = basis_columns(load_vec3(views, r, live), column // 3, K)  # (RAYS, ROW)
+    bases = basis_columns(load_vec3(rays.views, r, live), column // 3, K)  # (RAYS, ROW)
     basis = tl.sum(tl.where(live[:, None], bases, 0.0), 0) / (end - begin).to(tl.float32)
-    scene = Scene(index, density, sh, voxel, min_weight, basis, column)
-    sums = Sums(sum_thickness, sum_sh, stamp, number, terms, scale)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
+    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, voxels.min_weight, basis, column)
+    into = Sums(sums[0], sums[1], stamp, number, terms, scale)
     one = tl.full((RAYS,), 1.0, tl.float32)
     seen_through = march_cascades(
-        cascades, origin, direction, live, (scene, sums), Forward(one, zeros_vec3(RAYS), _nothing_held(RAYS)), _composite, CASCADES, BRICK, NEAREST, K, ROW
+        cascades, origin, direction, live, (scene, into), Forward(one, zeros_vec3(RAYS), _nothing_held(RAYS)), _composite, CASCADES, BRICK, NEAREST, K, ROW
     )
-    wanted, behind = load_vec3(seen, r, live), load_vec3(background, r, live)
-    light, solid = tl.load(arriving + r, live, other=0.0), tl.load(opacity + r, live, other=0.0)
-    error, by = _loss(seen_through.colour, seen_through.transmittance, wanted, behind, light, solid, opacity_weight)
+    wanted, behind = load_vec3(targets.colour, r, live), load_vec3(targets.background, r, live)
+    light, solid = tl.load(targets.transmittance + r, live, other=0.0), tl.load(targets.opacity + r, live, other=0.0)
+    error, by = _loss(seen_through.colour, seen_through.transmittance, wanted, behind, light, solid, targets.opacity_weight)
     tl.store(loss + r, error, live)
     gathered = Gathered(Vec3(_zeros(RAYS), _zeros(RAYS), _zeros(RAYS)), _zeros(RAYS))
     start = Backward(one, seen_through.colour, _nothing_held(RAYS), gathered)
-    last = march_cascades(cascades, origin, direction, live, (scene, sums, by), start, _gather, CASCADES, BRICK, NEAREST, K, ROW)
+    last = march_cascades(cascades, origin, direction, live, (scene, into, by), start, _gather, CASCADES, BRICK, NEAREST, K, ROW)
     nobody = tl.full((RAYS, 8), -1, tl.int32)
-    _hand_over(scene, sums, last.held.voxel, last.gathered, _some(last.gathered), nobody, K, RAYS)
+    _hand_over(scene, into, last.held.voxel, last.gathered, _some(last.gathered), nobody, K, RAYS)
 
 
 def loss_and_gradients(
@@ -268,11 +266,10 @@ def loss_and_gradients(
     count = len(rays.origins)
     loss = torch.empty(count, device=density.device)
     if len(first) > 1:
-        seen = (part.float().contiguous() for part in targets[:4])
+        wanted = RayTargets(*(part.float().contiguous() for part in targets[:4]), float(targets.opacity_weight))
         _packets[(len(first) - 1,)](
-            first, *rays, *seen, g.grid, *g.cascades.arrays, g.index, density, sh, loss, *sums, stamp, *g.cascades.shape, g.cascades.step,
-            float(g.voxel), float(min_weight),
-            float(targets.opacity_weight), number, min(terms, g.terms), fixed_point_scale(count),
-            NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, RAYS=RAYS, num_warps=WARPS[g.row],
+            first, rays, wanted, g.cascades, Voxels(g.index, density, sh, float(g.voxel), float(min_weight)), loss, sums, stamp, number,
+            min(terms, g.terms), fixed_point_scale(count),
+            NEAREST=g.nearest, CASCADES=len(g.cascades.first), BRICK=g.brick, K=g.terms, ROW=g.row, RAYS=RAYS, num_warps=WARPS[g.row],
         )  # fmt: skip
     return loss

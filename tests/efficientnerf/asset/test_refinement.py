@@ -20,12 +20,12 @@ from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.backends.layout import EARLY_STOP, RayTargets
 from efficientnerf.backends.numba.tree.contributions import max_contributions
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
@@ -121,7 +121,7 @@ def test_harmonics_of_degrees_that_wait_stay_as_they_are() -> None:
 def test_neighbours_become_alike_where_variation_weighs() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     noisy = replace(ball_tree(12), density_values=np.random.default_rng(0).uniform(0.1, 5, 12**3).astype(np.float32))
-    rough, smooth = ([fitted(noisy, targets, 20, rule=Rule(total_variation=w))[0] for w in (0.0, 10.0)])
+    rough, smooth = [fitted(noisy, targets, 20, rule=Rule(total_variation=w))[0] for w in (0.0, 10.0)]
 
     def variation(tree: NerfTree) -> float:
         grid = np.zeros(tree.resolution)

@@ -17,8 +17,7 @@ from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.layout import EARLY_STOP, RayTargets
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.patches import PatchGrid

@@ -19,8 +19,7 @@ from efficientnerf.asset.refinement.rule import Rule
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.layout import EARLY_STOP, RayTargets
 from tests.efficientnerf.balls import pixels
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.refinements import ball_tree, device_gradients, gradients_by_autograd, packet_gradients, seen_at_random

@@ -13,6 +13,7 @@ import torch
 from efficientnerf.asset.cascades import voxel_cascades, voxel_sides
 from efficientnerf.asset.refinement.state import RefinementState, initial_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.backends.layout import MOST_VARIATION
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import steps as host
 from efficientnerf.backends.numba.tree_training.cells import cells_of
@@ -135,6 +136,6 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     logarithm = torch.from_numpy(np.log(o.density.astype(np.float64) * sides)).requires_grad_()
     (slope,) = torch.autograd.grad(penalty(tree, logarithm, "total_variation"), logarithm)
     moved = np.log(there.values[0].cpu().numpy().astype(np.float64) / o.density)
-    np.testing.assert_allclose(moved, -min(0.1 * weight, host.MOST_VARIATION) * slope.numpy(), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(moved, -min(0.1 * weight, MOST_VARIATION) * slope.numpy(), rtol=1e-3, atol=1e-5)
     assert not there.moments.square_density.any()
     assert np.abs(moved).max() > 0.1

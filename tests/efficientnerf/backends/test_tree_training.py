@@ -14,12 +14,13 @@ from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_si
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.backends.layout import MIN_THICKNESS, MOST_VARIATION
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.cells import cells_of
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Values, step, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import Values, step, sum_gradients, values_of
 from efficientnerf.backends.numba.vector.memory import pointer
 from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at

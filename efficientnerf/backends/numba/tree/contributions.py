@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import SampleBuffer, TreeGrid, corner_weight, walk, walk_pointers
 from efficientnerf.backends.numba.vector.memory import pointer
 

@@ -9,8 +9,7 @@ import math
 
 import numpy as np
 
-EARLY_STOP = 1e-3  # transmittance at which a ray may end
-PACKED_EARLY_STOP = 5e-4  # transmittance at which a ray ends here; the rest of the tolerance is left to view colours
+PACKED_EARLY_STOP = 5e-4  # transmittance at which a ray ends; the rest of the tolerance is left to view colours
 MIN_COLOUR_WEIGHT = 1e-4  # weight below which no colour is looked up; it is added to that of the next sample that has one
 SKIP_MARGIN = 1e-3  # steps by which a skip ends early, so that float32 rounding never makes it end late
 

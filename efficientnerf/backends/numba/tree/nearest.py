@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.queries import normal_at
 from efficientnerf.backends.numba.tree.walk import SampleBuffer, tree_grid, walk_on, walk_pointers
 from efficientnerf.backends.numba.vector.memory import pointer

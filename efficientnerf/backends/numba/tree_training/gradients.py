@@ -15,12 +15,12 @@ R rays, P packets, N voxels, K harmonics, M records, U chunks.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from efficientnerf.backends.layout import EARLY_STOP, RayTargets
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree_training.cells import Cells, tree_pointers
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
@@ -41,27 +41,6 @@ from efficientnerf.backends.numba.vector.memory import fetch_add, pointer, prefe
 
 CHUNK = 32  # packets
 BIN_BITS = 15  # voxels of a bin, power of two
-
-
-class RayTargets(NamedTuple):
-    """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
-
-        sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
-
-    colour          (R, 3) of the photograph, less the colour of what lies in front of the box
-    background      (R, 3) colour of what lies behind the box
-    transmittance   (R,)   of what lies in front of the box
-    opacity         (R,)   of the photograph
-    opacity_weight  of the opacity's error
-
-    Arrays, or tensors of a device (`efficientnerf.backends.triton.tree_gradients`).
-    """
-
-    colour: Any
-    background: Any
-    transmittance: Any
-    opacity: Any
-    opacity_weight: float
 
 
 class Records(NamedTuple):

@@ -18,18 +18,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from efficientnerf.backends.layout import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION, Hyperparameters, Moments
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree_training.cells import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
 from efficientnerf.backends.numba.vector.maths import broadcast, fma, lowest_bit, sum_lanes
 from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_cycle, load_first, pointer, prefetch, store, store_first
 
 LANES = 16  # rows of coefficients, the three channels of one after those of the other, are read in groups of so many; the last may hold fewer
-MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
-MAX_VISITS = 60000
-MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
 AHEAD = 8  # voxels whose values are fetched before their turn
 
 
@@ -52,17 +49,6 @@ def corrections(decay: float) -> np.ndarray:
     powers[0] = 0
     table = (1 / (1 - powers)).astype(np.float32)
     return table[: int((table != 1).nonzero()[0].max(initial=0)) + 2]
-
-
-class Moments(NamedTuple):
-    """Running means of the gradients by the logarithm of the optical thickness (N,) and by the coefficients (N, 3 K), without rows where there is no momentum;
-    of their squares (N,), (N,); and the number of steps that met a voxel (N,) int32."""
-
-    density: np.ndarray
-    sh: np.ndarray
-    square_density: np.ndarray
-    square_sh: np.ndarray
-    visits: np.ndarray
 
 
 class Values(NamedTuple):
