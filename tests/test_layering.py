@@ -119,8 +119,8 @@ def test_no_modules_import_each_other_in_a_ring() -> None:
 
 def test_kernels_of_triton_import_none_of_numba() -> None:
     """What both take lies in `efficientnerf.backends.layout`."""
-    wrong = [(path.name, name) for path in modules("efficientnerf/backends/triton") for name in imported(path) if name.startswith("efficientnerf.backends.numba")]
-    assert wrong == []
+    names = [(path.name, name) for path in modules("efficientnerf/backends/triton") for name in imported(path)]
+    assert [each for each in names if each[1].startswith("efficientnerf.backends.numba")] == []
 
 
 def test_no_folder_holds_more_modules_than_can_be_surveyed() -> None:
