@@ -14,9 +14,8 @@ from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.rule import DECAY, EPSILON
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import Hyperparameters, Moments, RayTargets
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients
-from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.triton import tree_gradients, tree_packets, tree_steps
 from efficientnerf.geometry.cameras import rays
 
@@ -44,7 +43,7 @@ def patch_rays(tree: NerfTree, side: int, views: int, count: int) -> tuple[np.nd
 def voxels_met(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, first: np.ndarray) -> tuple[int, int]:
     """How many voxels packets meet, summed over the packets, and how many all do."""
     start, along, bases = in_voxels(tree, origins, directions)
-    cells, sh = cells_of(tree_grid(tree)), tree.sh.reshape(len(tree.sh), -1)
+    cells, sh = cells_of(tree), tree.sh.reshape(len(tree.sh), -1)
     dense = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values)
     _, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), dense, sh, targets, gradients.RecordBuffer())
     found = [records.numbers[begin:end, 0] for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True)]

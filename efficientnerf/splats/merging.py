@@ -66,9 +66,9 @@ class Shown:
 def greatest_weights(tree: NerfTree, cameras: Sequence[Camera], count: int = RAYS) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of about `count` pixels, spread evenly over the pictures."""
     from efficientnerf.backends.numba.tree import contributions
-    from efficientnerf.backends.numba.tree.walk import tree_grid
+    from efficientnerf.backends.numba.tree.cells import cells_of
 
-    grid, found = tree_grid(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
+    grid, found = cells_of(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
     stride = max(1.0, np.sqrt(sum(camera.width * camera.height for camera in cameras) / count))
     for number, camera in enumerate(cameras):
         # Each picture's raster begins elsewhere, so that together they meet more voxels.

@@ -121,10 +121,7 @@ def _backward(  # type: ignore[no-untyped-def]
     raw, length, first, harmonics, background, weight, rgb, grads, grad_raw, grad_background,
     K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """Chunks from the last to the first: what lies behind a sample is summed up, never a small difference of large numbers.
-
-    grads  by colour, opacity, distortion and weight
-    """
+    """From `grads`, by colour, opacity, distortion and weight. Chunks from the last to the first: no small difference of large numbers is taken."""
     WIDTH: tl.constexpr = 1 + 3 * K
     r = tl.program_id(0).to(tl.int64)
     begin = tl.load(first + r)

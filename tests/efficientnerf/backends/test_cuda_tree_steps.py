@@ -14,9 +14,8 @@ from efficientnerf.asset.cascades import voxel_cascades, voxel_sides
 from efficientnerf.asset.refinement.state import RefinementState, initial_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from efficientnerf.backends.layout import MOST_VARIATION
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training import steps as host
-from efficientnerf.backends.numba.tree_training.cells import cells_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.refinements import GRIDS, empty_moments, records_of, rule_of
@@ -65,7 +64,7 @@ def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str
     tree = made()
     o, adam, smooth = initial_state(tree), "momentum" in more, "total_variation" in more
     there = OnDevice(tree, o, adam=adam, smooth=smooth)
-    cells = cells_of(tree_grid(tree))
+    cells = cells_of(tree)
     moments, neighbours = empty_moments(o, adam=adam), neighbours_of(cells) if smooth else NO_NEIGHBOURS
     rule = rule_of(**more)
     width = 3 * more.get("terms", 25)

@@ -21,7 +21,7 @@ import numpy as np
 
 from efficientnerf.backends.layout import EARLY_STOP, RayTargets
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree_training.cells import Cells, tree_pointers
+from efficientnerf.backends.numba.tree.cells import Cells, tree_pointers
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
     FIRST_BLOCKS,

@@ -20,7 +20,7 @@ import numpy as np
 
 from efficientnerf.backends.layout import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION, Hyperparameters, Moments
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree_training.cells import Cells, dense_densities, voxel_places
+from efficientnerf.backends.numba.tree.cells import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
 from efficientnerf.backends.numba.vector.maths import broadcast, fma, lowest_bit, sum_lanes

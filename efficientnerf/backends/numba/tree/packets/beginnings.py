@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
+from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP, most_samples
 from efficientnerf.backends.numba.tree.packets.layout import (
     ALONG_X,
     ALONG_Y,
@@ -36,7 +36,6 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     TRANSMITTANCE,
 )
 from efficientnerf.backends.numba.tree.ray_batch import PINHOLE, pinhole_direction, ray_at
-from efficientnerf.backends.numba.tree.walk import most_samples
 from efficientnerf.backends.numba.vector.maths import bits_of, broadcast, ceil, floor, lane_numbers, maximum, minimum, select, to_float32
 from efficientnerf.backends.numba.vector.memory import advanced, load, store
 

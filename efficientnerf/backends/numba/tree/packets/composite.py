@@ -12,6 +12,7 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP
 from efficientnerf.backends.numba.tree.packets.layout import (
     BASIS,
+    BATCH_VOXELS,
     BLUE,
     CACHE,
     CACHED_BITS,
@@ -82,7 +83,7 @@ def locate(x, y, z, distance, owner, grid, colours, ints, batch, voxels):  # typ
     far = _weigh(2, far_first, far_mask, fx * gy, bit, fz, gz, batch, voxels) + _weigh(3, last_first, last_mask, fx * fy, bit, fz, gz, batch, voxels)
     store(batch, TOTAL, weight + far)
     store(batch, DISTANCE, distance)
-    prefetch_groups(colours, voxels, 4 * LANES)
+    prefetch_groups(colours, voxels, BATCH_VOXELS)
 
 
 @numba.njit(cache=True, error_model="numpy")
