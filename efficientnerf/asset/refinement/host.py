@@ -73,7 +73,7 @@ def optimise(
         yield error_map.record(drawn, loss) / 3
 
 
-def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:
+def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> float:
     """Sum of the losses of the rays of the bundles."""
     cells, buffer, sh = cells_of(tree), RecordBuffer(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
     dense, total = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values), 0.0
@@ -84,7 +84,7 @@ def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:
     return total
 
 
-def max_weights(tree: NerfTree, bundles: Iterable[Bundle]) -> np.ndarray:
+def max_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to a ray of the bundles."""
     grid, greatest = cells_of(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
     for origins, directions, wanted in bundles:

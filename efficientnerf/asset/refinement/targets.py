@@ -6,7 +6,7 @@ R rays, H rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -48,6 +48,11 @@ class Targets:
     def on_device(self) -> bool:
         """Whether they were sent to a device, where trees are then fitted to them."""
         return not isinstance(self.pixels, Pixels)
+
+    @property
+    def backend(self) -> Literal["numba", "triton"]:
+        """That which fits trees to them."""
+        return "triton" if self.on_device else "numba"
 
     @property
     def host_pixels(self) -> Pixels:
