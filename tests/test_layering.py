@@ -37,9 +37,6 @@ MANY_ARGUMENTS = {
     _KERNELS + "tree.image:render_batch": _OUTPUTS,
     _KERNELS + "tree.image:_render_blocks": "those of `render_batch` that a thread needs",
     _KERNELS + "tree.packets.tiles:render_tile": "those of `_render_blocks` that a tile needs",
-    _KERNELS + "tree_training.gradients:_forward_backward": _OUTPUTS,
-    _KERNELS + "tree_training.gradients:_work": _OUTPUTS,
-    _KERNELS + "tree_training.gradients:_trace_packet": _OUTPUTS,
 }
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
 
