@@ -13,6 +13,25 @@ MAX_VISITS = 60000  # steps that met a voxel, counted up to here
 MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
 
 
+class RayBundle(NamedTuple):
+    """Rays that are sampled: origins and directions (R, 3); near, far and offset (R,)."""
+
+    origins: Any
+    directions: Any
+    near: Any
+    far: Any
+    offset: Any
+
+
+class SampleColumns(NamedTuple):
+    """start, extent, length (N,) and point (N, 3) of Samples."""
+
+    start: Any
+    extent: Any
+    length: Any
+    point: Any
+
+
 class RayTargets(NamedTuple):
     """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
 

@@ -9,11 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.backends.layout import RayBundle, SampleColumns
 from efficientnerf.rendering.compositing import Composite
 from efficientnerf.sampling.samples import Samples
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.backends.numba.sampling import Box
     from efficientnerf.backends.torch.hash_grid import HashLevels
     from efficientnerf.fields.gradient_buffer import GradientBuffer
     from efficientnerf.geometry.spaces import Space
@@ -23,8 +25,10 @@ def _array(t: Tensor) -> np.ndarray:
     return t.detach().contiguous().numpy()
 
 
-def _box(space: Space) -> tuple[np.ndarray, np.ndarray, bool]:
-    return space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted
+def _box(space: Space) -> Box:
+    from efficientnerf.backends.numba.sampling import Box
+
+    return Box(space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted)
 
 
 def valid_samples(
@@ -33,8 +37,8 @@ def valid_samples(
 ) -> Samples:  # fmt: skip
     from efficientnerf.backends.numba import sampling
 
-    given: list[Any] = [_array(t) for t in (origins, directions, near, far, offset)] + [*_box(space), step, max_intervals, _array(voxels), threshold, unpruned]
-    *packed, tried = sampling.valid_samples(*given)
+    bundle = RayBundle(*(_array(t) for t in (origins, directions, near, far, offset)))
+    *packed, tried = sampling.valid_samples(bundle, _box(space), step, max_intervals, _array(voxels), threshold, unpruned)
     return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
 
 
@@ -49,9 +53,8 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: i
 def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
     from efficientnerf.backends.numba import sampling
 
-    columns = (coarse.first, coarse.start, coarse.extent, coarse.length, pivotal)
-    given: list[Any] = [*map(_array, (origins, directions, offset)), *_box(space), *map(_array, columns), per_pivot]
-    fine = sampling.pivotal_samples(*given)
+    bundle, columns = RayBundle(*map(_array, (origins, directions, offset, offset, offset))), SampleColumns(*map(_array, coarse[1:5]))
+    fine = sampling.pivotal_samples(bundle, _box(space), _array(coarse.first), columns, _array(pivotal), per_pivot)
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 

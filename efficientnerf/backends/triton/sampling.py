@@ -14,6 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from efficientnerf.backends.layout import RayBundle, SampleColumns
 from efficientnerf.backends.triton.launch import INTERPRETED, LANES, blocks
 from efficientnerf.backends.triton.vectors import Vec3, along, store_vec3
 from efficientnerf.geometry.spaces import FARTHEST, Space
@@ -28,25 +29,6 @@ class Box(NamedTuple):
 
     centre: Any
     half: Any
-
-
-class Bundle(NamedTuple):
-    """Rays: origins and directions (R, 3); near, far and offset (R,)."""
-
-    origins: Any
-    directions: Any
-    near: Any
-    far: Any
-    offset: Any
-
-
-class Buffers(NamedTuple):
-    """start, extent, length (N,) and point (N, 3) of Samples."""
-
-    start: Any
-    extent: Any
-    length: Any
-    point: Any
 
 
 @triton.jit
@@ -114,7 +96,7 @@ def _march(  # type: ignore[no-untyped-def]
     bundle, box, voxels, first, tallies, out, rays, max_intervals, step, threshold, unpruned, side,
     CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Counts the valid samples of each ray, or writes them from `first` on into Buffers.
+    """Counts the valid samples of each ray, or writes them from `first` on into SampleColumns.
 
     tallies  (R,) int32 each: valid samples, and intervals tried
     """
@@ -182,11 +164,11 @@ def valid_samples(
     rays, side = len(origins), voxels.shape[0]
     device = origins.device
     tallies = counts, tried = torch.zeros(rays, dtype=torch.int32, device=device), torch.zeros(rays, dtype=torch.int32, device=device)
-    bundle = (Bundle(origins, directions, near, far, offset), _box(space), voxels)
+    bundle = (RayBundle(origins, directions, near, far, offset), _box(space), voxels)
     rest = (rays, max_intervals, float(step), float(threshold), unpruned, side)
     grid, shape = (blocks(rays, RAYS),), {"CONTRACTED": space.contracted, "BLOCK": RAYS, "num_warps": 1}
     nothing = origins.new_empty(0)
-    _march[grid](*bundle, counts, tallies, Buffers(*[nothing] * 4), *rest, WRITE=False, **shape)
+    _march[grid](*bundle, counts, tallies, SampleColumns(*[nothing] * 4), *rest, WRITE=False, **shape)
     first = _offsets(counts)
     total_tried = tried.sum(dtype=torch.int64)
     complete = None
@@ -197,7 +179,7 @@ def valid_samples(
         first.clamp_(max=capacity)
     # Zeros: the padding, and what the two passes, compiled on their own, might disagree about by a rounding.
     start, extent, length, point = (origins.new_zeros(samples), origins.new_zeros(samples), origins.new_zeros(samples), origins.new_zeros(samples, 3))
-    _march[grid](*bundle, first, tallies, Buffers(start, extent, length, point), *rest, WRITE=True, **shape)
+    _march[grid](*bundle, first, tallies, SampleColumns(start, extent, length, point), *rest, WRITE=True, **shape)
     return Samples(first, start, extent, length, point, all_tried, complete)
 
 
@@ -252,7 +234,7 @@ def _pivotal(  # type: ignore[no-untyped-def]
     bundle, box, first, coarse, pivotal, before, fine, rays, samples, capacity,
     CONTRACTED: tl.constexpr, PER_PIVOT: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Divides the pivotal ones of the samples `coarse`, Buffers, into `fine`; before: pivotal samples before each."""
+    """Divides the pivotal ones of the samples `coarse`, SampleColumns, into `fine`; before: pivotal samples before each."""
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < samples
     live = live & (tl.load(pivotal + n, live, other=0) != 0)
@@ -288,8 +270,8 @@ def pivotal_samples(
     start, extent, length, point = (origins.new_zeros(total), origins.new_zeros(total), origins.new_zeros(total), origins.new_zeros(total, 3))
     if rays and samples and total:
         _pivotal[(blocks(samples),)](
-            Bundle(origins, directions, offset, offset, offset), _box(space), coarse.first, Buffers(*coarse[1:5]), pivotal.view(torch.int8), before,
-            Buffers(start, extent, length, point), rays, samples, total,
+            RayBundle(origins, directions, offset, offset, offset), _box(space), coarse.first, SampleColumns(*coarse[1:5]), pivotal.view(torch.int8), before,
+            SampleColumns(start, extent, length, point), rays, samples, total,
             CONTRACTED=space.contracted, PER_PIVOT=per_pivot, BITS=rays.bit_length(), BLOCK=LANES,
         )  # fmt: skip
     return Samples(first, start, extent, length, point, coarse.tried, complete)
