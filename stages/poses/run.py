@@ -203,7 +203,7 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
     return [*importers.files(source, settings), *networks]
 
 
-STAGE = Stage(name="poses", version=13, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
+STAGE = Stage(name="poses", version=14, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
