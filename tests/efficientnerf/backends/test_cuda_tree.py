@@ -159,7 +159,7 @@ def test_bricks_carry_a_border_of_their_neighbours() -> None:
         held = on_device.density[tree.brick_index[tuple(cell)]].reshape(edge, edge, edge).float().cpu().numpy()
         np.testing.assert_allclose(held, block, rtol=1e-3)
     assert on_device.bytes > 0
-    assert torch.equal(on_device.grid.cpu() < 0, torch.from_numpy(tree.brick_index < 0))
+    assert torch.equal(on_device.cascades.owner.cpu() < 0, torch.from_numpy(tree.brick_index < 0))
 
 
 def test_an_image_is_its_rays() -> None:
