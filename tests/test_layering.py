@@ -44,7 +44,6 @@ DOOR = (
 )  # fmt: skip
 # Imports within functions, each with its reason beside it: of extras, of Triton, of pycolmap, which other libraries must precede, of what most runs need not.
 LATE = {
-    "efficientnerf/asset/refinement/fit.py": 1,
     "efficientnerf/asset/rendering.py": 1,
     "efficientnerf/backends/dispatch.py": 1,
     "efficientnerf/geometry/ndc.py": 3,

@@ -13,7 +13,6 @@ PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from types import ModuleType
 
 import numpy as np
 
@@ -25,12 +24,6 @@ from efficientnerf.backends.dispatch import fitting
 
 PATCH_SIDE = 4  # docs/experiments/tree-training-kernels.md
 WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measured the rays leave records
-
-
-def _device() -> ModuleType:
-    from efficientnerf.asset.refinement import device  # its kernels need Triton, which is there on CUDA alone
-
-    return device
 
 
 def optimise(

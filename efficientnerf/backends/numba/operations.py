@@ -28,8 +28,6 @@ def _array(t: Tensor) -> np.ndarray:
 
 
 def _box(space: Space) -> Box:
-    from efficientnerf.backends.numba.sampling import Box
-
     return Box(space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted)
 
 
