@@ -134,6 +134,7 @@ def test_what_is_not_known_has_a_share(tmp_path: Path) -> None:
     assert run(tmp_path, workers, 20).state == "done"
     given = {(task.worker, task.request["kind"], task.memory) for task in workers.tasks}
     assert given >= {("a", "stage", 2 * GIB), ("b", "stage", None), ("a", "prepare", GIB // 2), ("b", "finish", None)}
+    assert {task.request["memory"] for task in workers.tasks if what(task.request) == "prepare"} == {2 * GIB, None}, "for warnings"
 
 
 def test_a_limit_that_is_not_known_is_none_whatever_the_estimate(tmp_path: Path) -> None:
