@@ -402,6 +402,13 @@ def test_a_scene_that_has_written_most_of_it_goes_on_behind_one_that_does_not_fi
     assert [scene.state for scene in found.scenes] == ["failed", "done", "failed"]
 
 
+def test_a_disk_that_filled_up_makes_a_scene_failed_and_the_next_command_tries_it_again(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 2)], at("s1", "bake", {"ok": False, "kind": "disk", "text": "bake: no space left."}))
+    found = run(tmp_path, workers, scenes(3))
+    assert [(scene.state, scene.reason) for scene in found.scenes] == [("done", None), ("failed", "bake: no space left."), ("done", None)]
+    assert run(tmp_path, Simulated([Worker("a", 2)]), scenes(3), former=found).state == "done"
+
+
 def test_what_was_written_already_is_not_asked_for_twice(tmp_path: Path) -> None:
     """Free space has shrunk by it."""
     (tmp_path / "s0" / ".work" / "train").mkdir(parents=True)
