@@ -27,14 +27,14 @@ from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose
 from efficientnerf.surface.mesh import Mesh, moved
 from efficientnerf.surface.shading import Shader
 from stages.artifacts import BakeOutputs, MeshOutputs
-from stages.evaluation.views import evaluation_views, evenly_spaced, ground_truth
+from stages.evaluate.views import evaluation_views, evenly_spaced, ground_truth
+from stages.formats.exporters import MESH_EXPORTERS
+from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.camera_paths import pose_on_sphere
-from stages.io.exporters import MESH_EXPORTERS
-from stages.io.exporters.glb import gltf_from_capture
-from stages.io.exporters.writing import SourceFrame, source_frame
 from stages.io.pictures import opened, rgb_and_alpha
 from stages.io.refined_cameras import load_scene
-from stages.meshing.files import read_mesh
+from stages.mesh.files import read_mesh
 
 GREY = 0.5
 BLENDER_FROM_GLTF = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

@@ -266,7 +266,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 def measured(run: Path, resolutions: list[int], test_rays: int, training_rays: int) -> dict[str, Any]:
     from efficientnerf.geometry.cameras import rays
     from efficientnerf.rendering.harmonics import basis_numpy
-    from stages.evaluation.views import evaluation_views, ground_truth, stride_for, subsample_camera
+    from stages.evaluate.views import evaluation_views, ground_truth, stride_for, subsample_camera
     from stages.io.field_file import load_renderer
     from stages.io.scene import load, views_of
 

@@ -108,7 +108,7 @@ def write_scene(folder: Path, kind: str, counts: dict[str, int], size: int, seed
 def figures(render: Any, poses: Path) -> dict[str, float]:
     """Mean PSNR over the test views, as they are, and with fitted colours."""
     from efficientnerf.evaluation.metrics import colour_fitted, psnr
-    from stages.evaluation.views import ground_truth
+    from stages.evaluate.views import ground_truth
     from stages.io import scene
 
     found = []
@@ -125,9 +125,10 @@ def trained(poses: Path, out: Path, choice: str, seed: int, steps: int, *, asset
     from efficientnerf.asset.rendering import render
     from efficientnerf.training.settings import TrainSettings
     from pipeline.stage import Job
-    from stages import bake, train
     from stages.artifacts import BakeOutputs
+    from stages.bake import run as bake
     from stages.io.field_file import load_renderer
+    from stages.train import run as train
 
     settings = TrainSettings(iterations=steps, exposure=choice, seed=seed, preview_every="off")  # type: ignore[arg-type]
     job = Job(settings=settings, inputs={"poses": poses}, out=out / "train", work=out / "train_work")

@@ -32,11 +32,11 @@ from efficientnerf.asset.format import load
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.gaussians import Gaussians, covariances
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
+from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.splats.frames import with_y_up
+from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.camera_paths import turntable_cameras
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
-from stages.io.exporters.glb import gltf_from_capture
-from stages.io.exporters.splats.frames import with_y_up
-from stages.io.exporters.writing import SourceFrame, source_frame
 
 ROOT = Path(__file__).resolve().parents[1]
 FRAMES, WIDTH, HEIGHT = 3, 320, 240
@@ -103,7 +103,7 @@ def decibels(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def mesh_row(case: Case, extension: str) -> Row:
-    from stages.meshing.files import read_mesh
+    from stages.mesh.files import read_mesh
 
     path, expected = case.export(f"mesh{extension}"), read_mesh(MeshOutputs.of_run(case.run))
     found = readers.mesh_by_usd(path) if extension.startswith(".usd") else readers.mesh_by_trimesh(path)
@@ -151,7 +151,7 @@ def _degrees(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def splats_row(case: Case, extension: str) -> Row:
-    from stages.io.exporters.splats.ply import read_splats
+    from stages.formats.exporters.splats.ply import read_splats
 
     expected = read_splats(SplatsOutputs.of_run(case.run).ply)
     path = case.export(f"splats{extension}", "--splats")
@@ -186,8 +186,8 @@ def splats_apart(found: readers.Splats, expected: Gaussians) -> Row:
 
 
 def volume_row(case: Case, extension: str) -> Row:
+    from stages.formats.exporters.vdb import grids_of
     from stages.framing.restriction import restricted
-    from stages.io.exporters.vdb import grids_of
 
     path = case.export(f"volume{extension}", "--region", "all")
     grids = grids_of(restricted(case.tree, "all"), case.frame, path)
@@ -239,8 +239,8 @@ def viewer_row(case: Case, extension: str) -> Row:
 def pictures_row(case: Case, extension: str) -> Row:
     """What `enerf render` writes, against our own renderer's picture, which the reader never saw."""
     from efficientnerf.asset.rendering import render
-    from stages.turntable import TurntableSettings
-    from stages.turntable import cameras_of as turntable_cameras_of
+    from stages.turntable.run import TurntableSettings
+    from stages.turntable.run import cameras_of as turntable_cameras_of
 
     out, tree, film = case.folder / "frames", case.tree, case.folder / "film.mp4"
     options = {".png": (), ".exr": ("--exr", "all"), ".mp4": ("--video", str(film))}[extension]

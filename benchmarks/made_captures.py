@@ -25,9 +25,9 @@ from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_atomically
 from pipeline.stage import Job
 from stages.io import scene
-from stages.poses import PosesSettings
-from stages.poses import run as find_poses
-from stages.training.priors import Prior, mask_uncovered_cells
+from stages.poses.run import PosesSettings
+from stages.poses.run import run as find_poses
+from stages.train.priors import Prior, mask_uncovered_cells
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_MASKED = 0.01  # of the subject's voxels: at the borders of photographs the middle of a voxel may be in view of fewer than the point in it

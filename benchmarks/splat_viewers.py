@@ -27,11 +27,11 @@ from efficientnerf.asset.format import load
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.splats.rendering import render
 from stages.artifacts import PosesOutputs, SplatsOutputs
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.splats.ply import read_splats
+from stages.formats.exporters.writing import source_frame
 from stages.io import scene
-from stages.io.exporters import SPLAT_EXPORTERS
-from stages.io.exporters.glb import gltf_from_capture
-from stages.io.exporters.splats.ply import read_splats
-from stages.io.exporters.writing import source_frame
 from stages.io.pictures import opened, rgb_and_alpha
 from tests.stages.viewer import browser
 from workflows.cli.target import asset_of

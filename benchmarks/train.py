@@ -74,9 +74,9 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     from efficientnerf.training.schedule import schedule_of
     from stages.io import scene
     from stages.io.field_file import space_of
-    from stages.training.budget import TIMED, UNKNOWN
-    from stages.training.data import depth_range, pixels_of, sparse_depth_of
-    from stages.training.hash_resolution import with_auto_sizes
+    from stages.train.budget import TIMED, UNKNOWN
+    from stages.train.data import depth_range, pixels_of, sparse_depth_of
+    from stages.train.hash_resolution import with_auto_sizes
 
     s, settings = scene.load(poses), settings_of(preset)
     views = scene.views_of(s, "train")
@@ -90,7 +90,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     warmed: list[tuple[int, float]] = []
 
     def plan(step: int, wall: float) -> Any:
-        """As `stages.training.budget` does, by the time of this contender alone."""
+        """As `stages.train.budget` does, by the time of this contender alone."""
         if not warmed and step >= settings.occupancy_warmup_steps:
             warmed.append((step, wall))
         if step < hold:
@@ -103,7 +103,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
 
 def test_views(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
     """Cameras, their images, and by how much both are subsampled."""
-    from stages.evaluation.views import ground_truth, subsample, subsample_camera
+    from stages.evaluate.views import ground_truth, subsample, subsample_camera
     from stages.io import scene
 
     s = scene.load(poses)

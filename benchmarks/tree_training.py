@@ -73,10 +73,10 @@ def loaded(run: Path) -> tuple[Any, Any]:
     from efficientnerf.asset import format
     from efficientnerf.asset.refinement.targets import Targets
     from stages.artifacts import BakeOutputs
-    from stages.evaluation.views import constant_background
+    from stages.evaluate.views import constant_background
     from stages.io import scene
     from stages.io.refined_cameras import load_scene
-    from stages.training.data import pixels_of
+    from stages.train.data import pixels_of
 
     s = load_scene(run / "poses", run / "train")
     tree = format.load(BakeOutputs(run / "bake").asset)

@@ -24,15 +24,15 @@ from benchmarks.poses import aligned_errors
 from benchmarks.stage_runs import cost_of, read_json
 from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
+from efficientnerf.capture import frame_choice as choice
+from efficientnerf.capture.captured_path import captured_cameras
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose, project
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, PosesOutputs
 from stages.figures.plots import to_uint8
-from stages.framing.captured_path import captured_cameras
+from stages.formats.exporters.video import write_mp4
 from stages.io import scene
-from stages.io.exporters.video import write_mp4
 from stages.sfm.reconstruction import find_cameras
-from stages.video import choice
 from stages.video.frames import Reader, frames_of, look
 
 SHUTTER = 0.02  # seconds

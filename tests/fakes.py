@@ -11,7 +11,7 @@ import numpy as np
 from efficientnerf.asset.rendering import Rendering
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from efficientnerf.rendering.field_renderer import FieldRendering, SampleCounts
-from stages.evaluation.asset import EvaluatedAsset
+from stages.evaluate.asset import EvaluatedAsset
 
 WHITE = (1.0, 1.0, 1.0)
 

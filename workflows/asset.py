@@ -31,7 +31,7 @@ class Workflow:
     memory: Callable[[str, Path, Sequence[Path], Mapping[str, Any], str], int | None] = lambda *_: None
 
 
-# Modules of `stages`, in order.
+# Folders of `stages`, in order.
 NAMES = (
     "poses",  # the source -> cameras, images, sparse points
     "train",  # poses -> field, density voxels
@@ -42,5 +42,5 @@ NAMES = (
     "turntable",  # bake -> frames, video, EXR
     "points",  # bake -> PLY
 )
-STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}").STAGE for name in NAMES)
+STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}.run").STAGE for name in NAMES)
 WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets", space=space_needed, memory=memory_needed)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import BadInput, UsageError
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.surface.mesh import Mesh
     from pipeline.executors.memory import Limit
-    from stages.io.exporters.writing import SourceFrame
-    from stages.mesh import MeshSettings
+    from stages.formats.exporters.writing import SourceFrame
+    from stages.mesh.run import MeshSettings
     from workflows.cli.resolve import Settings
 
 CAMERAS, VIEWER = ".json", ".html"
@@ -146,8 +146,8 @@ def check(export: Export) -> None:
 def export_cameras(export: Export) -> list[Written]:
     """The cameras of a run."""
     from stages.artifacts import PosesOutputs
+    from stages.formats.exporters import cameras
     from stages.io import scene
-    from stages.io.exporters import cameras
     from workflows.cli.target import is_run, open_run
     from workflows.destination import writing
 
@@ -165,8 +165,8 @@ def export_cameras(export: Export) -> list[Written]:
 
 def export_surface(export: Export, settings: Settings, progress: Progress) -> list[Written]:
     """The surface as points or as a mesh. `settings` holds those of the stages mesh and points, with which it is made."""
+    from stages.formats.exporters.writing import source_frame
     from stages.framing.restriction import restricted
-    from stages.io.exporters.writing import source_frame
     from workflows.cli.target import load_asset
     from workflows.destination import writing
 
@@ -189,7 +189,7 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
     frame = source_frame(tree.metadata)
     if not export.as_points:
         return _write_mesh(export, _meshed(export, tree, border, frame, wanted, progress), frame)
-    from stages.points import points_of
+    from stages.points.run import points_of
 
     _refuse_what_does_not_fit(export, tree, f"Lower points.num_points ({wanted.num_points}).", points=wanted.num_points)
     cloud = points_of(tree, wanted, frame, progress, border)
@@ -201,8 +201,8 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
 
 def export_volumes(export: Export, settings: Settings) -> list[Written]:
     """The asset's voxels as volumes; what of it, the settings of the stage mesh say where --region does not."""
+    from stages.formats.exporters.writing import source_frame
     from stages.framing.restriction import restricted
-    from stages.io.exporters.writing import source_frame
     from stages.memory.need import Need, libraries, refuse_more_than
     from stages.memory.rendering import tree_bytes
     from workflows.cli.target import load_asset
@@ -252,7 +252,7 @@ def export_viewers(export: Export) -> list[Written]:
 
 def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: Any) -> None:
     from stages.memory.need import refuse_more_than
-    from stages.memory.surface import surface_needed
+    from stages.mesh.memory import surface_needed
 
     refuse_more_than(export.limit, str(export.what), surface_needed(tree, **needed), remedy)
 
@@ -263,9 +263,9 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
     from pipeline.decide import decide
     from pipeline.stage import settings_dict, settings_from
     from stages.artifacts import BakeOutputs, MeshOutputs
-    from stages.io.exporters.writing import source_frame
-    from stages.mesh import STAGE, MeshSettings
-    from stages.meshing.files import read_mesh
+    from stages.formats.exporters.writing import source_frame
+    from stages.mesh.files import read_mesh
+    from stages.mesh.run import STAGE, MeshSettings
     from workflows.cli.target import is_run, open_run
 
     if not is_run(what):
@@ -290,8 +290,8 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
 def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: SourceFrame, wanted: MeshSettings, progress: Progress) -> Mesh:
     """The mesh of a tree, clipped to a region, in the capture's frame, textured as its settings say."""
     from stages.artifacts import BakeOutputs, MeshInputs, PosesOutputs, TrainOutputs
-    from stages.mesh import SURFACE_SHARE, in_capture, mesh_of
-    from stages.meshing.texture import largest_photograph, textured, with_relief
+    from stages.mesh.run import SURFACE_SHARE, in_capture, mesh_of
+    from stages.mesh.texture import largest_photograph, textured, with_relief
 
     if wanted.texture == "photographs" and not export.has_photographs:
         raise UsageError(f"{export.what}: holds no photographs. Give a run with its cameras, or --texture asset.")

@@ -10,8 +10,8 @@ from workflows.exporting import Export, Progress, Written
 
 if TYPE_CHECKING:
     from efficientnerf.splats.gaussians import Gaussians
-    from stages.io.exporters.writing import SourceFrame
-    from stages.splats import SplatsSettings
+    from stages.formats.exporters.writing import SourceFrame
+    from stages.splats.run import SplatsSettings
     from workflows.cli.resolve import Settings
 
 
@@ -35,11 +35,11 @@ def export_splats(export: Export, settings: Settings, progress: Progress) -> lis
 def _made(export: Export, wanted: SplatsSettings, progress: Progress) -> tuple[Gaussians, SourceFrame]:
     """In the capture's frame."""
     from stages.artifacts import PosesOutputs, TrainOutputs
+    from stages.formats.exporters.splats.frames import in_capture
+    from stages.formats.exporters.writing import source_frame
     from stages.framing.restriction import restricted
-    from stages.io.exporters.splats.frames import in_capture
-    from stages.io.exporters.writing import source_frame
     from stages.memory.need import refuse_more_than
-    from stages.splats import gaussians_of, needed
+    from stages.splats.run import gaussians_of, needed
     from workflows.cli.target import load_asset
 
     tree = restricted(load_asset(export.what), wanted.region, export.crop)
@@ -57,9 +57,9 @@ def _made_by_the_stage(what: Path, wanted: SplatsSettings) -> tuple[Gaussians, S
     from pipeline.decide import decide
     from pipeline.stage import settings_from
     from stages.artifacts import BakeOutputs, SplatsOutputs
-    from stages.io.exporters.splats.ply import read_splats
-    from stages.io.exporters.writing import source_frame
-    from stages.splats import STAGE, SplatsSettings
+    from stages.formats.exporters.splats.ply import read_splats
+    from stages.formats.exporters.writing import source_frame
+    from stages.splats.run import STAGE, SplatsSettings
     from workflows.cli.target import is_run, open_run
 
     if not is_run(what):

@@ -22,7 +22,7 @@ NGP = {"is_fisheye": False, "k1": 0.01}
 
 def read_source(folder: Path, data: bytes) -> None:
     """As the poses stage reads a source: the formats that it may be, of one input in four the files that it depends on, the cameras."""
-    from stages.io import importers
+    from stages.formats import importers
 
     settings = captures.Settings()
     name = importers.detect(folder)

@@ -50,7 +50,7 @@ def seeds(suffix: str) -> Callable[[], list[bytes]]:
 
     def made() -> list[bytes]:
         from efficientnerf.surface.mesh import PointCloud
-        from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+        from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
         from tests.stages.io.meshes import Y_DOWN, block
 
         mesh, found = block(), []

@@ -83,7 +83,7 @@ def open_checkpoint(folder: Path) -> Opened:
     """Restoring takes all of a checkpoint or nothing of it."""
     from efficientnerf.training.loop import restore, state_of
     from pipeline.stage import Job
-    from stages.training.checkpoints import Checkpoints
+    from stages.train.checkpoints import Checkpoints
 
     t = _trainer()
     job = Job(settings=None, out=folder / "out", work=folder / "work")
@@ -152,7 +152,7 @@ def log_changed(rng: Random, data: bytes) -> bytes:
 def open_log(folder: Path) -> Opened:
     """The log that training goes on with, and the curve of it."""
     from stages.figures import plots
-    from stages.training.log import TrainLog, read_lines
+    from stages.train.log import TrainLog, read_lines
 
     path = folder / "log.jsonl"
 
@@ -174,7 +174,7 @@ def schedule_seeds() -> list[bytes]:
 
 
 def open_schedule(folder: Path) -> Opened:
-    from stages.training.budget import FILE, training_budget
+    from stages.train.budget import FILE, training_budget
     from tests.efficientnerf.balls import settings
 
     chosen = settings(**QUICK, time_budget=10.0)
@@ -190,7 +190,7 @@ def open_schedule(folder: Path) -> Opened:
 
 def open_blocks(folder: Path) -> Opened:
     """Arrays that a bake goes on from, noted as they are."""
-    from stages.baking.scratch import read_arrays
+    from stages.bake.scratch import read_arrays
     from stages.scratch import note
 
     piece = folder / "block_000000"
@@ -261,7 +261,7 @@ def _refinement() -> tuple[Any, Any]:
 def refinement_seeds() -> list[bytes]:
     from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
     from pipeline.stage import Job
-    from stages.baking import checkpoint
+    from stages.bake.refine import checkpoint
 
     with tempfile.TemporaryDirectory() as folder:
         job = Job(settings=None, out=Path(folder) / "out", work=Path(folder) / "work")
@@ -273,7 +273,7 @@ def refinement_changed(rng: Random, data: bytes) -> bytes:
     """A change, the digest put right in most."""
     from safetensors.numpy import load
 
-    from stages.baking.checkpoint import digest_of
+    from stages.bake.refine.checkpoint import digest_of
 
     found = safetensors_bytes.changed(rng, data)
     parts = safetensors_bytes.parts(found)
@@ -288,7 +288,7 @@ def open_refinement(folder: Path) -> Opened:
     """The state that a refinement goes on from."""
     from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
     from pipeline.stage import Job
-    from stages.baking import checkpoint
+    from stages.bake.refine import checkpoint
 
     tree, _ = _refinement()
     job = Job(settings=None, out=folder / "out", work=folder / "work")

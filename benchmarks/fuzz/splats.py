@@ -19,9 +19,9 @@ HEADER = 16  # bytes of SPZ: magic, version, number, degree, bits, flags, 0
 
 def seeds(suffix: str) -> Callable[[], list[bytes]]:
     def made() -> list[bytes]:
-        from stages.io.exporters import SPLAT_EXPORTERS
-        from stages.io.exporters.writing import CAPTURE_IS_Z_UP
-        from tests.stages.io.gaussians import scattered
+        from stages.formats.exporters import SPLAT_EXPORTERS
+        from stages.formats.exporters.writing import CAPTURE_IS_Z_UP
+        from tests.stages.formats.gaussians import scattered
 
         found = []
         with tempfile.TemporaryDirectory() as folder:

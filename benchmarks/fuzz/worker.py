@@ -31,7 +31,7 @@ EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
 NOTE = "input"  # a file: the number of the input that is being tried, a line's end, the input
 CORPUS = "corpus"  # a folder: the inputs that libFuzzer kept
 KEPT = 200  # inputs that are changed again, beside the seeds
-INSTRUMENTED = ["pipeline", "stages.io", "stages.training", "workflows.cli", "workflows.report", "workflows.inspection"]
+INSTRUMENTED = ["pipeline", "stages.io", "stages.formats", "stages.train", "workflows.cli", "workflows.report", "workflows.inspection"]
 
 
 class Tally:

@@ -77,7 +77,7 @@ def _pixels(path: Path) -> np.ndarray:
 
 def truth_of(folder: Path, stride: int) -> list[np.ndarray]:
     """The test images on white, of the pixels that were rendered: (H', W', 3) each, 0 to 1."""
-    from stages.evaluation.views import subsample
+    from stages.evaluate.views import subsample
 
     frames = json.loads((folder / "transforms_test.json").read_text(encoding="utf-8"))["frames"]
     images = (_pixels(folder / f"{frame['file_path']}.png") / 255.0 for frame in frames)

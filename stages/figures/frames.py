@@ -60,8 +60,8 @@ def render_frames(
     warn      is told of frames that can't be kept
     """
     from efficientnerf.asset.rendering import render
-    from stages.io.exporters.exr import write_exr
-    from stages.io.exporters.frames import frame_background, frame_from_rendering
+    from stages.formats.exporters.exr import write_exr
+    from stages.formats.exporters.frames import frame_background, frame_from_rendering
     from stages.io.png import write_png
 
     background, similarity = frame_background(options.background), similarity_of(tree)
@@ -104,8 +104,8 @@ def _check(outputs: Sequence[Path], camera: Camera, value: list[str], names: Col
 
 def encode_frames(frames: Sequence[Path], path: Path, options: RenderOptions, each: Callable[[], None] | None = None) -> None:
     """Encode PNGs as an MP4."""
-    from stages.io.exporters.frames import NAMED, over_background
-    from stages.io.exporters.video import write_mp4
+    from stages.formats.exporters.frames import NAMED, over_background
+    from stages.formats.exporters.video import write_mp4
     from stages.io.png import read_png
 
     write_mp4((over_background(read_png(frame), NAMED["white"]) for frame in frames), path, fps=options.fps, crf=options.crf, each=each)

@@ -15,9 +15,10 @@ import numpy as np
 
 from efficientnerf.asset.cascades import Cascade, cascades_of
 from efficientnerf.asset.region import inside_share
+from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
-from stages.framing.captured import captured_of, coverage
+from stages.framing.captured import captured_of
 from stages.io.scene import Orbit
 
 if TYPE_CHECKING:
@@ -283,7 +284,7 @@ def _framed_orbit(tree: NerfTree, points: np.ndarray, path: str, sway: float | N
 
 def captured_cameras(tree: NerfTree, frames: int, width: int, height: int, fov: float | None = None) -> list[Camera]:
     """Cameras on the way of the captured ones, with about their field of view along the diagonal. Raises BadInput where the asset keeps none."""
-    from stages.framing.captured_path import captured_path
+    from efficientnerf.capture.captured_path import captured_path
 
     captured = captured_of(tree.metadata)
     if captured is None:

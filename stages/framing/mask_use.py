@@ -15,10 +15,10 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, project, resized
 from pipeline.errors import BadInput
+from stages.formats.importers.source import MIN_IMAGES, abbreviated
 from stages.framing import scene_bounds
 from stages.framing.training_frame import focus_point
 from stages.io.capture import Capture, Photo, Silhouettes
-from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.silhouettes import SmallPictures
 

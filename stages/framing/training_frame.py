@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.capture.forward_facing import ForwardFacing, detect_forward_facing
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
-from stages.framing.forward_facing import ForwardFacing, detect_forward_facing
 from stages.framing.near_planes import content_depths, near_far_planes
 from stages.io.capture import Capture
 from stages.io.scene import Orbit

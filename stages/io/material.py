@@ -11,10 +11,10 @@ from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
-from stages.io.importers import one_line_errors
-from stages.io.importers.masks import masks_of
-from stages.io.importers.photographs import is_video, photographs
-from stages.io.importers.source import MIN_IMAGES, Source
+from stages.formats.importers import one_line_errors
+from stages.formats.importers.masks import masks_of
+from stages.formats.importers.photographs import is_video, photographs
+from stages.formats.importers.source import MIN_IMAGES, Source
 from stages.io.pictures import MAX_SIDE
 
 Warn = Callable[[str], object]
@@ -79,7 +79,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
     max_side  longest side of the frames, pixels
     """
     from stages.cores import count_cores
-    from stages.memory.poses import refuse_large_videos
+    from stages.poses.memory import refuse_large_videos
     from stages.video.frames import Reader, frames_of
     from stages.video.reading import UnreadableVideo, opened
 

@@ -20,7 +20,7 @@ from stages.io import scene
 from stages.io.json_file import read_json
 from stages.io.scene import Scene, View, camera_from, camera_to_json
 from stages.io.scene_schema import CameraDocument, decoded
-from stages.training import choices
+from stages.train import choices
 
 FORMAT = 1
 AGAIN = "Train again."

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 from msgspec import to_builtins
 
+from efficientnerf.capture.forward_facing import SPACES, ForwardFacing
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.geometry.ndc import Ndc
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.files import is_safe_name, write_json
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
-from stages.framing.forward_facing import SPACES, ForwardFacing
 from stages.io.capture import SparsePoints
 from stages.io.json_file import read_json
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha

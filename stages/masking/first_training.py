@@ -54,8 +54,8 @@ def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settin
     from efficientnerf.training.pixels import Pixels
     from stages.cores import use_all_cores
     from stages.io.field_file import space_of
-    from stages.training.data import sparse_depth_of
-    from stages.training.priors import filled_points, mask_cells_by
+    from stages.train.data import sparse_depth_of
+    from stages.train.priors import filled_points, mask_cells_by
 
     use_all_cores()
     folder = job.work / "first_training"

@@ -20,8 +20,8 @@ from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.compiling import compiling_kernels
 from stages.cores import count_cores, in_order
+from stages.formats.importers.source import MIN_IMAGES, abbreviated
 from stages.io.capture import FOREGROUND, Capture, Photo, without
-from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header
 from stages.masking.first_training import FIRST, RAYS, SIDE, first_field
@@ -75,7 +75,7 @@ def with_foreground_masks(job: Job, capture: Capture, warn: Any) -> Capture:
 def _made_anew(job: Job, capture: Capture, images: list[np.ndarray], folder: Path) -> _Made:
     """Masks in the folder, by a first training. Raises BadInput."""
     from stages.memory.need import refuse_what_does_not_fit
-    from stages.memory.training import first_training_needed
+    from stages.train.memory import first_training_needed
 
     found: list[_Made] = []
 
@@ -123,7 +123,7 @@ def _pictures(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[np.n
 def _subject(field: FirstField) -> Subject:
     """The subject of a first training. Raises BadInput."""
     from efficientnerf.asset.field_samples import field_samples, picture_places, surface_points
-    from stages.framing.foreground import find_subject
+    from efficientnerf.capture.foreground import find_subject
 
     samples = field_samples(field.model, field.pixels, RAYS, LEAST_SAMPLE, lambda done, total: None)
     points = surface_points(samples)

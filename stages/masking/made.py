@@ -89,7 +89,7 @@ def _by_network(model: Path) -> Callable[[Path, Path], bool]:
 
 
 def _by_key(how: str) -> Callable[[Path, Path], bool]:
-    from stages.masking.keying import key_of, keyed
+    from efficientnerf.capture.keying import key_of, keyed
 
     key = key_of(how)
 

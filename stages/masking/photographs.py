@@ -41,7 +41,7 @@ def cameras_of_photographs(job: Job, warn: Any) -> Capture:
 
 def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tuple[Capture, list[str]]:
     """The capture in the frame of cameras that the source states, where it is read as photographs in spite of them; else by GPS; and what is to be said."""
-    from stages.io.importers import IMPORTERS, posed_format
+    from stages.formats.importers import IMPORTERS, posed_format
     from stages.sfm.gps import STATED, with_gps, with_stated_cameras
 
     said, source = [], job.source
@@ -115,7 +115,7 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
     from efficientnerf.settings import given
     from stages.cores import count_cores
     from stages.io.pictures import UnreadableImage, read_header
-    from stages.memory.poses import feature_threads
+    from stages.poses.memory import feature_threads
     from stages.sfm.ladder import features_for
     from stages.sfm.learned.networks import given_networks
     from stages.sfm.reconstruction import find_cameras

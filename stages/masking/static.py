@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from efficientnerf.capture.keying import without_specks
 from pipeline.errors import BadInput
-from stages.masking.keying import without_specks
 
 SIDE = 480  # px, longest side of what is compared
 FEWEST, MOST = 5, 40  # photographs that are compared

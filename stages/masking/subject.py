@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.capture.cells import CONNECTED, connected_parts
+from efficientnerf.capture.foreground import MIN_PART, Foreground
+from efficientnerf.capture.supports import Plane, along
 from efficientnerf.geometry.cameras import Camera, project, rays
-from stages.framing.cells import CONNECTED, connected_parts
-from stages.framing.foreground import MIN_PART, Foreground
-from stages.framing.supports import Plane, along
 
 if TYPE_CHECKING:
     from efficientnerf.model import Model

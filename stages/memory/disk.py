@@ -70,7 +70,7 @@ def _frames(own: Any) -> int:
 
 def _working_images(own: Any, sources: Sequence[Path]) -> int:
     """Working images, and what structure from motion reads: copies of photographs, or the frames of videos. Videos count where there are no images."""
-    from stages.io.importers.source import IMAGE_SUFFIXES
+    from stages.formats.importers.source import IMAGE_SUFFIXES
     from stages.sfm.ladder import features_for
     from stages.video.panorama import VIEWS
 
@@ -99,7 +99,7 @@ def _pixels(pictures: Sequence[Path], side: int) -> float:
 def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
     """Whether structure from motion has to find them, as far as can be told before."""
     from pipeline.errors import PipelineError
-    from stages.io.importers import detect
+    from stages.formats.importers import detect
 
     if own.format != "auto" or len(sources) != 1:
         return own.format in ("auto", "photographs")
@@ -110,9 +110,9 @@ def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
 
 def _training(own: Any, run: Path, memory: int | None) -> int:
     from stages.io.scene import load, views_of
-    from stages.memory.training import parameters
-    from stages.training.data import count_pixels
-    from stages.training.hash_resolution import with_auto_sizes
+    from stages.train.data import count_pixels
+    from stages.train.hash_resolution import with_auto_sizes
+    from stages.train.memory import parameters
 
     folder = PosesOutputs.of_run(run)
     pixels = 4 * DECODED * _bytes_below([folder.images])
@@ -129,10 +129,10 @@ def _baking(own: Any, run: Path) -> int:
     """The values of the voxels as they are baked, the state of their refinement, twice while it is written, and the asset."""
     from efficientnerf.asset.file.serialisation import most_voxels
     from efficientnerf.rendering.harmonics import harmonics_count
-    from stages.baking.resolution import size_limits
-    from stages.baking.voxels import MAX_OVERSHOOT, finest_choice
+    from stages.bake.resolution import size_limits
+    from stages.bake.voxels import MAX_OVERSHOOT, finest_choice
     from stages.cores import count_cores
-    from stages.evaluation.views import constant_background
+    from stages.evaluate.views import constant_background
     from stages.io.field_file import load_renderer
     from stages.io.refined_cameras import load_scene
 

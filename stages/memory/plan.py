@@ -49,12 +49,12 @@ def memory_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mapp
 
 def _poses(own: Any, sources: Sequence[Path]) -> Need:
     """As if no cameras were known: of a set with cameras less is taken."""
-    from stages.io.importers.source import IMAGE_SUFFIXES
+    from stages.formats.importers.source import IMAGE_SUFFIXES
     from stages.io.pictures import UnreadableImage, read_header
     from stages.masking.first_training import FIRST, RAYS, SIDE
-    from stages.memory.poses import features_needed, video_needed
-    from stages.memory.training import first_training_needed
+    from stages.poses.memory import features_needed, video_needed
     from stages.sfm.ladder import features_for
+    from stages.train.memory import first_training_needed
     from stages.video.reading import UnreadableVideo, opened
 
     files = [path for source in sources for path in files_below(source)]
@@ -80,9 +80,9 @@ def _poses(own: Any, sources: Sequence[Path]) -> Need:
 def _train(run: Path, settings: Mapping[str, Any], device: str) -> Need:
     from stages.io.field_file import space_of
     from stages.io.scene import load, views_of
-    from stages.memory.training import training_needed
-    from stages.training.data import count_pixels
-    from stages.training.hash_resolution import with_auto_sizes
+    from stages.train.data import count_pixels
+    from stages.train.hash_resolution import with_auto_sizes
+    from stages.train.memory import training_needed
 
     folder = PosesOutputs.of_run(run).folder
     s = load(folder)
@@ -92,14 +92,14 @@ def _train(run: Path, settings: Mapping[str, Any], device: str) -> Need:
 
 def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
     from efficientnerf.asset.refinement import schedule
-    from stages.baking.memory import Trained, most_needed
-    from stages.baking.resolution import size_limits
-    from stages.evaluation.views import constant_background
+    from stages.bake.memory import Trained, most_needed
+    from stages.bake.resolution import size_limits
+    from stages.evaluate.views import constant_background
     from stages.io.field_file import space_of
     from stages.io.refined_cameras import load_scene
     from stages.io.scene import views_of
-    from stages.training.data import channels_of, count_pixels
-    from stages.training.hash_resolution import with_auto_sizes
+    from stages.train.data import channels_of, count_pixels
+    from stages.train.hash_resolution import with_auto_sizes
 
     own, folder = settings["bake"], PosesOutputs.of_run(run).folder
     s = load_scene(folder, TrainOutputs.of_run(run).folder)
@@ -113,14 +113,14 @@ def _bake(run: Path, settings: Mapping[str, Any], device: str) -> Need:
 
 
 def _mesh(run: Path, settings: Mapping[str, Any], _: str) -> Need:
-    from stages import mesh
+    from stages.mesh import run as mesh
 
     return mesh.needed(_asset(run), settings["mesh"], inputs_of(MeshInputs, _folders(MeshInputs, run)))
 
 
 def _splats(run: Path, settings: Mapping[str, Any], _: str) -> Need:
-    from stages import splats
     from stages.memory.need import libraries
+    from stages.splats import run as splats
 
     own = settings["splats"]
     if own.make == "off":
@@ -129,7 +129,7 @@ def _splats(run: Path, settings: Mapping[str, Any], _: str) -> Need:
 
 
 def _evaluate(run: Path, settings: Mapping[str, Any], device: str) -> Need:
-    from stages import evaluate
+    from stages.evaluate import run as evaluate
 
     return evaluate.needed(_asset(run), settings["evaluate"], inputs_of(EvaluateInputs, _folders(EvaluateInputs, run)), device)
 
@@ -141,7 +141,7 @@ def _turntable(run: Path, settings: Mapping[str, Any], device: str) -> Need:
 
 
 def _points(run: Path, settings: Mapping[str, Any], _: str) -> Need:
-    from stages.memory.surface import surface_needed
+    from stages.mesh.memory import surface_needed
 
     return surface_needed(_asset(run), settings["points"].num_points)
 

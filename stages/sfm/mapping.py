@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.capture.moving_parts import moving_parts
 from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
 from pipeline.files import remove
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts
 from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
-from stages.verdict.moving import moving_parts
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
@@ -260,7 +260,7 @@ def match_agreement(work: Path, images: Sequence[WorkImage], model: Any) -> floa
 
 
 def moving_shares(work: Path, images: Sequence[WorkImage], model: Any, safe_point: SafePoint) -> dict[str, float]:
-    """Name of a photograph -> share of it that moves, of those in which anything does (`stages.verdict.moving`)."""
+    """Name of a photograph -> share of it that moves, of those in which anything does (`efficientnerf.capture.moving_parts`)."""
     cameras = cameras_of(model, images)
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
 

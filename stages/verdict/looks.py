@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.capture.compression import block_steps, is_strong
 from stages.io.photo import apply_exif_orientation
 from stages.io.pictures import UnreadableImage, opened, orientation_of, read_quality, rgb_and_alpha
-from stages.verdict.compression import block_steps, is_strong
 
 SIDE = 640  # px, longest side that photographs are looked at with; docs/experiments/sfm.md
 NOISE = 0.8  # px, standard deviation of a blur that takes noise away

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.framing.captured import meeting_point
+from efficientnerf.capture.coverage import meeting_point
 from stages.io.capture import Photo, SparsePoints
 
 SMALL_ANGLE = 4.0  # degrees of parallax

@@ -18,10 +18,10 @@ import numpy as np
 
 from efficientnerf.settings import given
 from pipeline.errors import BadInput
-from stages.io import importers
+from stages.formats import importers
+from stages.formats.importers.photographs import photographs
+from stages.formats.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.capture import FOREGROUND
-from stages.io.importers.photographs import photographs
-from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
 from stages.masking.turning import masks_of_turning_subject
@@ -287,9 +287,9 @@ def forecast(
     """
     from stages.masking.first_training import FIRST, RAYS
     from stages.masking.first_training import SIDE as SIDE_OF_FIRST
-    from stages.memory.poses import decoding_needed, features_needed
-    from stages.memory.training import first_training_needed
+    from stages.poses.memory import decoding_needed, features_needed
     from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
+    from stages.train.memory import first_training_needed
 
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
     features = given(settings.max_features) or ladder.features_for(count)

@@ -5,7 +5,7 @@
     poor    its pictures show less than strongly blurred photographs, or the asset is not where the scene is
     failed  its pictures show hardly more than one colour would
 
-The figures are those of metrics.json (`stages.evaluation.summary`) and the verdict on the cameras; nothing else is looked at, so that worse figures never
+The figures are those of metrics.json (`stages.evaluate.summary`) and the verdict on the cameras; nothing else is looked at, so that worse figures never
 give a better grade. Each threshold and its reason: docs/experiments/verdict.md.
 """
 
@@ -18,8 +18,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
-from stages.evaluation.trivial import BLURS, equivalent_blur
-from stages.io.importers.source import abbreviated
+from stages.evaluate.trivial import BLURS, equivalent_blur
+from stages.formats.importers.source import abbreviated
 from stages.verdict.grades import GRADES
 
 USABLE_BLUR, POOR_BLUR, FAILED_BLUR = 0.0125, 0.0225, 0.04  # of the longest side: the blur that costs as much, beyond which a result is no better

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from efficientnerf.settings import given
-from stages.baking.refinement import usual_steps
-from stages.baking.resolution import MAX_MIB
+from stages.bake.refine.refinement import usual_steps
+from stages.bake.resolution import MAX_MIB
 from stages.memory.need import libraries
 
 SLOWER = 1.5  # by `preflight.REFERENCE`, of the machine that the processor seconds below were taken on
@@ -68,7 +68,7 @@ def bytes_of(settings: Mapping[str, Any]) -> int:
 
 
 def _voxels(bake: Any) -> int:
-    """That the asset may hold; a packed one has a third of the bytes by default (`stages.baking.resolution.budget_of`)."""
+    """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.budget_of`)."""
     packed, stated = bake.layout == "packed", given(bake.max_mib)
     usual = MAX_MIB / 3 if packed else MAX_MIB
     mib = usual if stated is None else min(stated, usual) if packed and bake.resolution == "auto" else stated

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
+from stages.formats.importers.source import MIN_IMAGES, abbreviated
 from stages.io.capture import BACKGROUND, LEFT_OUT, Capture
-from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.verdict import looks as looks_of
 from stages.verdict.grades import GRADES
 from stages.verdict.looks import Look

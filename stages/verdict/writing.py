@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import project, resized
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
-from stages.framing.captured import coverage
+from stages.formats.importers.photographs import photographs
+from stages.formats.importers.source import Source
 from stages.io.capture import Capture
-from stages.io.importers.photographs import photographs
-from stages.io.importers.source import Source
 from stages.io.pictures import UnreadableImage, read_quality
 from stages.io.scene import Scene
 from stages.verdict import looks, pictures

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.capture.frame_choice import BLUR, CHOSEN
 from stages.figures.drawing import new_figure
-from stages.video.choice import BLUR, CHOSEN
 
 SHOWN = 24  # thumbnails of a video
 COLUMNS = 8

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.capture import frame_choice as choice
 from pipeline.files import atomic, remove
 from stages.io.png import FAST
 from stages.scratch import note, noted, once
-from stages.video import choice
 from stages.video.reading import Frame, UnreadableVideo, Video, opened
 
 SLOWEST = 12.0  # frames a second that are looked at at least; of videos with more than twice as many, every n-th
@@ -141,7 +141,7 @@ def look(path: Path, reader: Reader) -> Looked:
 def _look(path: Path, reader: Reader, threads: int) -> Looked:
     import cv2
 
-    from stages.video.motion import DETAIL, TRACKED, Motion, sharpness
+    from efficientnerf.capture.frame_motion import DETAIL, TRACKED, Motion, sharpness
 
     motion = Motion()
     rows: list[tuple[int, float, float, float]] = []

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose, rays
-from stages.io import importers
+from stages.formats import importers
 from stages.io.capture import Capture
 from tests.stages import captures
 from tests.stages.captures import FOCAL, HEIGHT, WIDTH, Settings

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.capture.forward_facing import detect_forward_facing
 from efficientnerf.geometry.cameras import Camera, rays
-from stages.framing.forward_facing import detect_forward_facing
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, save
 from tests.efficientnerf.balls import BOUNDS

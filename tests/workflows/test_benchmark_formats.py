@@ -13,8 +13,8 @@ from benchmarks import format_readers as readers
 from benchmarks.formats import ROWS, apart, farthest, splats_apart
 from efficientnerf.splats.gaussians import covariances
 from efficientnerf.surface.mesh import PointCloud
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
-from tests.stages.io.gaussians import scattered
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
 from workflows.exporting import formats
 

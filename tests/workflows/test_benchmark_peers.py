@@ -15,8 +15,8 @@ from benchmarks.minutes import read_rows
 from benchmarks.peers import __main__ as peers
 from benchmarks.scenes.__main__ import write_scene
 from benchmarks.scenes.catalogue import recipes
-from stages.io.importers import IMPORTERS, detect
-from stages.poses import PosesSettings
+from stages.formats.importers import IMPORTERS, detect
+from stages.poses.run import PosesSettings
 
 COUNTS = {"train": 3, "val": 1, "test": 2}
 # Renders the test images on white, of the pixels asked for, each a tenth nearer to grey than it is.

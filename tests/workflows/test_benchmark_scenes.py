@@ -14,7 +14,7 @@ from benchmarks.scenes.shapes import Box, Capsule, Ground, Material, Shape, Sphe
 from efficientnerf.geometry.cameras import rays
 from pipeline.stage import Job
 from stages.io import scene
-from stages.poses import PosesSettings, run
+from stages.poses.run import PosesSettings, run
 
 GREY = Material(((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))
 COUNTS = {"train": 6, "val": 2, "test": 3}

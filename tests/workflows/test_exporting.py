@@ -21,11 +21,11 @@ from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.run import Run
 from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
-from stages.io.exporters import MESH_EXPORTERS
-from stages.io.exporters.writing import source_frame
-from stages.mesh import MeshSettings
-from stages.meshing.files import read_mesh
-from stages.points import PointsSettings
+from stages.formats.exporters import MESH_EXPORTERS
+from stages.formats.exporters.writing import source_frame
+from stages.mesh.files import read_mesh
+from stages.mesh.run import MeshSettings
+from stages.points.run import PointsSettings
 from tests.stages.io.meshes import block
 from workflows import exporting
 from workflows.cli.resolve import Settings, table_of
@@ -144,7 +144,7 @@ def test_colours_of_vertices_are_asked_of_photographs_where_there_are_any(run: P
 
 
 def test_usd_is_refused_before_anything_is_made_where_its_package_is_missing(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.io.exporters.usd.find_spec", lambda name: None)
+    monkeypatch.setattr("stages.formats.exporters.usd.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[usd\]'"):
         export(run, "b.glb", "b.usdz")
     assert not (run.parent / "b.glb").exists()

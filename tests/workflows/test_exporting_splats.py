@@ -16,10 +16,10 @@ from pipeline.errors import CorruptArtifact
 from pipeline.run import Run
 from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, SplatsOutputs
-from stages.io.exporters import SPLAT_EXPORTERS
-from stages.io.exporters.writing import source_frame
-from stages.splats import SplatsSettings
-from tests.stages.io.gaussians import read_spz, scattered
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.writing import source_frame
+from stages.splats.run import SplatsSettings
+from tests.stages.formats.gaussians import read_spz, scattered
 from workflows import exporting_splats
 from workflows.cli.resolve import Settings, table_of
 from workflows.exporting import Export

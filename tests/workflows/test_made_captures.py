@@ -11,7 +11,7 @@ from benchmarks import made_captures
 from benchmarks.scenes import captures
 from benchmarks.scenes.captures import MadeCapture
 from efficientnerf.geometry.cameras import project
-from stages.io import importers
+from stages.formats import importers
 
 WIDTH = 120
 KINDS = captures.captures()

@@ -13,7 +13,7 @@ from workflows.cli.options import common_options, crop_option, folder_type, forc
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.cameras import Camera
-    from stages.turntable import TurntableSettings
+    from stages.turntable.run import TurntableSettings
     from workflows.cli.resolve import Settings
 
 TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
@@ -95,7 +95,9 @@ def export(
 
 
 def _surface_stages() -> dict[str, type]:
-    from stages import mesh, points, splats
+    from stages.mesh import run as mesh
+    from stages.points import run as points
+    from stages.splats import run as splats
 
     return {"mesh": mesh.MeshSettings, "points": points.PointsSettings, "splats": splats.SplatsSettings}
 
@@ -152,11 +154,11 @@ def render(
 
     from pipeline.errors import UsageError
     from stages.figures.frames import RenderOptions, encode_frames, render_frames
+    from stages.formats.exporters.frames import frame_background
     from stages.framing.camera_paths import PATHS
-    from stages.io.exporters.frames import frame_background
     from stages.memory.need import refuse_more_than
     from stages.memory.rendering import frames_needed
-    from stages.turntable import TurntableSettings
+    from stages.turntable.run import TurntableSettings
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
     from workflows.destination import check_files, check_folder, check_free, writing
@@ -203,7 +205,7 @@ def _restricted_with_cameras(
     from stages.framing.camera_paths import similarity_of
     from stages.framing.restriction import restricted, with_region
     from stages.io.camera_path import read_camera_path
-    from stages.turntable import cameras_of
+    from stages.turntable.run import cameras_of
 
     tree = restricted(whole, settings.region, crop)
     if camera_path is None:

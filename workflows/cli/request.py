@@ -180,7 +180,7 @@ def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:
 
 def _format(settings: Settings, sources: Sequence[Path]) -> str | None:
     """The format that sources will be read as; None where they cannot be, which the stage poses reports."""
-    from stages.io.importers import detect
+    from stages.formats.importers import detect
 
     stated = settings.resolved()["poses"]
     if stated.format != "auto":

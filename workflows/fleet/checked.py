@@ -59,7 +59,7 @@ class Choice:
 
 def _format(poses: Mapping[str, Any], sources: Sequence[Path]) -> str | None:
     """The format that sources are read as; None where that is not known yet."""
-    from stages.io.importers import detect
+    from stages.formats.importers import detect
 
     stated = poses.get("format", "auto")
     if stated != "auto":

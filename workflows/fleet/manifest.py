@@ -278,6 +278,6 @@ class _Reader:
 
 
 def _is_video(path: Path) -> bool:
-    from stages.io.importers.photographs import is_video
+    from stages.formats.importers.photographs import is_video
 
     return is_video(path)

@@ -45,7 +45,7 @@ def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
     """The folder itself; for a video, or a folder of videos, one with the frames that a run would choose. Raises BadInput."""
     from pipeline.errors import BadInput
     from stages.cores import count_cores
-    from stages.io.importers import candidates
+    from stages.formats.importers import candidates
     from stages.io.material import find_material
     from stages.video.frames import Reader, frames_of
     from stages.video.reading import UnreadableVideo

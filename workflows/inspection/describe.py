@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS
 from workflows.asset import STAGES
 from workflows.cli.output import plain
 from workflows.cli.progress import size
@@ -31,7 +31,7 @@ def describe(path: Path) -> dict[str, Any]:
         return scene.describe(path)
     if (path / ASSET).is_file():
         return {"what": "asset", "path": str(path / ASSET), **describe_asset(path / ASSET)}
-    from stages.io.importers.description import describe_source
+    from stages.formats.importers.description import describe_source
 
     return describe_source(path)
 
@@ -43,7 +43,7 @@ def _describe_file(path: Path) -> dict[str, Any]:
     if suffix == ".nerftree":
         return {"what": "asset", "path": str(path), **describe_asset(path)}
     if suffix in SPLAT_EXPORTERS:
-        from stages.io.exporters.splats.description import describe_splats
+        from stages.formats.exporters.splats.description import describe_splats
 
         splats = describe_splats(path)
         if splats is not None:
@@ -57,7 +57,7 @@ def _describe_file(path: Path) -> dict[str, Any]:
 
         return scene.describe(path.parent)
     if suffix in SUFFIXES or suffix in (".json", ".npy", ".bin", ".txt"):
-        from stages.io.importers.description import describe_source
+        from stages.formats.importers.description import describe_source
 
         return describe_source(path if suffix in SUFFIXES else path.parent)
     known = f"an asset (.nerftree), a mesh ({', '.join(MESHES)}), 3D Gaussians ({', '.join(SPLAT_EXPORTERS)}), a run or the folder of a data set"

@@ -187,7 +187,7 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
     from efficientnerf.evaluation.metrics import psnr, ssim
     from efficientnerf.rendering.field_renderer import SampleCounts
     from stages.cores import use_all_cores
-    from stages.evaluation.views import evaluation_views, evenly_spaced, ground_truth
+    from stages.evaluate.views import evaluation_views, evenly_spaced, ground_truth
     from stages.io import scene
     from stages.io.field_file import load_renderer
 
@@ -256,7 +256,7 @@ def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
     from efficientnerf.asset import format
     from efficientnerf.asset.rendering import render
     from efficientnerf.evaluation.metrics import psnr, ssim
-    from stages.evaluation.views import evaluation_views, evenly_spaced, ground_truth
+    from stages.evaluate.views import evaluation_views, evenly_spaced, ground_truth
     from stages.io import scene
 
     tree = format.load(BakeOutputs.of_run(run.path).asset).to(device)

@@ -68,7 +68,7 @@ class Strip(msgspec.Struct):
 
 
 class Metrics(msgspec.Struct):
-    """metrics.json, as far as it is shown; see `stages.evaluation.summary`."""
+    """metrics.json, as far as it is shown; see `stages.evaluate.summary`."""
 
     split: str = "test"
     network: NetworkQuality | None = None

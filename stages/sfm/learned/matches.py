@@ -17,7 +17,7 @@ from stages.sfm.pairs import Pair, ordered
 
 MOST = 2048  # features of a photograph: what LightGlue takes grows with their square
 NEIGHBOURS = 4  # photographs with a camera that each of them is compared with, too: its features get points by these
-AT_ONCE = 2  # pictures, or pairs, that are worked on: each takes up to 2.3 GiB (`stages.memory.poses`)
+AT_ONCE = 2  # pictures, or pairs, that are worked on: each takes up to 2.3 GiB (`stages.poses.memory`)
 
 
 def pairs_of(weak: Sequence[int], partners: Sequence[Pair], overlaps: Mapping[tuple[int, int], int]) -> list[Pair]:

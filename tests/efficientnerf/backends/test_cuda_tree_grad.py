@@ -192,7 +192,7 @@ def test_interrupted_or_not_the_bytes_are_the_same() -> None:
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_the_room_that_a_fit_takes_is_known_before(*, smooth: bool) -> None:
-    from stages.baking.memory import needed_on_device
+    from stages.bake.memory import needed_on_device
 
     tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
     errors = ErrorMap(PatchGrid(pixels(2, 8), 4))

@@ -31,7 +31,7 @@ from efficientnerf.training.exposure.model import (
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
-from stages.evaluation.views import subsample
+from stages.evaluate.views import subsample
 from tests.efficientnerf.balls import cameras, photograph, untrained
 
 CPU = torch.device("cpu")

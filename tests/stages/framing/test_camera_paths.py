@@ -16,14 +16,15 @@ import pytest
 from efficientnerf.asset.region import REGIONS, Region
 from efficientnerf.asset.rendering import MOST_PIXELS, Rendering
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError
 from stages.figures.frames import RenderOptions, render_path
 from stages.framing.camera_paths import PATHS, orbit_of, pose_on_sphere, similarity_of, turntable_cameras
-from stages.framing.captured import captured_metadata, captured_of, coverage
+from stages.framing.captured import captured_metadata, captured_of
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
-from stages.turntable import TurntableSettings, cameras_of
+from stages.turntable.run import TurntableSettings, cameras_of
 from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree

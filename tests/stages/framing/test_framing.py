@@ -319,8 +319,8 @@ DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
 def real(name: str, form: str) -> Capture:
-    from stages.io.importers import IMPORTERS
-    from stages.poses import PosesSettings
+    from stages.formats.importers import IMPORTERS
+    from stages.poses.run import PosesSettings
 
     if not (DATA / name).is_dir():
         pytest.skip(f"shared/data/{name} is not there")

@@ -16,8 +16,8 @@ from efficientnerf.geometry.cameras import Camera, project, rays
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
-from stages import bake, train
 from stages.artifacts import BakeOutputs
+from stages.bake import run as bake
 from stages.framing.view_coverage import (
     CLEARANCE,
     before_near,
@@ -37,6 +37,7 @@ from stages.io.png import write_png
 from stages.io.scene import Scene, views_of
 from stages.io.scene import load as load_scene
 from stages.io.scene import save as save_scene
+from stages.train import run as train
 from tests.efficientnerf import balls
 from tests.stages.balls import job, poses
 

@@ -12,7 +12,7 @@ import pytest
 
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Mesh, vertex_normals
-from stages.io.exporters.writing import SourceFrame
+from stages.formats.exporters.writing import SourceFrame
 
 Z_UP = SourceFrame(Similarity.identity())
 Y_DOWN = SourceFrame(Similarity(0.5, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([1.0, 2, 3])), metric=True)

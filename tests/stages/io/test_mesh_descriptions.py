@@ -20,7 +20,7 @@ import trimesh
 
 from efficientnerf.surface.mesh import PointCloud
 from pipeline.errors import BadInput
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from stages.io.meshes.description import SUFFIXES, describe_mesh
 from stages.io.meshes.glb import FACE, FACES
 from tests.stages.io.meshes import Y_DOWN, block

@@ -14,10 +14,10 @@ import pytest
 from efficientnerf.surface.mesh import Mesh, Texture
 from pipeline.errors import CorruptArtifact
 from stages.artifacts import MeshOutputs
-from stages.io.exporters import MESH_EXPORTERS
-from stages.io.exporters.writing import MOST_TEXELS
+from stages.formats.exporters import MESH_EXPORTERS
+from stages.formats.exporters.writing import MOST_TEXELS
 from stages.io.png import write_png
-from stages.meshing.files import read_mesh
+from stages.mesh.files import read_mesh
 from tests.stages.io.meshes import Y_DOWN, block
 
 

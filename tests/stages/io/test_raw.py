@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.formats.importers.photographs import photographs
+from stages.formats.importers.source import Source
 from stages.io import photo, pictures, working_images
-from stages.io.importers.photographs import photographs
-from stages.io.importers.source import Source
 from stages.io.pictures import UnreadableImage
 from tests.stages import captures
 

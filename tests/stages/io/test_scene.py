@@ -13,9 +13,10 @@ import pytest
 
 from efficientnerf.geometry.cameras import Similarity, rays, resized
 from pipeline.errors import BadInput, CorruptArtifact
-from stages.io import importers, scene
+from stages.formats import importers
+from stages.formats.exporters import cameras
+from stages.io import scene
 from stages.io.capture import SparsePoints
-from stages.io.exporters import cameras
 from stages.io.scene import Orbit, Scene, View
 from tests.stages import captures
 from tests.stages.captures import LENSES, assert_same_rays

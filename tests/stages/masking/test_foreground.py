@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.region import Region
+from efficientnerf.capture.foreground import Foreground
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
-from stages import poses
 from stages.framing import mask_use
-from stages.framing.foreground import Foreground
 from stages.io import scene
 from stages.masking import foreground
 from stages.masking.foreground import cleaned
 from stages.masking.subject import Subject, may_show, subject_of
-from stages.poses import PosesSettings
+from stages.poses import run as poses
+from stages.poses.run import PosesSettings
 from tests.stages import captures
 
 RADIUS = 0.6

@@ -13,13 +13,13 @@ from PIL import Image
 
 from pipeline.errors import BadInput
 from pipeline.stage import Job
+from stages.formats.importers.masks import masks_of
+from stages.formats.importers.source import Source
 from stages.io.capture import Capture, Photo
-from stages.io.importers.masks import masks_of
-from stages.io.importers.source import Source
 from stages.io.photo import read_mask_file, read_photo
 from stages.masking import photographs
 from stages.masking.polarity import kept_white
-from stages.poses import PosesSettings
+from stages.poses.run import PosesSettings
 from tests.stages import captures
 
 W, H = 96, 72

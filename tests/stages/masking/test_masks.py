@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from efficientnerf.capture.keying import key_of, keyed, without_specks
 from pipeline.errors import BadInput
 from stages.io.png import read_png, write_png
-from stages.masking.keying import key_of, keyed, without_specks
 from stages.masking.made import made_masks
 from stages.masking.static import StillBackground
 

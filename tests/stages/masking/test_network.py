@@ -14,7 +14,7 @@ from pipeline.stage import Job
 from stages.io.png import read_png, write_png
 from stages.masking.made import masks_by_network
 from stages.masking.photographs import mask_choice, masks_made_for
-from stages.poses import STAGE, PosesSettings
+from stages.poses.run import STAGE, PosesSettings
 
 onnx = pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")

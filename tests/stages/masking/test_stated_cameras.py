@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity
-from stages.io import importers
+from stages.formats import importers
+from stages.formats.importers.photographs import photographs
+from stages.formats.importers.source import Source
 from stages.io.capture import Capture
-from stages.io.importers.photographs import photographs
-from stages.io.importers.source import Source
 from stages.masking.photographs import _in_known_frame
-from stages.poses import PosesSettings
+from stages.poses.run import PosesSettings
 from tests.stages import captures, exports
 
 AWAY = Similarity(0.2, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([4.0, 1, -3]))

@@ -17,7 +17,7 @@ from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo
 from stages.io.png import write_png
 from stages.masking.photographs import _of_turning_subject, mask_choice
 from stages.masking.turning import border_stands_still, masks_of_turning_subject, turn
-from stages.poses import PosesSettings, read
+from stages.poses.run import PosesSettings, read
 from stages.verdict.verdict import verdict_on
 from tests.stages import turntables
 

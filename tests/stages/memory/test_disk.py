@@ -11,7 +11,7 @@ import pytest
 
 from efficientnerf.geometry.cameras import Camera
 from pipeline.fleet import disk
-from stages.io.exporters.exr import write_exr
+from stages.formats.exporters.exr import write_exr
 from stages.io.png import write_png
 from stages.memory.disk import LEAST, space_needed
 from tests.stages.captures import HEIGHT, WIDTH, cameras, nerfstudio

@@ -14,20 +14,26 @@ from PIL import Image
 from pipeline.errors import UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
-from stages import bake, evaluate, mesh, points, splats, train, turntable
 from stages.artifacts import BakeOutputs, TrainOutputs
-from stages.bake import BakeSettings
-from stages.evaluate import EvaluateSettings
+from stages.bake import run as bake
+from stages.bake.run import BakeSettings
+from stages.evaluate import run as evaluate
+from stages.evaluate.run import EvaluateSettings
 from stages.memory.need import Need, has_room, refuse_what_does_not_fit
-from stages.memory.poses import feature_threads, features_needed
-from stages.memory.surface import surface_needed
-from stages.memory.training import rows_for_training, samples_of
-from stages.mesh import MeshSettings
-from stages.points import PointsSettings
-from stages.poses import PosesSettings
-from stages.poses import run as run_poses
-from stages.splats import SplatsSettings
-from stages.turntable import TurntableSettings
+from stages.mesh import run as mesh
+from stages.mesh.memory import surface_needed
+from stages.mesh.run import MeshSettings
+from stages.points import run as points
+from stages.points.run import PointsSettings
+from stages.poses.memory import feature_threads, features_needed
+from stages.poses.run import PosesSettings
+from stages.poses.run import run as run_poses
+from stages.splats import run as splats
+from stages.splats.run import SplatsSettings
+from stages.train import run as train
+from stages.train.memory import rows_for_training, samples_of
+from stages.turntable import run as turntable
+from stages.turntable.run import TurntableSettings
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
 

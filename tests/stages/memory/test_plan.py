@@ -14,13 +14,19 @@ from PIL import Image
 from efficientnerf.asset.format import load, outline
 from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit
-from stages import bake, evaluate, mesh, points, splats, train, turntable
 from stages.artifacts import MeshOutputs
-from stages.bake import BakeSettings
+from stages.bake import run as bake
+from stages.bake.run import BakeSettings
+from stages.evaluate import run as evaluate
 from stages.memory.plan import memory_needed
-from stages.memory.poses import features_needed
 from stages.memory.rendering import tree_bytes
-from stages.memory.surface import surface_needed
+from stages.mesh import run as mesh
+from stages.mesh.memory import surface_needed
+from stages.points import run as points
+from stages.poses.memory import features_needed
+from stages.splats import run as splats
+from stages.train import run as train
+from stages.turntable import run as turntable
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
 from workflows.asset import NAMES, STAGES, WORKFLOW

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from efficientnerf.capture.moving_parts import OF_A_PART, motions, moving_parts, share_of_parts
 from efficientnerf.geometry.cameras import project
 from stages.sfm import ladder, mapping
-from stages.verdict.moving import OF_A_PART, motions, moving_parts, share_of_parts
 from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, SIZE, cameras, clouds, matched
 
 BALL = 60  # points that move

@@ -14,7 +14,7 @@ from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.masking.photographs import cameras_of_photographs
-from stages.poses import STAGE, PosesSettings
+from stages.poses.run import STAGE, PosesSettings
 from stages.sfm import ladder, matches
 from stages.sfm.database import FEATURES, forget
 from stages.sfm.learned.matches import NEIGHBOURS, pairs_of

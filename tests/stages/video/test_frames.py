@@ -14,12 +14,12 @@ from PIL import Image
 from pipeline.errors import BadInput, Interrupted
 from pipeline.run import named
 from pipeline.stage import Job
-from stages import poses
+from stages.formats.importers import candidates, files
 from stages.io.capture import Capture
-from stages.io.importers import candidates, files
 from stages.io.material import find_material, photographs_of, with_frames
 from stages.io.photo import read_photo
-from stages.poses import PosesSettings
+from stages.poses import run as poses
+from stages.poses.run import PosesSettings
 from stages.sfm import reconstruction
 from stages.sfm.images import prepare_images
 from stages.video.frames import Chosen, Reader, frames_of, look

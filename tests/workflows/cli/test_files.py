@@ -20,13 +20,13 @@ from efficientnerf.asset.region import Region
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
+from stages.formats.exporters.splats.ply import read_splats
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
-from stages.io.exporters.splats.ply import read_splats
-from stages.mesh import MeshSettings
-from stages.turntable import TurntableSettings
-from tests.stages.io.gaussians import scattered
+from stages.mesh.run import MeshSettings
+from stages.turntable.run import TurntableSettings
+from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
 from workflows.cli.files import EXR, REGIONS, TEXTURES

@@ -1,0 +1,187 @@
+"""Planes that support a subject: the floor or table that it stands on, the wall behind it.
+
+A support hides what is behind it, the subject stands before it, not beside it, and it goes on round the subject. Ears, fins or a chest in one plane do not:
+rays pass between and beside them, and the head lies beside the plane of the chest.
+
+M cells, R rays, C cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from efficientnerf.capture.cells import CONNECTED, Cells, connected_parts
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import rays as camera_rays
+
+# docs/experiments/foreground.md
+TRIES, MAX_PLANES, MAX_SUPPORTS = 400, 6, 3
+MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane holds; of the central rays that end before it, that end behind it: supports hide
+MIN_CONNECTED = 0.25  # of the cells of a plane's largest connected part, that others have which count
+MAX_THROUGH = 0.12  # of the rays that meet a plane within its outline, that go on
+MAX_PAST, MAX_PAST_LEVEL = 0.15, 0.7  # the rays that go on past the edge of a plane, of those that end on it; of a floor or table, which may end in view
+ROUND_IT = 1.3  # times the outline: what is round a wall
+MIN_UNDER = 0.5  # of what the middles of the photographs show before a plane, that stands on it
+LEVEL = 0.995  # least height of the normal of a floor or table
+FARTHEST = 1.6  # distance at which rays meet a plane over the usual distance
+FEET = 0.3  # of the subject's size, that a part of it stands above a support at most
+
+Plane = tuple[np.ndarray, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays of photographs and where they end.
+
+    origins, directions  (R, 3), directions of unit length
+    ends                 (R,) distance at which each ends; infinite where it ends nowhere
+    """
+
+    origins: np.ndarray
+    directions: np.ndarray
+    ends: np.ndarray
+
+
+def rays_that_end(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> Rays:
+    """The rays of pixels (R, 2), from -1 to 1, of views (R,), which end at points (R, 3); not finite where a ray ends nowhere."""
+    origins, directions = np.zeros(points.shape), np.zeros(points.shape)
+    for number, camera in enumerate(cameras):
+        mine = np.flatnonzero(views == number)
+        origins[mine], directions[mine] = camera_rays(camera, (pixels[mine] + 1) / 2 * (camera.width, camera.height))
+    with np.errstate(invalid="ignore"):
+        distance = np.linalg.norm(points - origins, axis=1)
+    return Rays(origins, directions, np.where(np.isfinite(distance), distance, np.inf))
+
+
+def find_supports(
+    cells: Cells, observed: np.ndarray, close: np.ndarray, rays: Rays, cameras: np.ndarray, reach: float
+) -> tuple[list[Plane], np.ndarray, np.ndarray]:
+    """The planes that support the subject, unit normals towards the cameras and offsets, the cells (M,) on them, and the cells behind one.
+
+    A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of what the photographs' middles show beside it.
+    """
+    tolerance = max(1.5 * cells.side, 0.03 * reach)
+    support, hidden = np.zeros(len(observed), bool), np.zeros(len(observed), bool)
+    planes: list[Plane] = []
+    left = observed.copy()
+    for _ in range(MAX_PLANES):
+        found = _plane(cells.centres[left], tolerance)
+        if found is None or len(planes) == MAX_SUPPORTS:
+            break
+        normal, offset = found
+        if np.median(cameras @ normal - offset) < 0:
+            normal, offset = -normal, -offset
+        height = along(cells.centres, normal) - offset
+        on = left & (np.abs(height) <= tolerance)
+        if on.sum() < MIN_SUPPORT * observed.sum():
+            break
+        left &= ~on
+        before, behind = (float(cells.central[close & part].sum()) for part in (height > tolerance, height < -tolerance))
+        if (cameras @ normal > offset + tolerance).mean() < 0.8 or behind > MAX_BEHIND * before:
+            continue
+        if not _supports((normal, offset), cells, on, close & (height > tolerance), rays, tolerance, reach):
+            continue
+        support |= np.abs(height) <= tolerance
+        hidden |= height < -tolerance
+        planes.append((normal, offset))
+    return planes, support, hidden & ~support
+
+
+def _supports(plane: Plane, cells: Cells, on: np.ndarray, before: np.ndarray, rays: Rays, tolerance: float, reach: float) -> bool:
+    """Whether a plane hides what is behind the cells (M,) on it, goes on round them, and is under what is before it."""
+    normal, offset = plane
+    across = _axes_across(normal)
+    outline = _outline(cells.centres[on] @ across.T, CONNECTED * cells.side)
+    if outline is None:
+        return False
+    beside = _beside(outline, cells.centres[before] @ across.T)
+    under = float(cells.central[before][beside <= 1.1].sum())
+    toward = -along(rays.directions, normal)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (along(rays.origins, normal) - offset) / toward
+        meets = (toward > 0.05) & (distance > 0) & (distance <= FARTHEST * reach) & ((rays.ends - distance) * toward > -tolerance)
+    at = np.flatnonzero(meets)
+    beside = _beside(outline, (rays.origins[at] + distance[at, None] * rays.directions[at]) @ across.T)
+    goes_on = (rays.ends[at] - distance[at]) * toward[at] > tolerance + 0.02 * distance[at]
+    within, past = beside <= 1, (beside > 1) & (beside <= ROUND_IT)
+    on_it = int((within & ~goes_on).sum())
+    if under < MIN_UNDER * float(cells.central[before].sum()) or (within & goes_on).sum() > MAX_THROUGH * within.sum():
+        return False
+    return bool((past & goes_on).sum() <= (MAX_PAST_LEVEL if abs(normal[2]) > LEVEL else MAX_PAST) * on_it)
+
+
+def _axes_across(normal: np.ndarray) -> np.ndarray:
+    """(2, 3) two unit vectors at right angles to a unit normal and to each other."""
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)])
+
+
+Outline = tuple[np.ndarray, np.ndarray]
+
+
+def _outline(places: np.ndarray, apart: float) -> Outline | None:
+    """The convex hull of the largest connected parts of places (N, 2): its middle (2,) and its sides (S, 2), each the normal over the distance of a side from
+    the middle; None where it has no area."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    _, part = connected_parts(places, apart)
+    size = np.bincount(part)
+    try:
+        hull = ConvexHull(places[(size >= MIN_CONNECTED * size.max())[part]])
+    except (QhullError, ValueError):
+        return None
+    middle = hull.points[hull.vertices].mean(axis=0)
+    distance = -(hull.equations[:, :2] @ middle + hull.equations[:, 2])
+    return (middle, hull.equations[:, :2] / distance[:, None]) if (distance > 0).all() else None
+
+
+def _beside(outline: Outline, places: np.ndarray) -> np.ndarray:
+    """(N,) how far places (N, 2) are from the middle of an outline: 1 on it, 2 at twice its size."""
+    middle, sides = outline
+    return np.asarray(((places - middle) @ sides.T).max(axis=1)) if len(places) else np.zeros(0)
+
+
+def along(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(N,) coordinates of points (N, 3) along a direction: in sums whose order no number of threads changes."""
+    return np.asarray(points[:, 0] * direction[0] + points[:, 1] * direction[1] + points[:, 2] * direction[2])
+
+
+def _plane(points: np.ndarray, tolerance: float) -> Plane | None:
+    """Normal and offset of the plane with most of the points (N, 3) within a tolerance."""
+    if len(points) < 3:
+        return None
+    generator = np.random.default_rng(0)
+    triple = points[generator.integers(0, len(points), (TRIES, 3))]
+    normals = np.cross(triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    good = length > 1e-12
+    if not good.any():
+        return None
+    normals = normals[good] / length[good, None]
+    offsets = (normals * triple[good, 0]).sum(axis=1)
+    counts = [(np.abs(along(points, normal) - offset) <= tolerance).sum() for normal, offset in zip(normals, offsets, strict=True)]
+    best = int(np.argmax(counts))
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(3):
+        near = points[np.abs(along(points, normal) - offset) <= tolerance]
+        if len(near) < 3:
+            break
+        middle = near.mean(axis=0)
+        normal = np.linalg.eigh(np.einsum("ni,nj->ij", near - middle, near - middle))[1][:, 0]
+        offset = float(normal @ middle)
+    return normal, offset
+
+
+def with_feet(subject: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
+    """Points (N, 3) of a subject and where those near a support would stand on it: what touches a plane counts as plane."""
+    size = float(np.ptp(subject, axis=0).max())
+    feet = [subject]
+    for normal, offset in planes:
+        height = along(subject, normal) - offset
+        near = height <= FEET * size
+        feet.append(subject[near] - height[near, None] * normal)
+    return np.concatenate(feet)

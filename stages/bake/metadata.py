@@ -1,0 +1,69 @@
+"""The metadata that the bake stage writes into an asset: frame, orbit, licence and provenance; see FORMAT.md."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.stage import Job
+from stages.artifacts import BakeInputs, inputs_of
+from stages.framing.captured import captured_metadata
+
+if TYPE_CHECKING:
+    from efficientnerf.capture.forward_facing import ForwardFacing
+    from stages.bake.run import BakeSettings
+    from stages.io.scene import Scene
+
+
+def sources_of(job: Job) -> dict[str, str]:
+    """SHA-256 of the files that the asset was made from: cameras and field."""
+    from pipeline.hashes import sha256_of
+
+    inputs = inputs_of(BakeInputs, job.inputs)
+    return {path.name: sha256_of(path) for path in (inputs.poses.scene, inputs.train.field)}
+
+
+def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
+    """What an asset needs to be used without its run."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        tool = version("efficientnerf")
+    except PackageNotFoundError:
+        tool = "unknown"
+    similarity, orbit = s.world_from_capture, s.orbit
+    return {
+        "world_from_capture": {
+            "scale": float(similarity.scale),
+            "rotation": np.asarray(similarity.rotation, np.float64).tolist(),
+            "translation": np.asarray(similarity.translation, np.float64).tolist(),
+        },
+        "orbit": {
+            "centre": [float(x) for x in orbit.centre],
+            "radius": float(orbit.radius),
+            "elevation": float(orbit.elevation),
+            "forward_facing": bool(orbit.forward_facing),
+            "heading": float(orbit.heading),
+        },
+        "captured_path": captured_metadata([view.camera for view in s.views]),
+        "metric": bool(s.metric),
+        **({} if s.forward is None else {"spiral": spiral_of(s.forward)}),
+        "licence": settings.licence,
+        "provenance": {
+            "tool": f"efficientnerf {tool}",
+            "kind": s.kind,
+            "training_views": sum(v.split == "train" for v in s.views),
+            "iterations": m.settings.iterations,
+        },
+    }
+
+
+def spiral_of(forward: ForwardFacing) -> dict[str, Any]:
+    """The parameters of a camera path for a forward-facing scene."""
+    return {
+        "radii": [float(x) for x in forward.radii],
+        "focus": float(forward.focus),
+        "tangents": [float(x) for x in forward.tangents],
+        "far": float(forward.far),
+    }

@@ -1,0 +1,131 @@
+"""Which voxels of a tree that is being refined are dropped: those that contribute to no pixel, and of the others those of least weight, as far as the asset's
+size demands. Of whole scenes, voxels without which a ray would end in a hole stay.
+
+N voxels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.stage import Job
+from stages.bake.holes import find_holes, voxels_of_holes
+from stages.bake.voxels import FEW_VIEWS_RATIO, seen_by_few
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.field_samples import FieldSamples
+    from efficientnerf.asset.refinement.state import RefinementState
+    from efficientnerf.asset.refinement.targets import Targets
+    from efficientnerf.asset.tree import NerfTree
+    from stages.io.scene import Scene
+
+# Training rays per voxel that are rendered to see which voxels show, at least bake.visibility_rays; in normalised device coordinates, where no ray
+# misses and each meets many voxels, fewer. docs/experiments/refinement.md
+RAYS_PER_VOXEL, NDC_RAYS_PER_VOXEL = 1.0, 0.25
+CHILDREN_OVERSHOOT = 3.0  # voxels after a split over those that the asset has room for, at most: few of them show
+
+
+def most_children(room: int) -> int:
+    """Voxels after a split, at most, where there is room for so many in the asset."""
+    return max(8, int(CHILDREN_OVERSHOOT * room))
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """That voxels were dropped, and of whole scenes the shares of the rays that end in holes.
+
+    without   after voxels were dropped
+    restored  after `voxels` of them were restored
+    """
+
+    without: float = 0.0
+    restored: float = 0.0
+    voxels: int = 0
+
+    def report(self) -> dict[str, Any]:
+        return {"pruned": round(self.without, 6), "restored": round(self.restored, 6), "voxels_restored": self.voxels}
+
+
+def prune(
+    job: Job, s: Scene, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None, baked: np.ndarray | None
+) -> tuple[RefinementState, Pruned]:
+    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most. Of a whole scene,
+    voxels without which a ray would end in a hole stay. In normalised device coordinates the contributions of voxels that few images have in view count more.
+
+    baked  (N,) densities before the first step, of a whole scene
+    """
+    from efficientnerf.asset.cascades import subset
+    from efficientnerf.asset.refinement.state import subset_state
+
+    state.to_host()
+    greatest = greatest_weights(job, state, targets)
+    if state.tree.ndc is not None:
+        greatest[of_few_views(job, s, state.tree)] *= FEW_VIEWS_RATIO
+    keep = heaviest(job, greatest, most)
+    if not keep.any():
+        return state, Pruned()
+    if samples is None:
+        if state.tree.background is None:
+            from efficientnerf.asset.components import small_components
+
+            keep &= ~small_components(state.tree, keep, job.settings.min_component)
+        return subset_state(state, keep, subset(state.tree, keep)), Pruned()
+    from efficientnerf.asset.components import unsupported_components
+
+    assert baked is not None
+    keep &= ~unsupported_components(state.tree, keep, job.settings.min_component, samples)
+    holes, pruned_share = find_holes(job, subset(state.tree, keep), samples)
+    needed = voxels_of_holes(state.tree, samples, holes)
+    restored = needed & ~keep
+    state.density[needed] = np.maximum(state.density, baked)[needed]
+    keep |= restored
+    over = int(keep.sum()) - most
+    if over > 0:
+        others = np.flatnonzero(keep & ~restored)
+        keep[others[np.argsort(greatest[others], kind="stable")[:over]]] = False
+    tree = subset(state.tree, keep)
+    return subset_state(state, keep, tree), Pruned(pruned_share, find_holes(job, tree, samples)[1], int((restored & keep).sum()))
+
+
+def count_rays(job: Job, ndc: bool, voxels: int, targets: Targets) -> int:
+    """Training rays that are rendered to see which of so many voxels show."""
+    per_voxel = NDC_RAYS_PER_VOXEL if ndc else RAYS_PER_VOXEL
+    return min(max(job.settings.visibility_rays, int(per_voxel * voxels)), 4 * len(targets.pixels))
+
+
+def greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.ndarray:
+    """(N,) the greatest contribution of each voxel to one of many training pixels."""
+    from efficientnerf.asset.refinement import fit
+
+    count = count_rays(job, state.tree.ndc is not None, len(state.density), targets)
+
+    def progress(done: int, total: int) -> None:
+        job.progress(done, total, "rendering for voxel weights")
+        job.safe_point()
+
+    return fit.max_weights(state.tree, targets, count, job.settings.seed, progress)
+
+
+def of_few_views(job: Job, s: Scene, tree: NerfTree) -> np.ndarray:
+    """Numbers of the voxels of the coarse cells that few training images have in view, in normalised device coordinates."""
+    assert tree.ndc is not None
+    cells = np.argwhere(tree.brick_index >= 0)
+    few = seen_by_few(job, s, tree.ndc, (cells + 0.5) * (tree.voxel * tree.brick) + tree.bounds_min)
+    rows = tree.voxel_index[tree.brick_index[tuple(cells[few].T)]]
+    found: np.ndarray = rows[rows >= 0]
+    return found
+
+
+def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:
+    """(N,) bool: voxels whose weight exceeds bake.weight_threshold, at most `most`."""
+    keep = greatest > job.settings.weight_threshold
+    if keep.sum() > most:
+        order = np.argsort(-greatest, kind="stable")
+        keep = np.zeros(len(keep), bool)
+        keep[order[:most]] = True
+        left_out = float(greatest[order[most]])
+        job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib has room for {most:,}")
+    return keep

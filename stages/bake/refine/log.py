@@ -1,0 +1,90 @@
+"""The log of a refinement, its previews of a view that was held back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.train.log import continue_log, psnr_of
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.refinement.state import RefinementState
+    from stages.bake.refine.timing import Stopwatch
+    from stages.train.previews import Previews
+
+EVERY = 10  # steps
+SMOOTHING = 0.9  # of the running mean of the error
+PREVIEWS = 8  # after the first, which is drawn before a step is taken
+PREVIEW_SHARE = 0.03  # of the time, at most; the first and the last are drawn all the same
+
+
+class RefinementLog:
+    """log.jsonl: a line every few steps, and at each preview.
+
+        seconds          of the stage so far
+        psnr             running mean over the training rays, each over the backgrounds that it is compared over; null before the first step
+        preview_psnr     of the preview, if one was drawn
+        rays_per_second  of the steps alone, the mean since the last line
+        resolution       voxels along the longest side
+
+    Lines are written by `flush`.
+    """
+
+    def __init__(self, path: Path, step: int, fraction: float, stopwatch: Stopwatch, previews: Previews, clock: Callable[[], float]) -> None:
+        """
+        step, fraction  that the refinement goes on from; lines after it are dropped, for they will be logged again
+        """
+        self.path, self.stopwatch, self.previews, self.clock = path, stopwatch, previews, clock
+        self.drawn = int(PREVIEWS * fraction)
+        self.previewing, self.working, self.logged = 0.0, 0.0, step
+        self.error: float | None = None
+        self.unwritten: list[str] = []
+        continue_log(path, step)
+
+    def record(self, state: RefinementState, phase: str, fraction: float, rays: int, error: float, seconds: float, *, last: bool) -> dict[str, Any]:
+        """Log a step where it is time; returns what a display shows of it.
+
+        fraction  of the way
+        rays      of the step
+        error     mean squared error of a channel
+        seconds   that the step took
+        last      of its phase
+        """
+        self.error = error if self.error is None else SMOOTHING * self.error + (1 - SMOOTHING) * error
+        self.working += seconds
+        drawn = self._preview(state, fraction)
+        if state.step % EVERY == 0 or last or drawn is not None:
+            rate = rays * (state.step - self.logged) / max(self.working, 1e-9)
+            line = {
+                "step": state.step, "phase": phase, "seconds": round(self.stopwatch.seconds, 3), "preview_psnr": drawn,
+                "psnr": psnr_of(self.error) if rays else None,
+                "rays": rays, "rays_per_second": round(rate), "voxels": len(state.density), "resolution": max(state.tree.resolution),
+            }  # fmt: skip
+            self.unwritten.append(json.dumps(line, sort_keys=True))
+            self.working, self.logged = 0.0, state.step
+        return {"psnr": round(psnr_of(self.error), 2), "voxels": len(state.density), **self.previews.figures}
+
+    def begin(self, state: RefinementState, phase: str, error: float) -> None:
+        """The line before the first step, and its preview."""
+        self.drawn = -1
+        self.record(state, phase, 0.0, 0, error, 0.0, last=True)
+        self.error = None
+
+    def _preview(self, state: RefinementState, fraction: float) -> float | None:
+        """Draw a preview where it is time; its PSNR."""
+        due = int(PREVIEWS * round(fraction, 9))
+        if due <= self.drawn or (0 < due < PREVIEWS and self.previewing > PREVIEW_SHARE * self.stopwatch.seconds):
+            return None
+        began = self.clock()
+        state.fetch()
+        psnr = self.previews.draw(state.step)
+        self.drawn = due
+        self.previewing += self.clock() - began
+        return psnr
+
+    def flush(self) -> None:
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.writelines(line + "\n" for line in self.unwritten)
+        self.unwritten.clear()

@@ -1,0 +1,172 @@
+"""The resolution of an asset: as fine as its size allows, and no finer than the training images resolve.
+
+The number of voxels at a resolution cannot be derived from the box. So visibility is computed once, on the finest grid in question; on coarser grids
+the same voxels are counted: first on two that are cheap, which give the exponent by which the number grows (2 for surfaces, 3 for what fills space),
+then on the one that follows from it. Nothing depends on the clock or on free memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.settings import given
+from pipeline.errors import UsageError
+
+if TYPE_CHECKING:
+    from efficientnerf.capture.forward_facing import ForwardFacing
+    from stages.bake.run import BakeSettings
+    from stages.io.scene import Scene
+
+MIN_RESOLUTION = 32  # voxels along the longest side
+# docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background, of a whole scene (in its innermost cascade), and in
+# normalised device coordinates (images hold noise that finer voxels would learn); voxels along the longest side, at most; MiB of an asset, at most
+VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
+MAX_RESOLUTION = 1024
+MAX_MIB = 38
+# Of whole scenes: cascades at most; the share of what the field shows that may lie beyond the last one, in the environment map; coarse cells of all of them.
+MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
+# In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
+NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
+# With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of a whole scene takes
+# fewer rays. docs/experiments/tree-training.md
+TIMED_MIB, SCENE_TIMED_MIB, MIN_TIMED_MIB = 0.115, 0.23, 2.0
+MIN_FILL = 0.93  # of the size that is used, at least
+MAX_TRIES = 4
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A resolution, and one sentence on what decided it."""
+
+    resolution: int
+    why: str
+
+
+def baked_resolution(resolution: int, splits: int) -> int:
+    """Voxels along the longest side of what is baked, which are split so often to have the asset's resolution."""
+    return -(-resolution // 2**splits)
+
+
+def finest_resolution(s: Scene, most: int | None) -> Choice:
+    """Voxels along the longest side of the box, so that a voxel covers half a pixel at the box's centre, for the median camera; at most `most` of them, or
+    MAX_RESOLUTION where it is None.
+
+    In normalised device coordinates, where a pixel is as wide at any depth, a voxel is as wide as 4/3 of a pixel.
+    """
+    if s.forward is not None:
+        wide, share = ndc_pixel(s, s.forward), NDC_VOXEL_PIXELS
+        side = float((s.forward.bounds[1] - s.forward.bounds[0])[:2].max())
+    else:
+        wide, share = pixel_at_centre(s, s.bounds), VOXEL_PIXELS
+        side = float((s.bounds[1] - s.bounds[0]).max())
+    return _resolved(side / (share * wide), share, MAX_RESOLUTION if most is None else most)
+
+
+def finest_of_cascades(s: Scene, bounds: np.ndarray, count: int, brick: int, most: int | None) -> Choice:
+    """`finest_resolution` of the innermost of so many cascades, which covers `bounds` (2, 3): a voxel covers a pixel at its centre. At most `most`, or as many
+    as MAX_CELLS allow where it is None."""
+    sides = np.asarray(bounds[1] - bounds[0], np.float64)
+    if most is None:
+        cells_at_one = float(np.prod(sides / sides.max())) / brick**3  # of a cascade, over the cube of the resolution
+        most = max(MIN_RESOLUTION, int((MAX_CELLS / count / cells_at_one) ** (1 / 3)))
+    return _resolved(float(sides.max()) / (SCENE_VOXEL_PIXELS * pixel_at_centre(s, bounds)), SCENE_VOXEL_PIXELS, most)
+
+
+def _resolved(voxels: float, share: float, most: int) -> Choice:
+    """So many voxels, each `share` of a pixel wide, but `most` at most."""
+    resolved = max(MIN_RESOLUTION, round(voxels))
+    if resolved > most:
+        return Choice(most, f"bake.max_resolution; pixels resolve {resolved}")
+    return Choice(resolved, f"a voxel covers {share:.2g} of a pixel")
+
+
+def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
+    """Width of a pixel of the median camera at the centre of a box (2, 3), world units."""
+    centre = np.asarray(bounds, np.float64).mean(axis=0)
+    return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
+
+
+def budget_of(s: Scene, stated: float | None, *, packed: bool = False) -> float:
+    """MiB that an asset may have: those stated, or else MAX_MIB. In normalised device coordinates, where nothing is empty
+    and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
+    large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
+    if stated is None and packed:
+        return math.ceil(budget_of(s, None) / 3)
+    if stated is not None or s.forward is None:
+        return MAX_MIB if stated is None else stated
+    across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
+    return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
+
+
+def refuse_without_room(settings: BakeSettings, mib: float, resolution: int, room: int, *, environment: bool) -> None:
+    """UsageError where an asset of so many MiB has no room for a single voxel beside its coarse cells at the least resolution in question, and, of a whole
+    scene, its environment map. Else the voxels would be dropped one and all, and the field be thought empty."""
+    if room > 0:
+        return
+    beside, lower = f"the coarse cells of {resolution} voxels along the longest side", [] if resolution <= MIN_RESOLUTION else [
+        "bake.resolution" if settings.resolution != "auto" else "train.discretise"
+    ]
+    if environment:
+        beside += f" and an environment map of {settings.environment_size} rows"
+        lower.append(f"bake.environment_size ({settings.environment_size})")
+    remedy = "Raise bake.max_mib (--target-mib)" + (f", or lower {' or '.join(lower)}" if lower else "")
+    raise UsageError(f"bake.max_mib={mib:.3g}: has no room for voxels beside {beside}. {remedy}.")
+
+
+def timed_budget(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:
+    """MiB of those that an asset may have, which can be refined in so many seconds: fewer voxels that rays have met often are better than more of them."""
+    timed = max(MIN_TIMED_MIB, (SCENE_TIMED_MIB if whole else TIMED_MIB) * seconds * cores)
+    return min(mib, timed / 3 if packed else timed)
+
+
+def size_limits(settings: BakeSettings, s: Scene, device: str, cores: int, *, whole: bool, discretise: int | None = None) -> tuple[float, float]:
+    """MiB that an asset may have; and those that its voxels are chosen by: where the size is left to us, no more than can be refined in bake.time_budget. A
+    packed asset has no more voxels than the default size would give it, unless bake.resolution or train.discretise is stated: bytes beyond
+    that go into finer codes. See docs/experiments/packed.md."""
+    packed, seconds = settings.layout == "packed", given(settings.time_budget)
+    mib = budget_of(s, given(settings.max_mib), packed=packed)
+    if settings.max_mib != "auto" and packed and (given(settings.resolution) or discretise) is None:
+        return mib, min(mib, budget_of(s, None, packed=True))
+    if seconds is None or settings.max_mib != "auto" or device != "cpu":
+        return mib, mib
+    return mib, timed_budget(mib, seconds, cores, whole=whole, packed=packed)
+
+
+def ndc_pixel(s: Scene, forward: ForwardFacing) -> float:
+    """Width of a pixel of the median camera in normalised device coordinates, at any depth."""
+    return forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
+
+
+def affordable_resolution(finest: Choice, count: Callable[[int], int], room: Callable[[int], int]) -> Choice:
+    """The greatest resolution up to the finest at which about as many voxels are baked as the asset holds.
+
+    count  voxels that would be baked at a resolution
+    room   voxels that the asset holds
+    """
+    top = finest.resolution
+    low, high = (max(MIN_RESOLUTION, top // n) for n in (4, 2))
+    few, more = count(low), count(high)
+    power = float(np.clip(math.log(max(more, 1) / max(few, 1)) / math.log(high / low), 1.5, 3)) if high > low else 2.0
+
+    def scaled(at: int, voxels: int) -> int:
+        return int(np.clip(int(at * (0.5 * (1 + MIN_FILL) * room(at) / max(voxels, 1)) ** (1 / power)), MIN_RESOLUTION, top))
+
+    at = top if more * (top / high) ** power <= 1.2 * room(top) else scaled(high, more)
+    best = 0
+    for _ in range(MAX_TRIES):
+        voxels = count(at)
+        if voxels <= room(at):
+            best = max(best, at)
+            if at == top or voxels >= MIN_FILL * room(at):
+                break
+        following = scaled(at, voxels)
+        if following in (at, best):
+            break
+        at = following
+    best = best or at
+    return finest if best == top else Choice(best, f"as fine as its size allows, where voxels grow with the resolution to the power {power:.1f}")

@@ -1,0 +1,216 @@
+"""One view, measured: network and asset against the photograph, and the asset against the network.
+
+gap       asset minus network on the pixels that the network was rendered at: PSNR, SSIM, PSNR with fitted colours
+holes     share of those pixels where the asset's opacity is below HOLE and the network's above SOLID. Where the asset has cascades, the network's is that of
+          what lies before the end of the last one: what is beyond has its place in the environment map
+floaters  opacity of the asset nearer than the network's surfaces, less a margin (`efficientnerf.evaluation.surfaces`), over its whole opacity: means over at
+          most FLOATER_RAYS pixels. The network's own figure, the same of itself, says how much of that is soft edges
+holes_excess_error, floaters_excess_error  the asset's squared error less the network's, of those pixels and weighed by that opacity, over what `holes` and
+          `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there
+
+Where training learned vignetting and response of the camera, renders are compared as that camera would show them, exposed as on average. A held-back
+photograph has an exposure of its own, which nothing has learned: psnr_colour_fitted is the PSNR once the render's colours have had the affine change, twelve
+numbers a view, that fits the photograph best (`metrics.colour_fitted`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera
+from pipeline.stage import Job
+from stages.artifacts import PosesOutputs
+from stages.evaluate.asset import EvaluatedAsset, over_field, render_asset
+from stages.evaluate.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
+from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
+from stages.evaluate.splats import EvaluatedSplats, splats_image, splats_metrics
+from stages.evaluate.trivial import blurred_psnrs, mean_colour_psnr
+from stages.evaluate.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
+from stages.io.scene import Scene, View
+from stages.train.averaged import Taken
+
+if TYPE_CHECKING:
+    from efficientnerf.evaluation.lpips import Lpips
+
+HOLE, SOLID = 0.5, 0.95
+FLOATER_RAYS = 4096
+QUALITY = ("psnr", "ssim", "psnr_in_box", "psnr_colour_fitted")
+GAP = ("psnr", "ssim", "psnr_colour_fitted")
+AGAINST_NETWORK = ("holes", "floaters", "holes_excess_error", "floaters_excess_error")
+SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
+
+
+def evaluate_view(
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
+    perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: ReliablePoints | None = None,
+    taken: Taken | None = None,
+) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
+
+    with_field  whether the field is measured; else it renders the surroundings of an asset without any, and nothing where these are constant
+    stride      of the pixels that the field renders
+    perceptual  LPIPS networks by the name of their metric
+    points      that the asset's depth is compared with
+    taken       `stages.train.averaged.as_taken`
+    """
+    from stages.figures.plots import error_map, to_uint8
+
+    truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
+    shown = partial(as_shown, job, view, taken)
+    unbounded = constant_background(scene) is None
+    metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
+    images: list[np.ndarray] = []
+    seen = None
+    if with_field or (unbounded and asset.inner is None):
+        small_camera = subsample_camera(view.camera, stride)
+        limits = asset.limits if with_field else None
+        seen = field.render(small_camera, progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach, limits=limits)
+    image, opacity, depth = render_asset(asset, scene, view, seen, stride)
+    image = shown(image, "the asset")
+    metrics |= {"trivial": trivial(truth), "sparse_points": None if points is None else against_points(points, scene, view, depth, truth)}
+    size = {"width": view.camera.width, "height": view.camera.height}
+    inside = upsample(seen.inside_opacity, stride, **size) >= 0.5 if unbounded and seen is not None else truth.inside
+    metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(perceptual or {}, image, truth)}
+    if unbounded and asset.inner is None:
+        metrics["asset"]["background_scale"] = 1.0 / stride
+    drawn, plain, covered = mesh_image(mesh, asset, scene, view, seen, stride)
+    metrics["mesh"] = mesh_metrics(shown(drawn, "the mesh"), shown(plain, "the mesh"), covered, image, truth)
+    if splats is not None:
+        metrics["splats"] = splats_metrics(shown(splats_image(splats, asset, scene, view), "the Gaussians"), truth)
+    if with_field and seen is not None:
+        small = truth.subsampled(stride)
+        render = shown(seen.colour, "the field", stride)
+        inside = seen.inside_opacity >= 0.5 if unbounded else small.inside
+        network = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0], **sample_shares(seen.counts)}
+        metrics["network"] = network | lpips_metrics(perceptual or {}, render, small)
+        same_image, same_opacity = subsample(image, stride), subsample(opacity, stride)
+        metrics |= differences(asset, subsample_camera(view.camera, stride), same_image, same_opacity, replace(seen, colour=render), small, metrics["network"])
+        if unbounded and asset.inner is not None:
+            other = shown(over_field(asset.inner, view, seen, stride)[0], "the asset over the field")
+            metrics["asset_with_network_background"] = {**compare(other, truth, upsample(seen.inside_opacity, stride, **size) >= 0.5), **size}
+        images += [to_uint8(small.colour), to_uint8(render), error_map(render, small.colour)]
+    if metrics["asset"]["psnr"] is None:
+        job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
+    return metrics, [*images, to_uint8(image), error_map(image, truth.colour)]
+
+
+def differences(
+    asset: EvaluatedAsset, camera: Camera, image: np.ndarray, opacity: np.ndarray, seen: Any, truth: GroundTruth, network: dict[str, Any]
+) -> dict[str, Any]:
+    """gap and AGAINST_NETWORK of a view, and the network's own floaters, which go to its metrics.
+
+    camera          whose pixels are those of all images here
+    image, opacity  of the asset
+    seen            the field's rendering
+    network         its metrics
+    """
+    own = compare(image, truth, None)
+    gap = {name: own[name] - network[name] if own[name] is not None and network[name] is not None else None for name in GAP}
+    used = np.ones(opacity.shape, bool) if truth.mask is None else truth.mask
+    excess = squared_error(image, truth) - squared_error(seen.colour, truth)
+    open_ = (opacity < HOLE) & (seen.within > SOLID)
+    holes, of_holes = (float(open_[used].mean()), float((open_ * excess)[used].mean())) if used.any() else (None, None)
+    floaters, of_floaters, network["floaters"] = floating(asset, camera, opacity, seen, used, excess)
+    return {"gap": gap, "holes": holes, "floaters": floaters, "holes_excess_error": of_holes, "floaters_excess_error": of_floaters}
+
+
+def trivial(truth: GroundTruth) -> dict[str, Any] | None:
+    """What pictures of its mean colour and of its blurs would score; None where no pixel counts."""
+    if truth.mask is not None and not truth.mask.any():
+        return None
+    return {"mean_colour": mean_colour_psnr(truth.colour, truth.mask), "blurred": blurred_psnrs(truth.colour, truth.mask)}
+
+
+def counting(truth: GroundTruth) -> np.ndarray:
+    """(H, W) bool: pixels of the photograph in which there is something to be hit."""
+    used = np.ones(truth.colour.shape[:2], bool) if truth.mask is None else truth.mask
+    return used if truth.inside is None else used & truth.inside
+
+
+def against_points(points: ReliablePoints, scene: Scene, view: View, depth: np.ndarray, truth: GroundTruth) -> dict[str, int]:
+    """COUNTS of the view's sparse points."""
+    _, kinds, subject = judged(points, scene.views.index(view), view.camera, depth, counting(truth))
+    return counts_of(kinds, subject)
+
+
+def squared_error(image: np.ndarray, truth: GroundTruth) -> np.ndarray:
+    """(H, W) mean over the channels; of pixels without a finite value 0."""
+    return np.nan_to_num(np.square(np.clip(np.asarray(image, np.float64), 0, 1) - truth.colour).mean(axis=-1))
+
+
+def floating(
+    asset: EvaluatedAsset, camera: Camera, opacity: np.ndarray, seen: Any, used: np.ndarray, excess: np.ndarray
+) -> tuple[float | None, float | None, float | None]:
+    """The share of the asset's opacity that lies away from the network's surfaces, its excess error, and the share of the network's own; None where nothing is
+    opaque.
+
+    used    (H, W) bool, pixels that count
+    excess  (H, W) the asset's squared error less the network's
+    """
+    from efficientnerf.geometry.cameras import rays
+
+    step = 1
+    while len(range(0, camera.height, step)) * len(range(0, camera.width, step)) > FLOATER_RAYS:
+        step += 1
+    chosen = np.zeros(used.shape, bool)
+    chosen[step // 2 :: step, step // 2 :: step] = True
+    y, x = np.nonzero(chosen & used)
+    if not len(y):
+        return None, None, None
+    origins, directions = rays(camera, np.stack([x, y], axis=-1) + 0.5)
+    distance = seen.depth[y, x] / np.maximum(directions @ camera.forward, 1e-3)
+    nearer = asset.nearer(origins, directions, asset.limits(origins, directions, distance))
+    opaque = opacity[y, x]
+    return _share(nearer, opaque), _share(nearer * excess[y, x], opaque), _share(seen.nearer[y, x], seen.opacity[y, x])
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float | None:
+    total = float(np.nan_to_num(whole).sum())
+    return min(1.0, float(np.nan_to_num(part).sum()) / total) if total > 1e-6 * len(whole) else None
+
+
+def lpips_metrics(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
+    """LPIPS by name; None for images too small for the networks."""
+    from efficientnerf.evaluation.lpips import SMALLEST
+
+    large = min(image.shape[:2]) >= SMALLEST
+    return {name: metric(image, truth.colour, truth.mask) if large else None for name, metric in perceptual.items()}
+
+
+def sample_shares(counts: Any) -> dict[str, float]:
+    """Valid and pivotal samples over rays x N_c (EfficientNeRF, equations 5 and 12), counted between near and far; fine samples a ray."""
+    return {"valid_share": counts.valid_share, "pivotal_share": counts.pivotal_share, "fine_per_ray": counts.fine / max(counts.rays, 1)}
+
+
+def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) -> dict[str, float | None]:
+    """The figures of QUALITY; None where no pixel, or no whole SSIM window, can be compared."""
+    from efficientnerf.evaluation.metrics import colour_fitted, psnr, ssim
+
+    used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
+    boxed = None if inside is None else used & inside
+    windows = used[5:-5, 5:-5]
+    return {
+        "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,
+        "ssim": ssim(image, truth.colour, truth.mask) if windows.any() else None,
+        "psnr_in_box": min(MAX_PSNR, psnr(image, truth.colour, boxed)) if boxed is not None and boxed.any() else None,
+        "psnr_colour_fitted": min(MAX_PSNR, psnr(colour_fitted(image, truth.colour, truth.mask), truth.colour, truth.mask)) if used.any() else None,
+    }
+
+
+def as_shown(job: Job, view: View, taken: Taken | None, image: np.ndarray, what: str, stride: int = 1) -> np.ndarray:
+    """A render of every stride-th pixel of a view as it is compared: clipped, and as the view's camera shows it."""
+    image = clipped(image, job, f"{view.name}: {what}")
+    return image if taken is None else taken(view, image, stride)
+
+
+def clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
+    """Clipped to 0-1; pixels that are not finite count as black, with a warning."""
+    bad = int((~np.isfinite(image)).any(axis=-1).sum())
+    if bad:
+        job.warn(f"{what} is not finite at {bad} pixels; they count as black")
+    return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)

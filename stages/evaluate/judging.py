@@ -1,0 +1,84 @@
+"""The verdict of the evaluate stage: what it is made from beside the held-out views, written with its picture, and said."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.files import Unreadable, read_json, write_json
+from pipeline.stage import Job
+from stages.artifacts import EvaluateOutputs, PosesOutputs
+from stages.evaluate import sparse_points
+from stages.evaluate.asset import EvaluatedAsset, render_asset
+from stages.evaluate.comparison import as_shown, compare, counting, trivial
+from stages.evaluate.sparse_points import ReliablePoints
+from stages.evaluate.summary import means
+from stages.evaluate.trivial import equivalent_blur
+from stages.evaluate.views import constant_background, evenly_spaced, ground_truth
+from stages.io.scene import Scene, View, views_of
+from stages.train.averaged import Taken
+from stages.verdict.result import ResultVerdict, camera_verdict_of, verdict_on_result
+
+TRAINING_VIEWS = 4  # that the asset is compared with, evenly spaced: enough to tell an overfit asset
+
+
+def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job, taken: Taken | None = None) -> dict[str, Any] | None:
+    """The asset on some views that training saw: means of PSNR, SSIM and PSNR with fitted colours, and the median of `equivalent_blur`. None where it does not
+    show by itself all that a photograph shows, and where there are no such views.
+
+    taken  `stages.train.averaged.as_taken`
+    """
+    views = views_of(scene, "train")
+    if constant_background(scene) is None and asset.inner is None:
+        return None
+    figures, blurs = [], []
+    for k in evenly_spaced(len(views), TRAINING_VIEWS):
+        job.safe_point()
+        truth = ground_truth(job.inputs[PosesOutputs.stage], views[k], scene.background)
+        flat = trivial(truth)
+        if flat is None:
+            continue
+        image = as_shown(job, views[k], taken, render_asset(asset, scene, views[k], None, 1)[0], "the asset")
+        found = compare(image, truth, None)
+        figures.append(found)
+        blurs.append(equivalent_blur(found["psnr_colour_fitted"] or -math.inf, flat["blurred"]))
+    names = ("psnr", "ssim", "psnr_colour_fitted")
+    return {**means(figures, names), "blur": statistics.median(blurs), "views": len(figures)} if figures else None
+
+
+def judge(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints | None, metrics: Mapping[str, Any], job: Job) -> ResultVerdict:
+    """Write the verdict on a result and the picture of its sparse points; say it, and warn of what stands against it."""
+    outputs = EvaluateOutputs(job.out)
+    if points is not None:
+        _draw(asset, scene, views, points, metrics, job)
+    found = verdict_on_result(metrics, camera_verdict_of(_read(job)))
+    write_json(outputs.verdict, found.document())
+    job.say(found.summary(), grade=found.grade)
+    for problem in found.problems:
+        if problem.grade != "good":
+            job.warn(problem.text())
+    return found
+
+
+def _read(job: Job) -> Any:
+    """The verdict on the cameras; None where there is none."""
+    try:
+        return read_json(PosesOutputs(job.inputs[PosesOutputs.stage]).verdict)
+    except (OSError, Unreadable):
+        return None
+
+
+def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints, metrics: Mapping[str, Any], job: Job) -> None:
+    """Of the view whose points agree least with the asset's depth."""
+    from stages.io.png import write_png
+
+    counts = [found["sparse_points"] for found in metrics["views"]]
+    shares = [1.0 if not found["points"] else 1 - (found["nearer"] + found["farther"]) / found["points"] for found in counts]
+    view = views[shares.index(min(shares))]
+    job.safe_point()
+    truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
+    depth = asset.render(view.camera, normals=False).depth
+    pixels, kinds, _ = sparse_points.judged(points, scene.views.index(view), view.camera, depth, counting(truth))
+    write_png(sparse_points.picture(truth.colour, depth, pixels, kinds), EvaluateOutputs(job.out).sparse_points)

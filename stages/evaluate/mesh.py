@@ -1,0 +1,139 @@
+"""The mesh against the photographs: drawn from the held-back cameras in its own colours, unlit, before what of the asset is not in it.
+
+Behind the mesh is what is behind the asset in its own figures: a constant background, the asset without its foreground region (nearer parts of it hide the
+mesh), or what the field shows before and behind the box of an asset that holds no surroundings. So `psnr` is of whole photographs, and beside the asset's own.
+
+psnr_covered        over the pixels that the mesh covers by half or more; asset_psnr_covered: the asset's on the same
+covered             their share of the pixels that count
+..._vertex_colours  the same of the mesh in the colours of its vertices
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stages.artifacts import MeshOutputs
+from stages.evaluate.asset import EvaluatedAsset, RenderTree
+from stages.evaluate.views import GroundTruth, constant_background, upsample
+from stages.io.scene import Scene, View
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.surface.mesh import Mesh
+    from efficientnerf.surface.shading import ColouredImage, Shader
+
+FIGURES = ("psnr", "ssim", "psnr_covered", "psnr_vertex_colours", "ssim_vertex_colours", "asset_psnr_covered", "covered")
+MARGIN = 0.03  # of the depth, that surroundings have to be nearer to hide the mesh: it ends where they begin
+MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedMesh:
+    """What is measured of a mesh.
+
+    shader        of the mesh in the training frame
+    surroundings  what of the asset is not in it, as `EvaluatedAsset.render`; None: nothing
+    facts         that metrics.json repeats
+    """
+
+    shader: Shader
+    surroundings: RenderTree | None
+    facts: dict[str, Any]
+
+
+def evaluated_mesh(mesh: Mesh, surroundings: RenderTree | None) -> EvaluatedMesh:
+    """A mesh of the training frame."""
+    from efficientnerf.surface.shading import Shader
+
+    size = None if mesh.texture is None else max(mesh.texture.colours.shape[:2])
+    return EvaluatedMesh(Shader(mesh), surroundings, {"faces": len(mesh.faces), "vertices": len(mesh.vertices), "texture_size": size})
+
+
+def load_mesh(outputs: MeshOutputs, tree: NerfTree, region: str) -> EvaluatedMesh:
+    """The mesh of a run, made of this asset, or of its foreground where `region` says so. Raises CorruptArtifact."""
+    from functools import partial
+
+    from efficientnerf.asset.region import surroundings
+    from efficientnerf.asset.rendering import render
+    from efficientnerf.surface.mesh import moved
+    from stages.formats.exporters.writing import source_frame
+    from stages.mesh.files import read_mesh
+
+    to_world = source_frame(tree.metadata).world_from_capture
+    mesh = moved(read_mesh(outputs), to_world.scale, to_world.rotation, to_world.translation)
+    with_surroundings = tree.ndc is None and (tree.environment is not None or (tree.region is not None and region == "foreground"))
+    around = partial(render, surroundings(tree, all_is_foreground=region == "all").to(tree.device)) if with_surroundings else None
+    return evaluated_mesh(mesh, around)
+
+
+def mesh_bytes(outputs: MeshOutputs) -> int:
+    """Of memory, that measuring a mesh takes beside the view itself: its arrays, and those of its texture."""
+    from stages.io.pictures import read_header
+
+    texels = 0
+    if outputs.texture.is_file():
+        width, height = read_header(outputs.texture).size
+        texels = width * height
+    return 16 * (_size(outputs.ply) + _size(outputs.glb) // 4) + 12 * texels
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else 0
+
+
+def mesh_image(mesh: EvaluatedMesh, asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The image of a view (H, W, 3) with the mesh in its texture, that with it in the colours of its vertices, and the mesh's share of each pixel (H, W).
+
+    seen  the field's rendering on every stride-th pixel, where the asset is composited with it; else it is not looked at
+    """
+    textured, plain = mesh.shader.images(view.camera)
+    background = constant_background(scene)
+    over_field = background is None and asset.inner is None
+    behind = None if over_field else background or asset.behind
+    around = None if mesh.surroundings is None else mesh.surroundings(view.camera, background=behind, normals=False)
+    size = (view.camera.height, view.camera.width, 3)
+    rest = np.broadcast_to(np.asarray(behind or (0.0, 0.0, 0.0), np.float32), size) if around is None else around.colour
+    hidden = np.zeros(size[:2], bool) if around is None else around.depth < (1 - MARGIN) * textured.depth
+    before = None
+    if over_field:
+        stretch = (stride, view.camera.width, view.camera.height)
+        farther, before = upsample(seen.behind, *stretch), upsample(seen.before, *stretch)
+        rest = rest + (1.0 - (0.0 if around is None else around.opacity[..., None])) * farther
+
+    def image(drawn: ColouredImage) -> np.ndarray:
+        middle = np.where(hidden[..., None], rest, drawn.colour + (1 - drawn.covered[..., None]) * rest)
+        return np.asarray(middle if before is None else before[..., :3] + (1.0 - before[..., 3:]) * middle, np.float32)
+
+    return image(textured), image(plain), np.where(hidden, 0, textured.covered)
+
+
+def mesh_metrics(image: np.ndarray, plain: np.ndarray, covered: np.ndarray, asset: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
+    """FIGURES of a view; None where no pixel can be compared.
+
+    image, plain, covered  of `mesh_image`, clipped
+    asset                  its image of the view, clipped
+    """
+    from efficientnerf.evaluation.metrics import psnr, ssim
+
+    used = np.ones(covered.shape, bool) if truth.mask is None else truth.mask
+    on_mesh = used & (covered >= 0.5)
+
+    def decibels(picture: np.ndarray, where: np.ndarray) -> float | None:
+        return min(MAX_PSNR, psnr(picture, truth.colour, where)) if where.any() else None
+
+    def similarity(picture: np.ndarray) -> float | None:
+        return ssim(picture, truth.colour, truth.mask) if used[5:-5, 5:-5].any() else None
+
+    return {
+        "psnr": decibels(image, used),
+        "ssim": similarity(image),
+        "psnr_covered": decibels(image, on_mesh),
+        "psnr_vertex_colours": decibels(plain, used),
+        "ssim_vertex_colours": similarity(plain),
+        "asset_psnr_covered": decibels(asset, on_mesh),
+        "covered": float(on_mesh.sum() / used.sum()) if used.any() else None,
+    }

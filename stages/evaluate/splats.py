@@ -1,0 +1,67 @@
+"""The 3D Gaussians of a run against the photographs: drawn from the held-back cameras before what is behind the asset in its own figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stages.artifacts import SplatsOutputs
+from stages.evaluate.asset import EvaluatedAsset
+from stages.evaluate.mesh import MAX_PSNR
+from stages.evaluate.views import GroundTruth, constant_background
+from stages.io.scene import Scene, View
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Camera
+
+FIGURES = ("psnr", "ssim")
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedSplats:
+    """What is measured of Gaussians.
+
+    draw   what a camera sees (H, W, 3) on a colour, or on black
+    facts  that metrics.json repeats
+    """
+
+    draw: Callable[[Camera, tuple[float, float, float] | None], np.ndarray]
+    facts: dict[str, Any]
+
+
+def load_splats(outputs: SplatsOutputs, tree: NerfTree) -> EvaluatedSplats | None:
+    """The Gaussians of a run, from the file that others read; None where it made none of all that the asset shows. Raises CorruptArtifact."""
+    from efficientnerf.splats.rendering import render
+    from pipeline.files import read_json
+    from stages.formats.exporters.splats.frames import moved
+    from stages.formats.exporters.splats.ply import read_splats
+    from stages.formats.exporters.writing import source_frame
+
+    if not outputs.ply.is_file() or read_json(outputs.report).get("region") != "all":
+        return None
+    gaussians = moved(read_splats(outputs.ply), source_frame(tree.metadata).world_from_capture)
+    facts = {"gaussians": len(gaussians), "ply_bytes": outputs.ply.stat().st_size}
+    return EvaluatedSplats(lambda camera, background: render(gaussians, camera, background).colour, facts)
+
+
+def splats_image(splats: EvaluatedSplats, asset: EvaluatedAsset, scene: Scene, view: View) -> np.ndarray:
+    """(H, W, 3), on what is behind the asset; on black where its environment map is, which the Gaussians have as their own."""
+    return splats.draw(view.camera, constant_background(scene) or asset.behind)
+
+
+def splats_metrics(image: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
+    """FIGURES of a view; None where no pixel, or no whole window, can be compared.
+
+    image  clipped
+    """
+    from efficientnerf.evaluation.metrics import psnr, ssim
+
+    used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
+    return {
+        "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,
+        "ssim": ssim(image, truth.colour, truth.mask) if used[5:-5, 5:-5].any() else None,
+    }

@@ -1,0 +1,44 @@
+"""The video of the captured path: the asset alone, as seen along the photographs' cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from pipeline.stage import Job
+from stages.artifacts import EvaluateOutputs
+from stages.evaluate.asset import EvaluatedAsset
+from stages.io.scene import Scene
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.rendering import Rendering
+    from efficientnerf.geometry.cameras import Camera
+
+LONGEST = 480  # pixels, the longer side of the video
+FPS, CRF = 15, 20
+
+
+def write_captured_path(asset: EvaluatedAsset, tree: Any, scene: Scene, frames: int, job: Job) -> None:
+    """Write the video. Frames are kept in job.work, so that a kill costs at most one.
+
+    tree  the asset's, whose metadata frames need
+    """
+    import numpy as np
+
+    from efficientnerf.capture.captured_path import captured_cameras
+    from stages.figures.frames import RenderOptions, encode_frames, render_frames
+
+    behind = scene.background or asset.behind
+
+    def draw(tree: Any, camera: Camera, **more: Any) -> Rendering:
+        rendering: Rendering = asset.render(camera, background=behind, **more)
+        return replace(rendering, opacity=np.ones_like(rendering.opacity))  # whatever is behind has been drawn
+
+    def each(done: int, total: int) -> None:
+        job.safe_point()
+        job.progress(done, total, "frames of the captured path")
+
+    cameras = captured_cameras([view.camera for view in scene.views], frames, LONGEST)
+    options = RenderOptions(exr="off", fps=FPS, crf=CRF)
+    written = render_frames(tree, cameras, job.work / "captured", options, each, reuse=True, draw=draw, warn=job.warn)
+    encode_frames(written, EvaluateOutputs(job.out).captured_path, options, job.safe_point)

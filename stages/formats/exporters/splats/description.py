@@ -1,0 +1,287 @@
+"""What a file of 3D Gaussians holds, whoever wrote it: PLY of 3DGS, SPZ 1 to 4, GLB with KHR_gaussian_splatting.
+
+Nothing that a header says is believed before the file's size allows it, and no more than a piece of a file is in memory at a time.
+
+N Gaussians.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from pipeline.errors import BadInput
+from pipeline.files import Unreadable, open_plain
+from pipeline.text import printable
+from stages.formats.exporters.splats import gltf, spz
+from stages.io.meshes.geometry import AT_ONCE, Damaged, exactly
+from stages.io.meshes.glb import Glb
+from stages.io.meshes.ply import MAX_HEADER, TYPES
+
+MAX_GLTF_JSON = 2**24  # bytes; of Gaussians it takes a few thousand
+DENSEST = 1032  # bytes that one byte of deflate, or of a zstd frame as SPZ writes them, can stand for
+FEW, USUAL = 2**20, 64  # Gaussians that any file may hold; and bytes that one byte stands for in larger ones at most: those of scenes have 3
+SPZ_DEGREES = range(5)
+STREAMS = 6  # of SPZ 4, at least: places, opacities, colours, scales, rotations, harmonics
+_PLY_NAMES = {*"xyz", *(f"{name}_{k}" for name, count in (("f_dc", 3), ("scale", 3), ("rot", 4)) for k in range(count)), "opacity"}
+
+
+@dataclass
+class _Range:
+    """The least and the greatest of columns that come in pieces, and how many numbers of them are not finite."""
+
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
+    not_finite: int = 0
+
+    def add(self, rows: np.ndarray) -> None:
+        """rows  (n, K)"""
+        rows = rows.astype(np.float64)
+        finite = np.isfinite(rows)
+        self.not_finite += int(rows.size - finite.sum())
+        low, high = np.where(finite, rows, np.inf).min(axis=0), np.where(finite, rows, -np.inf).max(axis=0)
+        self.low = low if self.low is None else np.minimum(self.low, low)
+        self.high = high if self.high is None else np.maximum(self.high, high)
+
+    def box(self) -> list[list[float]] | None:
+        """The corners; None where no number is finite in a column."""
+        if self.low is None or self.high is None or not (np.isfinite(self.low) & np.isfinite(self.high)).all():
+            return None
+        return [self.low.tolist(), self.high.tolist()]
+
+    def extremes(self) -> list[float] | None:
+        """The least and the greatest of all columns."""
+        box = self.box()
+        return None if box is None else [min(box[0]), max(box[1])]
+
+
+@dataclass
+class _Found:
+    """What is known of a file's Gaussians."""
+
+    format: str
+    count: int
+    degree: int
+    places: _Range = field(default_factory=_Range)
+    scales: _Range = field(default_factory=_Range)
+    opacities: _Range = field(default_factory=_Range)
+    notes: list[str] = field(default_factory=list)
+
+    def facts(self) -> dict[str, Any]:
+        wrong = sum(each.not_finite for each in (self.places, self.scales, self.opacities))
+        return {
+            "format": self.format, "gaussians": self.count, "sh_degree": self.degree, "bounds": self.places.box(), "scales": self.scales.extremes(),
+            "opacities": self.opacities.extremes(), "not_finite": wrong or None, "notes": self.notes,
+        }  # fmt: skip
+
+
+def describe_splats(path: Path) -> dict[str, Any] | None:
+    """Format, number, degree of the harmonics, bounds, least and greatest standard deviation and opacity of the Gaussians in a file; None where the file is
+    something else, as a mesh may be. In the file's own frame. Raises BadInput."""
+    readers: dict[str, Callable[[BinaryIO, int], _Found | None]] = {".ply": _ply, ".spz": _spz, ".glb": _glb}
+    try:
+        with open(open_plain(path), "rb") as file:
+            found = readers[path.suffix.lower()](file, os.fstat(file.fileno()).st_size)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read ({error.strerror or error}).") from error
+    except (Damaged, Unreadable, struct.error) as error:
+        raise BadInput(f"{path}: {error}. Write the file again with the program that made it.") from error
+    return None if found is None else found.facts()
+
+
+# PLY
+
+
+def _ply(file: BinaryIO, size: int) -> _Found | None:
+    head = file.read(MAX_HEADER)
+    end = re.search(rb"\nend_header\r?\n", head)
+    if not head.startswith(b"ply") or end is None:
+        return None
+    lines = [line.strip() for line in head[: end.start()].decode("ascii", "replace").splitlines()]
+    names = {line.split()[-1] for line in lines if line.startswith("property ")}
+    if {"packed_position", "packed_rotation"} <= names:
+        raise Damaged("a PLY compressed as SuperSplat does it; expected the columns of 3DGS (convert it: splat-transform in.ply out.ply)")
+    if _PLY_NAMES - names:
+        return None
+    order = {"format binary_little_endian 1.0": "<", "format binary_big_endian 1.0": ">"}.get(next((line for line in lines if line.startswith("format")), ""))
+    if order is None:
+        raise Damaged("a PLY of 3D Gaussians that is not binary; expected 'format binary_little_endian 1.0'")
+    count, rows, more = _ply_rows(lines, order)
+    start = end.end()
+    if _PLY_NAMES - {*(rows.names or ())}:
+        raise Damaged("its vertices lack columns of Gaussians, which other elements have")
+    if size < start + count * rows.itemsize or (size > start + count * rows.itemsize and not more):
+        raise Damaged(f"{size} bytes; expected {start + count * rows.itemsize} for the {count} Gaussians that its header names")
+    above = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in rows.names or ())
+    if above not in (0, 9, 24, 45, 72):
+        raise Damaged(f"{above} columns f_rest_*; expected 0, 9, 24, 45 or 72")
+    found = _Found("PLY (3DGS)", count, round((above / 3 + 1) ** 0.5) - 1, notes=[printable(line[8:], 200) for line in lines if line.startswith("comment ")])
+    file.seek(start)
+    for some in _pieces(count):
+        part = np.frombuffer(exactly(file, some * rows.itemsize), rows)
+        found.places.add(np.stack([part[name] for name in "xyz"], axis=1))
+        with np.errstate(over="ignore", invalid="ignore"):
+            found.scales.add(np.exp(np.stack([part[f"scale_{k}"] for k in range(3)], axis=1).astype(np.float64)))
+            found.opacities.add(1 / (1 + np.exp(-part["opacity"].astype(np.float64)))[:, None])
+    return found
+
+
+def _ply_rows(lines: list[str], order: str) -> tuple[int, np.dtype[Any], bool]:
+    """The number of the vertices, a row of them, and whether other elements follow; the vertices have to come first."""
+    elements = [number for number, line in enumerate(lines) if line.startswith("element ")]
+    first = lines[elements[0]].split() if elements else []
+    if first[:2] != ["element", "vertex"] or len(first) != 3 or not re.fullmatch(r"\d{1,12}", first[2]):
+        raise Damaged("its first element is not 'element vertex N'")
+    columns: list[tuple[str, str]] = []
+    for line in lines[elements[0] + 1 : elements[1] if len(elements) > 1 else None]:
+        words = line.split()
+        if words[:1] != ["property"]:
+            continue
+        if len(words) != 3 or words[1] not in TYPES or words[2] in (name for name, _ in columns):
+            raise Damaged(f"its header has the line '{printable(line, 80)}'; expected columns of numbers, each once")
+        columns.append((words[2], order + TYPES[words[1]]))
+    return int(first[2]), np.dtype(columns), len(elements) > 1
+
+
+# SPZ
+
+
+def _spz(file: BinaryIO, size: int) -> _Found:
+    if file.read(4) == spz.MAGIC:
+        return _spz4(file, size)
+    file.seek(0)
+    inflated = _Inflated(file)
+    magic, version, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", inflated.take(16))
+    if magic != spz.MAGIC or version not in (1, 2, 3):
+        raise Damaged(f"no SPZ of version 1 to 4: its header begins with {magic!r} and version {version}")
+    found = _spz_header(version, count, degree, bits, flags, size)
+    for some in _pieces(count):
+        raw = inflated.take(some * (6 if version == 1 else 9))
+        found.places.add(np.frombuffer(raw, "<f2").reshape(some, 3) if version == 1 else spz.places(raw, bits))
+    for some in _pieces(count):
+        found.opacities.add(np.frombuffer(inflated.take(some), np.uint8)[:, None] / 255)
+    inflated.skip(3 * count)
+    for some in _pieces(count):
+        found.scales.add(np.exp(np.frombuffer(inflated.take(3 * some), np.uint8).reshape(some, 3) / spz.SCALE_STEPS + spz.SMALLEST_SCALE))
+    inflated.skip(count * ((3 if version < 3 else 4) + 3 * ((degree + 1) ** 2 - 1)))
+    inflated.finish(more=bool(flags & 2))
+    return found
+
+
+def _spz4(file: BinaryIO, size: int) -> _Found:
+    """Version 4, whose header is not compressed. Its streams are zstd's, and are not opened: there is no such decoder here."""
+    version, count, degree, bits, flags, streams, table = struct.unpack("<IIBBBBI", exactly(file, 16))
+    if version != 4:
+        raise Damaged(f"no SPZ of version 1 to 4: version {version}")
+    if streams < STREAMS or table < 32 or table + 16 * streams > size:
+        raise Damaged(f"a table of {streams} streams at byte {table} of {size}; expected at least {STREAMS}, within the file")
+    found = _spz_header(version, count, degree, bits, flags, size)
+    file.seek(table)
+    sizes = struct.unpack(f"<{2 * streams}Q", exactly(file, 16 * streams))
+    if table + 16 * streams + sum(sizes[::2]) != size:
+        raise Damaged(f"{size} bytes; expected {table + 16 * streams + sum(sizes[::2])} for its streams")
+    if sizes[1] != 9 * count:
+        raise Damaged(f"places of {sizes[1]} bytes; expected {9 * count} for {count} Gaussians")
+    found.notes.append("bounds are not read: this version is compressed with zstd")
+    return found
+
+
+def _spz_header(version: int, count: int, degree: int, bits: int, flags: int, size: int) -> _Found:
+    if degree not in SPZ_DEGREES or bits > 24:
+        raise Damaged(f"harmonics of degree {degree} and {bits} fractional bits; expected a degree of 0 to 4 and at most 24 bits")
+    if count < 1 or 9 * count > (DENSEST if count <= FEW else USUAL) * size:
+        raise Damaged(f"its header names {count} Gaussians, and {size} bytes hold none, or not as many")
+    return _Found(f"SPZ {version}", count, degree, notes=["antialiased"] if flags & 1 else [])
+
+
+class _Inflated:
+    """A gzip stream that is read forwards, no more than is asked for."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.stream, self.left = file, zlib.decompressobj(16 + zlib.MAX_WBITS), b""
+
+    def _part(self, most: int) -> bytes:
+        """Some bytes, at most so many. Raises Damaged where what is stored is no gzip, or its checksum another."""
+        self.left = self.left or self.file.read(AT_ONCE)
+        try:
+            part = self.stream.decompress(self.left, most)
+        except zlib.error as error:
+            raise Damaged(f"no SPZ of version 1 to 4, or a damaged one: it does not unpack as gzip ({error})") from error
+        if not part and not self.left and not self.stream.eof:
+            raise Damaged("it is cut short")
+        self.left = self.stream.unconsumed_tail
+        return part
+
+    def take(self, count: int) -> bytes:
+        """So many bytes."""
+        found: list[bytes] = []
+        while count:
+            if self.stream.eof:
+                raise Damaged("its Gaussians end before as many have come as its header names")
+            found.append(self._part(count))
+            count -= len(found[-1])
+        return b"".join(found)
+
+    def skip(self, count: int) -> None:
+        while count:
+            some = min(count, 16 * AT_ONCE)
+            self.take(some)
+            count -= some
+
+    def finish(self, more: bool) -> None:
+        """To the end, where gzip's checksum is; only if `more` may something come before it, and not much."""
+        left = FEW if more else 0
+        while not self.stream.eof:
+            left -= len(self._part(AT_ONCE))
+            if left < 0:
+                raise Damaged("it goes on after its last Gaussian")
+
+
+# GLB
+
+
+def _glb(file: BinaryIO, size: int) -> _Found | None:
+    if gltf.EXTENSION.encode() not in file.read(20 + MAX_GLTF_JSON):
+        return None
+    file.seek(0)
+    glb = Glb(file, size, MAX_GLTF_JSON)
+    try:
+        return _glb_primitives(glb)
+    except (KeyError, IndexError, TypeError, AttributeError) as error:
+        raise Damaged(f"a glTF document that is not as it has to be ({type(error).__name__}: {printable(error, 80)})") from error
+
+
+def _glb_primitives(glb: Glb) -> _Found | None:
+    primitives = [each for mesh in glb.document["meshes"] for each in mesh["primitives"] if gltf.EXTENSION in each.get("extensions", {})]
+    if not primitives:
+        return None
+    found = _Found(f"GLB ({gltf.EXTENSION})", 0, 0)
+    for primitive in primitives:
+        below = primitive["extensions"][gltf.EXTENSION].get("extensions", {})
+        if below:
+            raise Damaged(f"Gaussians compressed by {printable(', '.join(below), 80)}; expected attributes as they are (write it without compression)")
+        names, counts = primitive["attributes"], set()
+        scales, opacities = (f"{gltf.EXTENSION}:{name}" for name in ("SCALE", "OPACITY"))
+        columns = (("POSITION", "VEC3", found.places), (scales, "VEC3", found.scales), (opacities, "SCALAR", found.opacities))
+        for name, widths, into in columns:
+            counts.add(glb.document["accessors"][names[name]]["count"])
+            for rows in glb.rows(names[name], widths):
+                into.add(rows / np.iinfo(rows.dtype).max if rows.dtype.kind in "iu" else rows)
+        if len(counts) > 1:
+            raise Damaged(f"attributes of {sorted(counts)} rows; expected as many of each")
+        degrees = [int(each[1]) for name in names if (each := re.fullmatch(rf"{gltf.EXTENSION}:SH_DEGREE_(\d)_COEF_\d", name))]
+        found.count, found.degree = found.count + counts.pop(), max([found.degree, *degrees])
+    return found
+
+
+def _pieces(count: int) -> Iterator[int]:
+    for done in range(0, count, AT_ONCE):
+        yield min(AT_ONCE, count - done)

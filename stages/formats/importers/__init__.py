@@ -1,0 +1,154 @@
+"""Formats that a capture can come in: one file each, by family (apps, photogrammetry, datasets), a plain dict as the table.
+
+Nothing heavy is imported until something is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import BadInput
+from pipeline.text import printable
+from stages.formats.importers.source import ImportSettings, Source
+from stages.io.capture import Capture
+from stages.io.pictures import NOT_THE_FILES_FAULT
+from stages.video.reading import KNOWN, SUFFIXES
+
+
+@dataclass(frozen=True)
+class Importer:
+    """How one format is read.
+
+    module   of this package or one below it, with recognises(folder), files(folder, settings) and, where the format states cameras, read(folder, settings)
+    posed    whether the format states cameras; else they are found from the photographs
+    renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
+    dialect  passed on to `recognises` and `read` where one module reads several formats
+    """
+
+    module: str
+    posed: bool = True
+    renders: bool = False
+    dialect: str | None = None
+
+    def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
+        """Whether a folder holds files of this format; BadInput where they cannot be read."""
+        with one_line_errors(folder):
+            return bool(self._function("recognises")(folder, allow_outside, *self._dialect))
+
+    def holds_less_than(self, other: str, folder: Path, allow_outside: bool = False) -> bool:
+        """Whether another format of the same images in the folder says more of them; of formats that know of one such."""
+        with one_line_errors(folder):
+            return bool(self._function(f"holds_less_than_{other}")(folder, allow_outside))
+
+    def read(self, folder: Path, settings: ImportSettings) -> Capture:
+        """The capture, whose names and sentences may be shown; raises BadInput."""
+        with one_line_errors(folder):
+            capture: Capture = self._function("read")(folder, settings, *self._dialect)
+        return replace(capture, warnings=tuple(map(printable, capture.warnings)))
+
+    def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
+        """What the capture depends on; raises BadInput."""
+        with one_line_errors(folder):
+            paths: list[Path] = self._function("files")(folder, settings)
+        return paths
+
+    def _function(self, name: str) -> Callable[..., Any]:
+        return getattr(import_module(f"{__name__}.{self.module}"), name)
+
+    @property
+    def _dialect(self) -> tuple[str, ...]:
+        return () if self.dialect is None else (self.dialect,)
+
+
+@contextmanager
+def one_line_errors(folder: Path) -> Iterator[None]:
+    """BadInput whose text is one line that may be shown, whatever the names in it hold; also where a file or folder of the source cannot be read."""
+    try:
+        yield
+    except BadInput as error:
+        raise BadInput(printable(error, LONGEST)) from error
+    except OSError as error:
+        if error.errno in NOT_THE_FILES_FAULT:
+            raise
+        raise BadInput(printable(f"{error.filename or folder}: cannot be read ({error.strerror or error}). Check the source folder.")) from error
+
+
+LONGEST = 2000  # characters of a message: a path of the longest kind may be in it, more than once it may not
+
+# In order of preference: a folder may hold several formats.
+IMPORTERS: dict[str, Importer] = {
+    "blender": Importer("transforms", renders=True, dialect="blender"),
+    "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
+    "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
+    "scannetpp": Importer("datasets.scannetpp"),
+    "polycam": Importer("apps.polycam"),
+    "record3d": Importer("apps.record3d"),
+    "3d-scanner-app": Importer("apps.scanner_app"),
+    "metashape": Importer("photogrammetry.metashape"),
+    "realitycapture": Importer("photogrammetry.realitycapture"),
+    "opensfm": Importer("photogrammetry.opensfm"),
+    "kapture": Importer("photogrammetry.kapture"),
+    "llff": Importer("llff"),
+    "colmap": Importer("colmap"),
+    "mvsnet": Importer("datasets.mvsnet"),
+    "idr": Importer("datasets.idr"),
+    "nsvf": Importer("datasets.nsvf", renders=True),
+    "tanks-and-temples": Importer("datasets.tanks"),
+    "photographs": Importer("photographs", posed=False),
+}
+FORMATS = ("auto", *IMPORTERS)
+
+
+def detect(folder: Path, allow_outside: bool = False, llff_factor: int | str = "auto") -> str:
+    """The name of the format of a source folder; BadInput where it is none."""
+    return candidates(folder, allow_outside, llff_factor)[0]
+
+
+def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str = "auto") -> list[str]:
+    """Every format that the folder could be read as, the one to choose first; BadInput where there is none.
+
+    llff_factor  of the settings: where it is stated, LLFF is meant
+    """
+    if not folder.exists():
+        raise BadInput(f"{folder}: no such folder. Expected a folder of photographs, a video or a posed data set.")
+    if not folder.is_dir():
+        if folder.suffix.lower() in SUFFIXES:
+            return ["photographs"]
+        raise BadInput(f"{folder}: a file; expected a folder of photographs or of a posed data set, or a video ({KNOWN}). Name the folder that holds it.")
+    found = [name for name, importer in IMPORTERS.items() if importer.recognises(folder, allow_outside)]
+    if not found:
+        from stages.formats.importers.photographs import photographs
+
+        with one_line_errors(folder):
+            photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
+        found.append("photographs")
+    if {"llff", "colmap"} <= set(found) and llff_factor == "auto" and IMPORTERS["llff"].holds_less_than("colmap", folder, allow_outside):
+        found.remove("colmap")
+        found.insert(found.index("llff"), "colmap")
+    return found
+
+
+def posed_format(folder: Path, settings: Any) -> str | None:
+    """The format of the cameras that a folder states which is to be read as photographs in spite of them; None where it states none."""
+    if settings.format != "photographs" or not folder.is_dir():
+        return None
+    try:
+        name = candidates(folder, settings.allow_outside, settings.llff_factor)[0]
+    except BadInput:
+        return None
+    return name if IMPORTERS[name].posed else None
+
+
+def files(folder: Path, settings: Any) -> list[Path]:
+    """What the poses stage depends on: the files of the format in question that it reads, and of photographs those that state cameras of them."""
+    name = detect(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else settings.format
+    found, stated = set(IMPORTERS[name].files(folder, settings)), posed_format(folder, settings)
+    if stated is not None:
+        with suppress(BadInput):  # said where it is read
+            found |= set(IMPORTERS[stated].files(folder, settings))
+    return sorted(found)

@@ -1,0 +1,129 @@
+"""3D Scanner App's export "All Data" (Laan Labs): frame_00000.jpg beside frame_00000.json, directly in the folder or in the only folder that it holds.
+
+Layout: the readers of PSegs (ios_lidar) and nuwa (from_3dscannerapp). cameraPoseARFrame is ARCamera.transform row by row: camera to world with x right, y up,
+looking along -z, for the picture as the sensor has it (landscape); the world is ARKit's: y up, metres. intrinsics are K row by row, in pixels of the picture.
+The app writes more poses than pictures. Scans in low resolution have depth_00000.png, millimetres, and conf_00000.png, ARConfidenceLevel: 0, 1 or 2.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, pose_from_opengl
+from pipeline.errors import BadInput
+from stages.formats.importers import frames, lenses
+from stages.formats.importers.brown import brown_camera
+from stages.formats.importers.depth import DepthFile, depth_file, with_depth
+from stages.formats.importers.source import ImportSettings, Source, images_in
+from stages.io.capture import Capture
+from stages.io.json_file import numbers, read_json, shown
+
+POSE, INTRINSICS = "cameraPoseARFrame", "intrinsics"
+LARGEST_FRAME = 1 << 20  # bytes
+MILLIMETRE = 0.001  # metres
+HIGH = 2  # confidence
+FARTHEST = 5.0  # metres, the range of the sensor
+OFF_CENTRE = 0.1  # of a side: as far as the principal point of a picture that was neither cropped nor scaled may lie from its middle
+_FRAME = re.compile(r"frame_\d+")
+_TRIED = 10  # frames that are read to recognise the format, for some may be damaged
+_AGAIN = "Export from 3D Scanner App again, as All Data."
+
+
+def recognises(folder: Path, allow_outside: bool = False) -> bool:
+    source = Source(folder, allow_outside)
+    for image in [path for path in _pictures(_place(source)) if _is_posed(path)][:_TRIED]:
+        path = source.check_inside(image.with_suffix(".json"))
+        with suppress(BadInput):  # said where it is read
+            document = read_json(source.real(path), _AGAIN, limit=LARGEST_FRAME)
+            if isinstance(document, dict) and POSE in document:
+                return True
+    return False
+
+
+def files(folder: Path, settings: ImportSettings) -> list[Path]:
+    """The frames, their pictures, masks and depth."""
+    source = Source(folder, settings.allow_outside)
+    place = _place(source)
+    found = frames.files_of(source, _frames(source, place))
+    maps = [_depth(source, place, path.stem) for path in found]
+    beside = [path for one in maps if one is not None for path in (one.file, one.confidence) if path is not None]
+    return [*(source.check_inside(path.with_suffix(".json")) for path in _pictures(place) if _is_posed(path)), *found, *beside]
+
+
+def read(folder: Path, settings: ImportSettings) -> Capture:
+    """The capture that the frames describe. Raises BadInput."""
+    source = Source(folder, settings.allow_outside)
+    place = _place(source)
+    pictures = _pictures(place)
+    poses = sum(1 for path in place.glob("frame_*.json") if _FRAME.fullmatch(path.stem))
+    posed = sum(map(_is_posed, pictures))
+    capture = frames.capture_of(
+        source,
+        _frames(source, place),
+        settings,
+        kind="3d-scanner-app",
+        where=source.name_of(place / "frame_*.json"),
+        rejected=[(source.name_of(path), "without a pose") for path in pictures if not _is_posed(path)],
+        up=np.array([0.0, 1.0, 0.0]),
+        metric=True,
+        facts={"poses_without_picture": poses - posed},
+    )
+    return with_depth(capture, lambda photo: _depth(source, place, photo.image.stem))
+
+
+def _depth(source: Source, place: Path, stem: str) -> DepthFile | None:
+    number = stem.removeprefix("frame_")
+    return depth_file(source, place / f"depth_{number}.png", MILLIMETRE, place / f"conf_{number}.png", HIGH, FARTHEST)
+
+
+def _place(source: Source) -> Path:
+    """The folder of the frames: the source, or what is in it where that is one folder and nothing else, as the app packs them."""
+    inside = list(islice((path for path in source.root.iterdir() if not path.name.startswith((".", "__MACOSX"))), 2))
+    return inside[0] if len(inside) == 1 and inside[0].is_dir() and not inside[0].is_symlink() else source.root
+
+
+def _pictures(place: Path) -> list[Path]:
+    return [path for path in images_in(place) if _FRAME.fullmatch(path.stem)]
+
+
+def _is_posed(picture: Path) -> bool:
+    return picture.with_suffix(".json").is_file()
+
+
+def _frames(source: Source, place: Path) -> list[frames.Frame]:
+    pictures = [path for path in _pictures(place) if _is_posed(path)]
+    if not pictures:
+        raise BadInput(f"{source.root}: no export of 3D Scanner App: expected frame_00000.jpg beside frame_00000.json and so on. Choose a format with --as.")
+    frames.check_count(len(pictures), source.name_of(place / "frame_*.json"))
+    return [frames.Frame(path.name, place, source.name_of(path.with_suffix(".json")), _camera(source, path.with_suffix(".json"))) for path in pictures]
+
+
+def _camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Camera]:
+    """The camera of a frame for a picture of a size, which the frame does not state. Raises BadInput, as does what is returned."""
+    where = source.name_of(path)
+    document: Any = read_json(source.real(path), _AGAIN, limit=LARGEST_FRAME)
+    if not isinstance(document, dict):
+        raise BadInput(f"{where}: {shown(document)}; expected an object. {_AGAIN}")
+    matrix = numbers(document.get(POSE), 16, f"{where}: {POSE}", _AGAIN)
+    pose = pose_from_opengl(lenses.rigid(np.reshape(matrix, (4, 4)), where))
+    k = numbers(document.get(INTRINSICS), 9, f"{where}: {INTRINSICS}", _AGAIN)
+    if k[1] or k[3] or k[6] or k[7] or k[8] != 1:
+        raise BadInput(f"{where}: {INTRINSICS} are {k}; expected fx 0 cx 0 fy cy 0 0 1 (are they transposed?). {_AGAIN}")
+
+    def at(name: str, size: tuple[int, int]) -> Camera:
+        for width, height in (size, size[::-1]):  # a picture that EXIF turns has its camera stated for the pixels as stored
+            if abs(k[2] - width / 2) <= OFF_CENTRE * width and abs(k[5] - height / 2) <= OFF_CENTRE * height:
+                return replace(brown_camera(name, (width, height), (k[0], k[4]), (k[2], k[5]), (), (0, 0), where), world_from_camera=pose)
+        raise BadInput(
+            f"{where}: the principal point {k[2]:g}, {k[5]:g} is not near the middle of the picture of {size[0]}x{size[1]}. Was it cropped or scaled? {_AGAIN}"
+        )
+
+    return at

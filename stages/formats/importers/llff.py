@@ -1,0 +1,187 @@
+"""LLFF: poses_bounds.npy beside images/, images_4/, images_8/ ...
+
+A row is 3x5 [R | t | (h, w, f)] with camera columns down, right, back, then near and far; rows are in the order of the sorted names.
+h, w, f are those of the full images; the images at hand may be smaller, and f is scaled to them.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, pose_from_llff
+from pipeline.errors import BadInput
+from pipeline.text import printable
+from stages.formats.importers import lenses
+from stages.formats.importers.masks import masks_of
+from stages.formats.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, name_key
+from stages.io.capture import Capture, Photo
+from stages.io.json_file import LARGEST_NUMBER
+from stages.io.pictures import Header, UnreadableImage, read_header
+
+POSES = "poses_bounds.npy"
+
+
+def recognises(folder: Path, allow_outside: bool = False) -> bool:
+    return (folder / POSES).is_file()
+
+
+def holds_less_than_colmap(folder: Path, allow_outside: bool = False) -> bool:
+    """Whether the folder's COLMAP model is of all the images that poses_bounds.npy is of, and they look round about, as in mip-NeRF 360's data.
+
+    The file was made from the model, and has one focal length for its lens and none of its points. Of forward-facing captures its depths give the space that
+    they are trained in.
+    """
+    from efficientnerf.capture.forward_facing import MAX_AXIS_ANGLE
+    from stages.formats.importers import colmap
+
+    source = Source(folder, allow_outside)
+    try:
+        rows, named = _rows(source), colmap.image_names(source)
+    except BadInput:  # said where it is read
+        return False
+    here = [name_key(path.name) for path in images_in(folder / "images")]
+    if sorted(name_key(PurePosixPath(name).name) for name in named) != sorted(here) or len(here) != len(rows):
+        return False
+    axes = rows[:, :15].reshape(-1, 3, 5)[:, :, 2]
+    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
+    mean = axes.mean(0) / max(float(np.linalg.norm(axes.mean(0))), 1e-12)
+    return bool((axes @ mean).min() < np.cos(np.radians(MAX_AXIS_ANGLE)))
+
+
+def image_folders(folder: Path) -> dict[int, Path]:
+    """Reduction factor -> folder of images: images/ is 1, images_4/ is 4."""
+    folders = {1: folder / "images"} if images_in(folder / "images") else {}
+    for entry in sorted(folder.iterdir()):
+        match = re.fullmatch(r"images_(\d{1,4})", entry.name)
+        if match and int(match[1]) > 0 and images_in(entry):
+            folders.setdefault(int(match[1]), entry)
+    return dict(sorted(folders.items()))
+
+
+def files(folder: Path, settings: ImportSettings) -> list[Path]:
+    """The matrix of poses, the images of the folder that is used, and their masks."""
+    source = Source(folder, settings.allow_outside)
+    images = _images(source, settings, len(_rows(source)))[0]
+    return [folder / POSES, *images, *masks_of(source, images).values()]
+
+
+def read(folder: Path, settings: ImportSettings) -> Capture:
+    """The capture that poses_bounds.npy describes. Raises BadInput."""
+    source = Source(folder, settings.allow_outside)
+    rows = _rows(source)
+    images, factor, warnings = _images(source, settings, len(rows))
+    masks = masks_of(source, images)
+    photos: list[Photo] = []
+    rejected: list[tuple[str, str]] = []
+    rejected_files: dict[str, Path] = {}
+    remarks: dict[str, list[str]] = {}
+    readable: list[tuple[Path, float, float]] = []
+    stated: list[tuple[Camera, Header, str]] = []
+    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
+        name, where = source.name_of(image), f"{POSES}: row {index} ({source.name_of(image)})"
+        try:
+            header = read_header(source.real(image))
+        except UnreadableImage as error:
+            rejected.append((name, str(error)))
+            rejected_files[name] = source.real(image)
+            warnings.append(f"{name}: {error}; left out.")
+            continue
+        stated.append((_camera(row, name, where), header, where))
+        near, far = float(row[15]), float(row[16])
+        if not 0 < near < far:
+            raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
+        readable.append((image, near, far))
+    for (image, near, far), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
+        if remark in ("turned", "upright?"):  # another size than stated is what the folders are for
+            remarks.setdefault(str(remark), []).append(camera.name)
+        mask = source.real(masks[image]) if image in masks else None
+        photos.append(Photo(camera, source.real(image), mask, near=near, far=far))
+    if len(photos) < MIN_IMAGES:
+        raise BadInput(f"{folder}: {len(photos)} usable images; at least {MIN_IMAGES} are needed.")
+    return Capture(
+        kind="llff",
+        photos=tuple(photos),
+        background=None,
+        rejected=tuple(rejected),
+        warnings=tuple(warnings + lenses.fit_warnings(POSES, remarks)),
+        facts={"image_folder": printable(images[0].parent.name), "factor": factor},
+        rejected_files=rejected_files,
+    )
+
+
+def _rows(source: Source) -> np.ndarray:
+    return read_rows(source.real(source.root / POSES))
+
+
+def _camera(row: np.ndarray, name: str, where: str) -> Camera:
+    matrix = row[:15].reshape(3, 5)
+    pose = pose_from_llff(matrix[:, :4])
+    pose[:3, :3] = lenses.rotation(pose[:3, :3], where)
+    height, width, focal = matrix[:, 4]
+    if width != round(width) or height != round(height) or not (0 < width <= 65535 and 0 < height <= 65535):
+        raise BadInput(f"{where}: h, w are {height:g}, {width:g}; expected the image size in whole pixels.")
+    width, height = int(width), int(height)
+    return lenses.validated(Camera(name, width, height, "SIMPLE_PINHOLE", (float(focal), width / 2, height / 2), pose), where)
+
+
+def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
+    """(N, 17) float64, finite, N at most `max_frames`; nothing but plain numbers is read from the file. Raises BadInput."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(17 * 8 * max_frames + 4097)
+    except OSError as error:
+        raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error
+    if len(data) > 17 * 8 * max_frames + 4096:
+        raise BadInput(f"{path}: {path.stat().st_size} bytes; more than {max_frames} poses are not read.")
+    shape, fortran, kind, start = npy_header(path, data)
+    if len(shape) != 2 or shape[1] != 17 or kind.kind not in "fiu":
+        found = f"{kind} {shape}"
+        raise BadInput(f"{path}: {found:.80}; expected numbers of shape (N, 17): 3x5 poses, near and far. Write it again with LLFF's imgs2poses.")
+    size = shape[0] * 17 * kind.itemsize
+    if not 0 <= size <= len(data) - start:
+        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({len(data)} bytes for {shape[0]} poses).")
+    rows = np.frombuffer(data, kind, shape[0] * 17, start).reshape(shape, order="F" if fortran else "C").astype(np.float64)
+    unusable = ~(np.abs(rows) <= LARGEST_NUMBER).all(1)  # nan, too
+    if unusable.any():
+        raise BadInput(f"{path}: row {int(np.flatnonzero(unusable)[0])} holds numbers that are not finite, or beyond {LARGEST_NUMBER:g}. Write it again.")
+    return rows
+
+
+def npy_header(path: Path, data: bytes) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+    """Shape, whether columns come first, type, and where the numbers begin, of a .npy file; nothing is allocated on its word."""
+    file = io.BytesIO(data)
+    try:
+        major, _ = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        shape, fortran, kind = read(file)
+    except Exception as error:  # a damaged header is parsed as a Python literal, which raises anything
+        reason = printable(next(iter(str(error).splitlines()), type(error).__name__), 80)
+        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({reason}).") from error
+    return tuple(map(int, shape)), fortran, kind, file.tell()  # True is an integer to the parser
+
+
+def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[Path], int, list[str]]:
+    """The images in the order of the rows, the reduction factor of their folder, and warnings."""
+    folders = image_folders(source.root)
+    if not folders:
+        raise BadInput(f"{source.root}: {POSES} without images: expected a folder images, images_4, images_8 ... beside it.")
+    counts = {factor: len(images_in(folder)) for factor, folder in folders.items()}
+    if settings.llff_factor != "auto":
+        if settings.llff_factor not in folders:
+            there = ", ".join(folder.name for folder in folders.values())
+            raise BadInput(f"{source.root}: no images reduced by {settings.llff_factor} (poses.llff_factor); there are {there}.")
+        usable = [settings.llff_factor]
+    else:
+        usable = list(folders)
+    fitting = [factor for factor in usable if counts[factor] == count]
+    if not fitting:
+        found = ", ".join(f"{folders[factor].name} holds {counts[factor]}" for factor in usable)
+        raise BadInput(f"{source.root / POSES}: {count} poses, but {found} images; rows belong to the sorted names. Restore the images it was made from.")
+    warnings = []
+    if fitting[0] != usable[0]:
+        warnings.append(f"{folders[usable[0]].name} holds {counts[usable[0]]} images for {count} poses; {folders[fitting[0]].name} is used instead.")
+    return [source.check_inside(image) for image in images_in(folders[fitting[0]])], fitting[0], warnings

@@ -1,0 +1,186 @@
+"""OpenSfM and OpenDroneMap (ODM): reconstruction.json, of OpenSfM in the folder itself, of ODM in opensfm/, with the photographs in images/.
+
+Layout and lenses: OpenSfM's documentation, "Dataset structure" and "Geometric models". A shot's `rotation` (axis times angle) and `translation` are world to
+camera with x right, y down, z forward. Lengths of the lens are shares of the image's longer side, the centre is that of the image. The world has z up, and
+is in metres where the photographs have GPS (`reference_lla`). Points that tracks.csv knows are registered in their images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import BadInput
+from pipeline.text import printable
+from stages.formats.importers import frames
+from stages.formats.importers.brown import brown_camera
+from stages.formats.importers.source import ImportSettings, Source
+from stages.formats.importers.texts import read_text
+from stages.io.capture import Capture, SparsePoints
+from stages.io.json_file import finite, read_json, shown
+
+PLACES = ("opensfm/reconstruction.json", "reconstruction.json")
+MAX_POINTS = 2_000_000
+_AGAIN = "Reconstruct again, or choose another format with --as."
+_BROWN = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": ("k1", "k2", "k3", "p1", "p2"),
+}
+_FISHEYE = {"fisheye": ("k1", "k2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
+
+
+def recognises(folder: Path, allow_outside: bool = False) -> bool:
+    return Source(folder, allow_outside).first_of(PLACES) is not None
+
+
+def files(folder: Path, settings: ImportSettings) -> list[Path]:
+    """The reconstruction, its tracks, the photographs and their masks."""
+    source = Source(folder, settings.allow_outside)
+    file, reconstructions = _read(source)
+    tracks = file.with_name("tracks.csv")
+    return [file, *([tracks] if tracks.is_file() else []), *frames.files_of(source, _frames(source, file, reconstructions[0]))]
+
+
+def read(folder: Path, settings: ImportSettings) -> Capture:
+    """The capture that the largest reconstruction describes. Raises BadInput."""
+    source = Source(folder, settings.allow_outside)
+    file, reconstructions = _read(source)
+    where, best = source.name_of(file), reconstructions[0]
+    warnings = []
+    if len(reconstructions) > 1:
+        others = ", ".join(str(len(one["shots"])) for one in reconstructions[1:6])
+        warnings.append(f"{where}: the reconstruction with {len(best['shots'])} images is used; there are others with {others}, which share no frame with it.")
+    origin = best.get("reference_lla")
+    metric = isinstance(origin, dict) and any(finite(value) for value in origin.values())
+    return frames.capture_of(
+        source,
+        _frames(source, file, best),
+        settings,
+        kind="opensfm",
+        where=where,
+        warnings=warnings,
+        points=lambda places: _points(source, file, best, places),
+        up=np.array([0.0, 0.0, 1.0]),
+        metric=metric,
+        facts={"reconstruction": where, "registered": len(best["shots"]), "cameras": len(best["cameras"])},
+    )
+
+
+
+def _read(source: Source) -> tuple[Path, list[dict[str, Any]]]:
+    """The file, and its reconstructions, that with most shots first."""
+    file = source.first_of(PLACES)
+    if file is None:
+        raise BadInput(f"{source.root}: no reconstruction of OpenSfM: expected {' or '.join(PLACES)}. Choose another format with --as.")
+    document = read_json(source.real(file), _AGAIN)
+    found = [one for one in document if isinstance(one, dict)] if isinstance(document, list) else []
+    found = [one for one in found if isinstance(one.get("shots"), dict) and isinstance(one.get("cameras"), dict)]
+    if not found:
+        raise BadInput(f"{source.name_of(file)}: no reconstruction: expected a list of objects with `cameras` and `shots`. {_AGAIN}")
+    return file, sorted(found, key=lambda one: len(one["shots"]), reverse=True)
+
+
+def _vector(value: Any, where: str) -> np.ndarray:
+    found = [finite(entry) for entry in value] if isinstance(value, list) and len(value) == 3 else [None]
+    if None in found:
+        raise BadInput(f"{where}: {shown(value)}; expected three finite numbers. {_AGAIN}")
+    return np.array(found, np.float64)
+
+
+def _frames(source: Source, file: Path, reconstruction: dict[str, Any]) -> list[frames.Frame]:
+    where = source.name_of(file)
+    frames.check_count(len(reconstruction["shots"]), where)
+    beside = source.root / "images" if (source.root / "images").is_dir() else source.root
+    listed = []
+    for name, shot in sorted(reconstruction["shots"].items()):
+        place = f"{where}: shot {printable(name, frames.MAX_NAME)}"
+        if not isinstance(shot, dict):
+            raise BadInput(f"{place}: {shown(shot)}; expected an object. {_AGAIN}")
+        turn = rotation_of(_vector(shot.get("rotation"), f"{place}: rotation"))
+        pose = np.eye(4)
+        pose[:3, :3] = turn.T
+        pose[:3, 3] = -turn.T @ _vector(shot.get("translation"), f"{place}: translation")
+        lens = reconstruction["cameras"].get(shot.get("camera")) if isinstance(shot.get("camera"), str) else None
+        if not isinstance(lens, dict):
+            raise BadInput(f"{place}: camera {shown(shot.get('camera'))} is not among the cameras. {_AGAIN}")
+        listed.append(frames.Frame(name, beside, place, _camera(lens, pose, place), bare=True))
+    return listed
+
+
+def rotation_of(vector: np.ndarray) -> np.ndarray:
+    """(3,) axis times angle -> (3, 3), by Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+
+
+def _camera(lens: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
+    def value(key: str, default: Any = 0.0) -> float:
+        found = finite(lens.get(key, default))
+        if found is None:
+            raise BadInput(f"{where}: {key} of its camera is {shown(lens.get(key))}, expected a finite number. {_AGAIN}")
+        return found
+
+    kind = lens.get("projection_type")
+    if not isinstance(kind, str) or kind not in _BROWN | _FISHEYE:
+        raise BadInput(f"{where}: a {shown(kind)} camera; {', '.join(_BROWN | _FISHEYE)} are read. Undistort the images first (opensfm undistort).")
+    used = (_BROWN | _FISHEYE)[kind]
+    k = {key: value(key) if key in used else 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    focal = value("focal_x", lens.get("focal")), value("focal_y", lens.get("focal", lens.get("focal_x")))
+    shift = value("c_x"), value("c_y")
+    stated = (value("width", 0), value("height", 0)) if "width" in lens and "height" in lens else None
+    if stated is not None and not (stated[0] == int(stated[0]) and stated[1] == int(stated[1]) and 0 < min(stated) <= max(stated) <= 65535):
+        raise BadInput(f"{where}: image size {stated[0]:g}x{stated[1]:g}; expected whole pixels. {_AGAIN}")
+
+    def camera(name: str, size: tuple[int, int]) -> Camera:
+        width, height = (int(stated[0]), int(stated[1])) if stated else size
+        longer = max(width, height)
+        fx, fy = focal[0] * longer, focal[1] * longer
+        centre = width / 2 + shift[0] * longer, height / 2 + shift[1] * longer
+        if kind in _FISHEYE:
+            found = Camera(name, width, height, "OPENCV_FISHEYE", (fx, fy, *centre, k["k1"], k["k2"], k["k3"], k["k4"]), pose)
+        else:
+            found = brown_camera(name, (width, height), (fx, fy), centre, (k["k1"], k["k2"], k["k3"]), (k["p1"], k["p2"]), where)
+        return replace(found, world_from_camera=pose)
+
+    return camera
+
+
+def _points(source: Source, file: Path, reconstruction: dict[str, Any], places: dict[str, int]) -> SparsePoints | None:
+    """The reconstruction's points; tracks where tracks.csv has them."""
+    points = reconstruction.get("points")
+    if not isinstance(points, dict) or not points:
+        return None
+    where = source.name_of(file)
+    if len(points) > MAX_POINTS:
+        raise BadInput(f"{where}: {len(points)} points; at most {MAX_POINTS} are read. {_AGAIN}")
+    xyz, rgb = [], []
+    for name, point in points.items():
+        if not isinstance(point, dict):
+            raise BadInput(f"{where}: point {printable(name, 40)}: {shown(point)}; expected an object. {_AGAIN}")
+        xyz.append(_vector(point.get("coordinates"), f"{where}: point {printable(name, 40)}"))
+        rgb.append(_vector(point.get("color", [128, 128, 128]), f"{where}: colour of point {printable(name, 40)}"))
+    tracks = _tracks(source, file.with_name("tracks.csv"), {name: index for index, name in enumerate(points)}, places)
+    return frames.sparse_points(np.array(xyz), np.array(rgb), tracks)
+
+
+def _tracks(source: Source, file: Path, points: dict[str, int], places: dict[str, int]) -> list[tuple[int, ...]] | None:
+    """Of each point the photos that see it, from the lines "image TAB track TAB ..."; None where there is no such file."""
+    if not file.is_file():
+        return None
+    tracks: list[set[int]] = [set() for _ in points]
+    for line in read_text(source.real(file)).splitlines():
+        words = line.split("\t", 2)
+        if len(words) == 3 and words[1] in points and words[0] in places:
+            tracks[points[words[1]]].add(places[words[0]])
+    return [tuple(sorted(track)) for track in tracks]

@@ -1,0 +1,45 @@
+"""What extracting a surface takes. docs/experiments/memory.md"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from stages.memory.need import SURFACES, Need, libraries
+from stages.memory.rendering import tree_bytes
+from stages.mesh.check import CAPTURED, FUSED, LONGER_SIDE, ORBIT
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+# Bytes. Of a stored voxel: vertices and faces while they are joined, cleaned and decimated, as many as a thin shell has; of a cell in which enclosed space
+# is found, and of a voxel of the bricks that these are made from; of a point with what its colour is looked up by.
+VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
+# Of a pixel of a view whose depth is fused, and of a voxel of a block that is fused at a time.
+PIXEL, BLOCK_VOXEL = 36, 120
+# Of a texel, with what it has seen of photographs; of a photograph's pixel with depth and edges.
+TEXEL, PHOTOGRAPH_PIXEL = 140, 60
+# Of a stored voxel, what a normal map is baked from: the surface before decimation with its normals, and cells in which its faces are found.
+DENSE_VOXEL, DENSE_CELLS = 250, 8 * 256**3
+
+
+def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False) -> Need:
+    """What it takes to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
+    and with a normal map where `dense`."""
+    from efficientnerf.surface.fusion import MARGIN
+    from efficientnerf.surface.isosurface import BLOCK, pool_of
+    from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
+
+    views = CAPTURED + ORBIT + FUSED
+    pool = pool_of(volume_of(tree))
+    cells = [-(-side // pool) + 2 for side in tree.resolution]
+    terms = {
+        "vertices and faces": VOXEL * len(tree.density_values),
+        "the grid": CELL * math.prod(cells) + BRICK_VOXEL * min(VOXELS_AT_ONCE, tree.voxel_index.size),
+        "views": (PIXEL * views * LONGER_SIDE**2 + BLOCK_VOXEL * (BLOCK + 1 + 2 * MARGIN) ** 3) if tree.ndc is None else 0,
+        "the asset": tree_bytes(tree),
+        "libraries": libraries() + SURFACES,
+    }
+    optional = {"points": POINT * points, "the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
+                "the normal map": (DENSE_VOXEL * len(tree.density_values) + DENSE_CELLS) if dense else 0}  # fmt: skip
+    return Need(terms | {what: count for what, count in optional.items() if count})

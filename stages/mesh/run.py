@@ -1,0 +1,279 @@
+"""The mesh stage: the asset's surface with a texture, as PLY and OBJ in the capture's frame and as GLB, a report, and a preview."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from efficientnerf.settings import Auto, Fraction, given, setting
+from pipeline.errors import StageFailed
+from pipeline.files import write_json
+from pipeline.stage import Job, Stage
+from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
+from stages.compiling import compiling_kernels
+from stages.mesh.check import asset_views, checked, level_of, shown_by, warning_of
+from stages.mesh.texture import facts_of, largest_photograph, refuse_normal_map_without_texture, textured, with_relief
+from stages.mesh.timing import Stopwatch
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.surface.agreement import AssetView
+    from efficientnerf.surface.mesh import Mesh
+    from stages.formats.exporters.writing import SourceFrame
+    from stages.memory.need import Need
+
+
+PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
+STEPS = 500  # of the progress of each
+SURFACE_SHARE = 0.7  # of the stage's time; the texture takes the rest
+FACES = {"20k": 20_000, "100k": 100_000, "500k": 500_000}  # of mesh.max_faces
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """How the surface is meshed."""
+
+    region: Literal["foreground", "all"] = setting(
+        "foreground",
+        "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
+        advanced=True,
+    )
+    max_faces: Annotated[int, Meta(ge=100)] | Literal["20k", "100k", "500k"] = setting(
+        200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
+    )
+    density_threshold: Annotated[float, Meta(gt=0.0)] | Auto = setting(
+        "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
+    )
+    min_component: Fraction = setting(
+        0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
+    )
+    smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
+        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, of normals follow, which keep edges.", advanced=True
+    )
+    texture: Literal["auto", "photographs", "asset", "off"] = setting(
+        "auto",
+        "Where the texture's colours are from: the training photographs, blended (photographs), or the asset (asset); auto: photographs where they show the"
+        " mesh; off: colours at vertices alone.",
+    )
+    texture_size: Annotated[int, Meta(ge=256, le=8192)] = setting(
+        2048, "Most texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.", advanced=True
+    )
+    normal_map: bool = setting(
+        False,
+        "A normal map beside the texture, of the surface before it was decimated; materials are lit then, so that lamps show its relief over the light of the"
+        " capture.",
+        advanced=True,
+    )
+
+
+def mesh_of(
+    tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
+    dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
+) -> Mesh:  # fmt: skip
+    """The tree's surface in the training frame; `progress` takes (done, total, text). Raises StageFailed where there is none at a density that was asked for;
+    else it has no faces then, and "no_surface" among its facts says why.
+
+    views   is given those of the asset that say which components it shows
+    region  that the surface is clipped to
+    dense   is given vertices and faces as they were before decimation
+    """
+    from efficientnerf.surface.isosurface import NoSurface
+    from efficientnerf.surface.nested import scene_surface
+
+    progress = whole_progress(progress, 1 + len(tree.outer))
+    seen, fused = asset_views(tree, progress)
+    if views is not None:
+        views += seen
+    threshold = given(settings.density_threshold)
+
+    def tick() -> None:
+        progress(1, 1, PARTS[0])
+
+    try:
+        mesh = scene_surface(
+            tree,
+            level_of(tree, threshold, seen, tick),
+            faces=FACES[settings.max_faces] if isinstance(settings.max_faces, str) else settings.max_faces,
+            min_component=settings.min_component,
+            rounds=settings.smoothing_iterations,
+            viewpoints=orbit_points(tree.metadata),
+            shown=shown_by(seen, float(tree.voxel), tick),
+            views=fused if threshold is None else (),
+            region=region,
+            dense=dense,
+            progress=progress,
+        )
+    except NoSurface as error:
+        if threshold is not None:
+            raise StageFailed(f"mesh: {error}. {remedy('mesh', threshold)}") from error
+        mesh = nothing(str(error))
+    return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"})
+
+
+def nothing(why: str) -> Mesh:
+    """A mesh without faces."""
+    from efficientnerf.surface.mesh import Mesh
+
+    return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.float32), {"no_surface": why})
+
+
+def whole_progress(progress: Callable[[int, int, str], None], grids: int = 1) -> Callable[[int, int, str], None]:
+    """Progress over views of the asset and the parts of the surfaces of so many grids together: a bar that never goes back."""
+    begun: list[str] = []
+    reached, most = 0, 1 + grids * len(PARTS)
+
+    def part(done: int, total: int, text: str) -> None:
+        nonlocal reached
+        if not begun or (begun[-1] != text and len(begun) < most):
+            begun.append(text)
+        reached = max(reached, (len(begun) - 1) * STEPS + (STEPS * done // total if total else STEPS))
+        progress(reached, most * STEPS, text)
+
+    return part
+
+
+def orbit_points(metadata: Mapping[str, Any]) -> np.ndarray:
+    """(N, 3) points on the orbit of the capture's cameras, training frame; none where the asset's metadata have no orbit."""
+    orbit = metadata.get("orbit")
+    if not orbit:
+        return np.zeros((0, 3))
+    turn, tilt = np.radians(float(orbit["heading"]) + np.arange(8) * 45.0), np.radians(float(orbit["elevation"]))
+    direction = np.stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.full(8, np.sin(tilt))], 1)
+    return np.asarray(orbit["centre"], np.float64) + float(orbit["radius"]) * direction[: 1 if orbit["forward_facing"] else 8]
+
+
+def remedy(stage: str, threshold: float | None) -> str:
+    """What to do where no surface was found."""
+    if threshold is None:
+        return f"The asset is nearly empty: train longer, or set {stage}.density_threshold by hand."
+    return f"Lower {stage}.density_threshold (found {threshold:g}), or set it to auto."
+
+
+def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:
+    """A mesh of the training frame in the capture's."""
+    from efficientnerf.surface.mesh import moved
+
+    back = frame.world_from_capture.inverse()
+    return moved(mesh, back.scale, back.rotation, back.translation)
+
+
+def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
+    """The report of a mesh in the capture's frame: counts, topology, bounds, area, volume, settings."""
+    from dataclasses import asdict
+
+    from efficientnerf.surface.mesh import face_areas, face_volumes, topology
+
+    found = topology(mesh.vertices, mesh.faces)
+    return {
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        **asdict(found),
+        "bounds": [mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()] if len(mesh.vertices) else None,
+        "unit": "metre" if frame.metric else "unknown",
+        "area": float(face_areas(mesh.vertices, mesh.faces).sum()),
+        "volume": float(face_volumes(mesh.vertices, mesh.faces).sum()) if found.watertight else None,
+        **mesh.facts,
+    }
+
+
+def preview_of(mesh: Mesh, metadata: Mapping[str, Any], *, clipped: bool) -> np.ndarray:
+    """(H, W, 3) uint8: a mesh of the training frame from four sides, of a capture from one side those that its cameras saw.
+
+    clipped  whether the mesh ends at a region's border. One that does not may reach far behind its subject: then the nearest four fifths are shown
+    """
+    from stages.figures.shading import IN_FRONT, render_sides
+
+    orbit = metadata.get("orbit", {})
+    heading, elevation = float(orbit.get("heading", 0.0)), float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
+    if not orbit.get("forward_facing", False):
+        return render_sides(mesh, heading=heading, elevation=elevation)
+    return render_sides(mesh, heading=heading, elevation=0.0, turns=IN_FRONT, shown=1.0 if clipped else 0.8)
+
+
+def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: SourceFrame, job: Job) -> None:
+    """The files of a mesh without faces, and a warning: what else a run makes of its asset does not depend on there being one."""
+    from stages.io.png import write_png
+    from stages.mesh.files import write_empty_meshes
+
+    write_empty_meshes(outputs, frame)
+    agreed, picture = checked(mesh, seen, job.safe_point)
+    for path in (outputs.preview, outputs.check):
+        write_png(picture, path)
+    write_json(outputs.report, describe(mesh, frame) | {"region": job.settings.region} | agreed)
+    job.warn(f"the mesh is empty: {mesh.facts['no_surface']}. {remedy('mesh', None)}")
+    job.say("no faces", faces=0, components=0, watertight=False)
+
+
+def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
+    """What meshing and texturing it take of memory."""
+    from stages.mesh.memory import surface_needed
+
+    texture = 0 if settings.texture == "off" else settings.texture_size
+    return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
+
+
+@compiling_kernels
+def run(job: Job) -> None:
+    from efficientnerf.asset.format import load
+    from stages.formats.exporters import MESH_EXPORTERS
+    from stages.formats.exporters.writing import source_frame
+    from stages.framing.restriction import restricted
+    from stages.io.png import write_png
+    from stages.memory.need import refuse_what_does_not_fit
+
+    outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
+    refuse_normal_map_without_texture(settings)
+    watch = Stopwatch()
+    whole = load(inputs.bake.asset)
+    tree = restricted(whole, settings.region)
+    frame = source_frame(tree.metadata)
+    refuse_what_does_not_fit(job, needed(tree, settings, inputs), "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
+    seen: list[AssetView] = []
+    share = 1.0 if settings.texture == "off" else SURFACE_SHARE
+    border = whole.region if settings.region == "foreground" else None
+    dense: list[tuple[np.ndarray, np.ndarray]] | None = [] if settings.normal_map else None
+    surface = mesh_of(tree, settings, watch.listening(lambda done, total, text: job.reached(share * done, total, text)), seen, border, dense)
+    if "no_surface" in surface.facts:
+        write_empty(outputs, surface, seen, frame, job)
+        write_json(outputs.timings, watch.seconds)
+        return
+    texture_progress = watch.listening(lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text))
+    found = textured(surface, tree, inputs, settings.texture, settings.texture_size, texture_progress)
+    if dense is not None:
+        found = with_relief(found, dense, lambda: texture_progress(1, 1, "normal map"))
+    job.safe_point()
+    write_png(preview_of(found, tree.metadata, clipped=border is not None), outputs.preview)
+    watch.lap("preview")
+    job.safe_point()
+    mesh = in_capture(found, frame)
+    for path in (outputs.ply, outputs.glb, outputs.obj):
+        MESH_EXPORTERS[path.suffix](mesh, path, frame)
+    watch.lap("files")
+    agreed, picture = checked(found, seen, job.safe_point)
+    write_png(picture, outputs.check)
+    watch.lap("check")
+    write_json(outputs.timings, watch.seconds)
+    report = describe(mesh, frame) | {"region": job.settings.region} | agreed
+    write_json(outputs.report, report)
+    if (doubt := warning_of(report)) is not None:
+        job.warn(doubt)
+    if not report["watertight"]:
+        job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['non_manifold_edges']} non-manifold edges")
+    facts = {name: report[name] for name in ("faces", "components", "watertight")}
+    job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
+
+
+STAGE = Stage(
+    name="mesh",
+    version=15,
+    settings=MeshSettings,
+    needs=needs_of(MeshInputs),
+    run=run,
+    check=lambda settings: refuse_normal_map_without_texture(settings["mesh"]),
+    volatile=(MeshOutputs.timings,),
+)

@@ -1,0 +1,119 @@
+"""The texture of a mesh: from the training photographs, one in memory at a time, or from the asset. Test and validation views are left for scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.surface.mesh import Mesh
+    from efficientnerf.surface.texturing.photographs import Photograph
+    from stages.artifacts import MeshInputs
+    from stages.io.scene import View
+    from stages.mesh.run import MeshSettings
+
+Progress = Callable[[int, int, str], None]
+
+
+def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, largest: int, progress: Progress) -> Mesh:
+    """A mesh of the training frame with a texture, the colours of its vertices from that, and what is known of it beside its facts.
+
+    choice    "photographs", "asset", "off", or "auto": photographs where the training views show any of the mesh, else the asset
+    largest   texels along a side, at most
+    progress  is called often; what it raises stops the work
+    """
+    from efficientnerf.surface.shading import vertex_colours
+    from efficientnerf.surface.texturing.asset import texture_of_asset
+
+    if choice == "off":
+        return mesh
+    found = None if choice == "asset" else _from_photographs(mesh, inputs, largest, progress)
+    if found is None or (choice != "photographs" and not found.facts["texture_observed"]):
+        found = texture_of_asset(tree, mesh, largest=largest, progress=progress)
+    return replace(found, colours=vertex_colours(found))  # docs/experiments/vertex-colours.md
+
+
+def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Progress) -> Mesh | None:
+    """Textured by the training photographs; None where there are none."""
+    from efficientnerf.surface.mesh import Texture
+    from efficientnerf.surface.texturing.atlas import atlas_of
+    from efficientnerf.surface.texturing.filling import texture_from
+    from efficientnerf.surface.texturing.photographs import PhotographTexture, survey, texels_wanted
+    from stages.io.refined_cameras import load_scene
+    from stages.io.scene import views_of
+
+    views = views_of(load_scene(inputs.poses.folder, inputs.train.folder), "train")
+    if not views:
+        return None
+    surveys, steps = [], 2 * len(views)
+    for number, photo in enumerate(photographs(inputs, views)):
+        progress(number, steps, "texture")
+        surveys.append(survey(mesh.vertices, mesh.faces, mesh.normals, mesh.colours, photo, partial(progress, number, steps, "texture")))
+    density = np.max([each.density for each in surveys], axis=0)
+    atlas = atlas_of(mesh.vertices, mesh.faces, texels_wanted(mesh.vertices, mesh.faces, density), largest)
+    sharpness = float(np.median([each.sharpness for each in surveys]))
+    progress(len(views), steps, "charts")
+    texels = PhotographTexture(mesh.vertices, mesh.faces, mesh.normals, atlas, density, sharpness)
+    for number, photo in enumerate(photographs(inputs, views)):
+        progress(len(views) + number, steps, "texture")
+        texels.look(photo, surveys[number], partial(progress, len(views) + number, steps, "texture"))
+    colours, known = texels.finished(mesh, partial(progress, steps, steps, "texture"))
+    progress(steps, steps, "texture")
+    facts = {
+        "texture": "photographs",
+        "texture_size": atlas.size,
+        "texture_charts": int(atlas.chart.max(initial=-1)) + 1,
+        "texture_observed": float(f"{(known >= 0.5).mean() if len(known) else 0.0:.4g}"),
+        "texels_per_pixel": texels.texels_per_pixel(),
+    }
+    return replace(mesh, texture=Texture(atlas.coordinates, texture_from(atlas, colours)), facts=mesh.facts | facts)
+
+
+def with_relief(mesh: Mesh, dense: list[tuple[np.ndarray, np.ndarray]], tick: Callable[[], None]) -> Mesh:
+    """The textured mesh with a normal map of what it was before decimation: vertices and faces of each cascade."""
+    from efficientnerf.surface.texturing.normal_map import Dense, with_normal_map
+
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in dense)])
+    faces = np.concatenate([part + start for (_, part), start in zip(dense, first)])
+    return with_normal_map(mesh, Dense(np.concatenate([vertices for vertices, _ in dense]), faces), tick)
+
+
+def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
+    """Raise UsageError for a normal map on a mesh without texture coordinates."""
+    from pipeline.errors import UsageError
+
+    if settings.normal_map and settings.texture == "off":
+        raise UsageError("mesh.normal_map lies on the coordinates of a texture, and mesh.texture is off. Set one of them otherwise.")
+
+
+def largest_photograph(inputs: MeshInputs, choice: str) -> int:
+    """Pixels of the largest photograph that a texture is made of; none where it is not made of any."""
+    from stages.io.scene import load, views_of
+
+    if choice in ("off", "asset"):
+        return 0
+    return max((view.camera.width * view.camera.height for view in views_of(load(inputs.poses.folder), "train")), default=0)
+
+
+def photographs(inputs: MeshInputs, views: tuple[View, ...]) -> Iterator[Photograph]:
+    """The photographs of views, read when they are asked for; where training learned their exposure, as if all had been exposed alike."""
+    from efficientnerf.surface.texturing.photographs import photograph
+    from stages.train.averaged import averaged_views
+
+    read = averaged_views(inputs.poses.folder, inputs.train.folder)
+    for view in views:
+        yield photograph(view.camera, *read(view))
+
+
+def facts_of(report: dict[str, Any]) -> str:
+    """A few words on the texture for the user; none where there is none."""
+    if "texture_size" not in report:
+        return ""
+    side = report["texture_size"]
+    seen = f", {100 * report['texture_observed']:.0f} % of it from photographs" if "texture_observed" in report else ", from the asset"
+    return f", with a texture of {side}x{side}{seen}"

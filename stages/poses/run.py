@@ -1,0 +1,369 @@
+"""The poses stage: a source in any format becomes a scene that needs the source no more.
+
+    detect the format -> read the cameras, or find them -> working images -> training frame -> splits -> write
+
+Images are not undistorted: later stages trace the distorted rays.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from msgspec import Meta
+
+from efficientnerf.geometry.cameras import resized
+from efficientnerf.settings import Auto, PositiveInt, given, setting
+from pipeline.errors import BadInput
+from pipeline.files import write_json
+from pipeline.stage import Job, Stage
+from stages.artifacts import PosesOutputs
+from stages.cores import count_cores, in_order
+from stages.formats import importers
+from stages.formats.importers.source import MIN_IMAGES, abbreviated
+from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
+from stages.io.scene import SPLITS, Scene, View, save, save_points
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from stages.io.silhouettes import SmallPictures
+
+    Format = str
+else:
+    Format = Literal[importers.FORMATS]  # the names of the table of importers
+
+WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
+
+
+@dataclass(frozen=True)
+class PosesSettings:
+    """How a source is read and framed."""
+
+    format: Format = setting("auto", "Format of the source; auto: found out from its files.")
+    max_image_size: Annotated[int, Meta(ge=32, le=16384)] = setting(
+        1024, "Longest side of the images that later stages read; larger ones are reduced.", unit="pixels"
+    )
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "Axis of the capture's frame that points up; auto: estimated.")
+    crop_box: tuple[float, float, float, float, float, float] | Auto = setting(
+        "auto", "Crop box in the capture's frame: x y z of one corner, then of the opposite one; auto: estimated."
+    )
+    box_margin: Annotated[float, Meta(ge=0.0, le=2.0)] = setting(
+        0.05, "Margin on each side of an estimated crop box, as a fraction of its longest side.", advanced=True
+    )
+    space: Literal["auto", "box", "contracted", "ndc"] = setting(
+        "auto",
+        "Space of the field: the box alone, with a background without depth beyond it (box); all of an unbounded scene (contracted); or normalised device"
+        " coordinates, for forward-facing captures (ndc); auto: ndc for forward-facing LLFF folders, box for objects with alpha, else contracted.",
+    )
+    masks: Literal["auto", "silhouette", "ignore"] = setting(
+        "auto",
+        "What masks and alpha channels mean: outside of them is background, and the object alone is trained, on random colours (silhouette), or pixels outside"
+        " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
+    )
+    mask_from: Annotated[
+        str,
+        Meta(
+            pattern="^(auto|off|foreground|static|green|white|#[0-9a-fA-F]{6})$",
+            description="auto, off, foreground, static, green, white or a colour as #rrggbb",
+        ),
+    ] = setting(
+        "auto",
+        "What silhouettes are made from where photographs have no masks: the subject as a first quick training of the scene finds it (foreground), a background"
+        " that stands still while the object turns (static), a screen of one colour (green, white, #rrggbb), or nothing (off); auto: static where cameras found"
+        " by the object alone show that it turned.",
+        advanced=True,
+    )
+    mask_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
+        "off", "ONNX file of a network that tells a subject from its background (as rembg has them), by which silhouettes are made; off: none.", advanced=True
+    )
+    features_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
+        "off",
+        "ONNX file of a network that detects features (ALIKED), by which photographs are matched that have no camera else; off: none.",
+        advanced=True,
+    )
+    matcher_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
+        "off", "ONNX file of a network that matches these features (LightGlue); off: none.", advanced=True
+    )
+    mask_polarity: Literal["auto", "white", "black"] = setting(
+        "auto",
+        "What is kept of given masks: what is not black in them (white), or what is (black); auto: white, unless black shows one compact object in nearly all.",
+        advanced=True,
+    )
+    test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
+    llff_factor: PositiveInt | Auto = setting(
+        "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
+    )
+    frames: Annotated[int, Meta(ge=3, le=10_000)] = setting(
+        150, "Most frames that are chosen of videos, of all of them together: the sharpest ones that differ.", advanced=True
+    )
+    strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
+    allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
+    lens: Literal["auto", "perspective", "fisheye", "equirectangular"] = setting(
+        "auto",
+        "What photographs and videos show: what a usual lens projects (perspective), a fisheye lens (fisheye), or 360 degrees (equirectangular), which are cut"
+        " into views of pinhole cameras; auto: fisheye where EXIF names such a lens, 360 degrees where a picture is twice as wide as high and XMP says so.",
+        advanced=True,
+    )
+    matching: Literal["auto", "exhaustive", "retrieval", "sequential"] = setting(
+        "auto",
+        "Which photographs are matched: all pairs (exhaustive), each with those that look most like it (retrieval), or with those that follow (sequential);"
+        " auto: exhaustive for up to 60, else retrieval.",
+    )
+    max_features: Annotated[int, Meta(ge=256, le=65536)] | Auto = setting(
+        "auto", "Most features detected in a photograph; auto: 4096, of more than 60 photographs 2048.", advanced=True
+    )
+    feature_image_size: Annotated[int, Meta(ge=320, le=8192)] = setting(
+        1600, "Longest side of the photographs in which features are detected.", unit="pixels", advanced=True
+    )
+    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = setting(0, "Seed of every random choice in finding cameras.", advanced=True)
+
+
+def run(job: Job) -> None:
+    """Write scene.json, images/, masks/, points.safetensors, verdict.json, pictures and report.json. Raises BadInput."""
+    from stages.figures.contact_sheet import write_contact_sheet
+    from stages.framing import training_frame
+    from stages.io.silhouettes import SmallPictures
+    from stages.poses.memory import refuse_large_photographs
+    from stages.verdict.writing import judge
+
+    settings: PosesSettings = job.settings
+    if job.source is None:
+        raise BadInput("the poses stage needs a source: name a folder of photographs, a video, or a posed data set.")
+    notes: list[str] = []
+
+    def warn(text: str, **facts: Any) -> None:
+        notes.append(text)
+        job.warn(text, **facts)
+
+    capture = read(job, settings, warn)
+    job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
+    refuse_large_photographs(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos])
+    small = SmallPictures()
+    capture, mask_facts = with_mask_use(job, capture, small, warn)
+    capture, written = _write_images(job, capture, warn)
+    judged = capture  # by all sparse points that its cameras were found with
+    capture = with_points_of_object(capture, small)
+    framed = training_frame.find_training_frame(
+        capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
+    )
+    _say_what_is_cut(framed.facts.get("silhouettes_cut", ()), warn)
+    splits = assign_splits(capture.photos, settings.test_every, warn)
+    world = framed.world_from_capture
+    views = _views(capture, written, splits, framed)
+    if capture.points is not None:
+        save_points(replace(capture.points, xyz=world.points(capture.points.xyz)), job.out)
+    scene = Scene(
+        kind=capture.kind,
+        views=views,
+        bounds=framed.bounds,
+        background=capture.background,
+        world_from_capture=world,
+        orbit=framed.orbit,
+        points=capture.points is not None,
+        metric=capture.metric,
+        space=framed.space,
+        forward=framed.forward,
+    )
+    save(scene, job.out)
+    judge(job, judged, scene, _may_be_renders(capture), warn)
+    _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
+    job.safe_point()
+    write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
+
+
+def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], framed: Any) -> tuple[View, ...]:
+    """Of the photographs, in the training frame."""
+    world = framed.world_from_capture
+    return tuple(
+        View(
+            image=files.image,
+            mask=files.mask,
+            split=split,
+            camera=world.camera(resized(photo.camera, files.width, files.height)),
+            source_camera=photo.camera,
+            near=float(near),
+            far=float(far),
+        )
+        for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far_planes, strict=True)
+    )
+
+
+def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
+    if names:
+        warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
+
+
+def files(source: Path, settings: PosesSettings) -> list[Path]:
+    """What the scene depends on: files of the source, and the networks that masks are made and photographs matched by."""
+    networks = [Path(path) for path in (settings.mask_model, settings.features_model, settings.matcher_model) if path != "off"]
+    return [*importers.files(source, settings), *networks]
+
+
+STAGE = Stage(name="poses", version=13, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
+
+
+def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
+    """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
+    from stages.masking.foreground import with_foreground_masks
+    from stages.masking.photographs import cameras_of_photographs, masks_made_for
+    from stages.masking.polarity import capture_kept_white
+
+    assert job.source is not None
+    possible = _formats(job, settings)
+    name = possible[0]
+    if len(possible) > 1 and possible[1:] != ["photographs"]:
+        warn(f"{job.source} is read as {name}; it could also be {', '.join(possible[1:])}. Choose with --as.")
+    if importers.IMPORTERS[name].posed:
+        capture = importers.IMPORTERS[name].read(job.source, settings)
+        for sentence in capture.warnings:
+            warn(sentence)
+        capture = capture_kept_white(job, capture)
+        made = masks_made_for(job, {photo.camera.name: photo.image for photo in capture.photos if photo.mask is None}, warn)
+        capture = replace(capture, photos=tuple(replace(photo, mask=made.get(photo.camera.name, photo.mask)) for photo in capture.photos))
+    else:
+        capture = cameras_of_photographs(job, warn)
+    if settings.mask_from == FOREGROUND:
+        capture = with_foreground_masks(job, capture, warn)
+    if settings.strict and capture.rejected:
+        which = abbreviated([f"{image} ({why})" for image, why in capture.rejected])
+        raise BadInput(f"{job.source}: {len(capture.rejected)} images cannot be used: {which}. Refused by --strict.")
+    return capture
+
+
+def _formats(job: Job, settings: PosesSettings) -> list[str]:
+    """What the source can be read as, the one to choose first; of several sources photographs alone. Raises BadInput."""
+    found: list[str] = []
+    for path in job.sources.values():
+        found = importers.candidates(path, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else [settings.format]
+        if len(job.sources) > 1 and found[0] != "photographs":
+            remedy = "Give it alone, or --as photographs, to find all cameras anew."
+            raise BadInput(f"{path}: is read as {found[0]}; of several sources photographs and videos alone can be put together. {remedy}")
+    return found
+
+
+def _format_of(capture: Capture) -> str:
+    return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
+
+
+def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
+    """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
+    from stages.framing.mask_use import doubts, find_mask_use, without_silhouette
+    from stages.masking.photographs import mask_choice
+
+    renders = _may_be_renders(capture)
+    use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, small, job.safe_point)
+    for sentence in use.sentences:
+        job.say(sentence)
+    for sentence in doubts(use):
+        warn(sentence)
+    names = set(without_silhouette(capture.photos, use.silhouettes, renders))
+    if names:
+        warn(f"{len(names)} of {len(capture.photos)} images have no silhouette, and the others do: {abbreviated(sorted(names))}. They are left out.")
+    kept = [index for index, photo in enumerate(capture.photos) if photo.camera.name not in names]
+    capture = without(capture, kept, [(name, "has no silhouette, and the others do") for name in sorted(names)])
+    if not use.silhouettes:
+        return replace(capture, background=None), use.facts
+    return replace(capture, background=WHITE, silhouettes=use.silhouettes), use.facts
+
+
+def with_points_of_object(capture: Capture, small: SmallPictures) -> Capture:
+    """Without the sparse points that lie outside of silhouettes."""
+    import numpy as np
+
+    from stages.framing.mask_use import points_of_object
+
+    if not capture.silhouettes or capture.points is None:
+        return capture
+    return replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, small))))
+
+
+def _may_be_renders(capture: Capture) -> bool:
+    return importers.IMPORTERS[_format_of(capture)].renders
+
+
+def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[Any]]:
+    """Write the working images. Returns the capture without the images that cannot be decoded, and what was written for the others."""
+    from stages.io import working_images
+    from stages.io.pictures import UnreadableImage
+    from stages.poses.memory import reading_threads
+
+    relative = working_images.image_paths([photo.camera for photo in capture.photos])
+    how: dict[str, Any] = {"max_side": job.settings.max_image_size, "silhouettes": capture.silhouettes, "may_be_empty": _may_be_renders(capture)}
+    kept: list[int] = []
+    written = []
+    failed: list[tuple[str, str]] = []
+    remarks: list[str] = []
+
+    def write(index: int) -> working_images.Written | UnreadableImage:
+        try:
+            return working_images.write(capture.photos[index], job.out, relative[index], **how)
+        except UnreadableImage as error:
+            return error
+
+    threads = reading_threads(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos], count_cores())
+    for index, found in enumerate(in_order(write, range(len(capture.photos)), threads, job.safe_point)):
+        job.progress(index, len(capture.photos), "preparing images")
+        if isinstance(found, UnreadableImage):
+            failed.append((capture.photos[index].camera.name, str(found)))
+        else:
+            written.append(found)
+            remarks += found.warnings
+            kept.append(index)
+    job.progress(len(capture.photos), len(capture.photos), "preparing images")
+    if failed:
+        sentence = f"{len(failed)} of {len(capture.photos)} images cannot be used: {abbreviated([f'{name} {reason}' for name, reason in failed])}."
+        if len(kept) < MIN_IMAGES or job.settings.strict:
+            why = "Refused by --strict." if len(kept) >= MIN_IMAGES else f"{len(kept)} remain; at least {MIN_IMAGES} are needed."
+            raise BadInput(f"{job.source}: {sentence} {why} Copy or convert them again, or take them out.")
+        warn(f"{sentence} They are left out.")
+    for sentence in [*remarks[:3], *([f"... and {len(remarks) - 3} more remarks like these."] if len(remarks) > 3 else [])]:
+        warn(sentence)
+    return without(capture, kept, failed), written
+
+
+def only(points: SparsePoints, kept: np.ndarray) -> SparsePoints:
+    """The points of these indices."""
+    return SparsePoints(points.xyz[kept], points.rgb[kept], points.error[kept], tuple(points.tracks[index] for index in kept.tolist()) if points.tracks else ())
+
+
+def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: None) -> list[str]:
+    """The split of each photo: the source's where it states validation or test images, else every n-th in sorted order is a test image.
+
+    At least 2 are left for training, whatever the source states.
+    """
+    given = [photo.split for photo in photos]
+    if any(split in ("val", "test") for split in given):
+        splits = [split or "train" for split in given]
+        if splits.count("train") >= 2:
+            unlisted = given.count(None)
+            if unlisted:
+                warn(f"{unlisted} images are in none of the splits that the source states; they are used for training.")
+            return splits
+        warn(f"The source states {splits.count('train')} images for training; at least 2 are needed, and its split is not used.")
+    order = sorted(range(len(photos)), key=lambda index: photos[index].camera.name)
+    test = set(order[::every][: max(0, len(photos) - 2)])
+    return ["test" if index in test else "train" for index in range(len(photos))]
+
+
+def _write_report(path: Path, capture: Capture, scene: Scene, facts: dict[str, dict[str, object]], notes: Sequence[str]) -> None:
+    """Images used and rejected, splits, facts and warnings."""
+    report = {
+        "kind": capture.kind,
+        "registered": [
+            {"name": view.name, "split": view.split, "image": view.image, "mask": view.mask, "size": [view.camera.width, view.camera.height]}
+            for view in scene.views
+        ],
+        "rejected": [{"name": name, "reason": reason} for name, reason in capture.rejected],
+        "splits": {split: count for split, count in Counter(view.split for view in scene.views).items() if split in SPLITS},
+        "reprojection_error": capture.reprojection_error,
+        "points": 0 if capture.points is None else len(capture.points.xyz),
+        "background": capture.background,
+        **facts,
+        "facts": capture.facts,
+        "warnings": list(notes),
+    }
+    write_json(path, report, default=str)

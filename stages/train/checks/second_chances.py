@@ -1,0 +1,152 @@
+"""Second chances: what is known to rescue captures, tried by short trainings where a run learns nothing.
+
+Each trial leaves out one of the priors that keep density away, or lets training correct what photographs and cameras have wrong. All begin from nothing, draw
+the same pixels, and are compared on the same pixels of the same held-out views. A trial is small enough that one which a kill cut short is done again; those
+that are finished are not. docs/experiments/early-check.md
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.training.settings import TrainSettings
+from pipeline.stage import Job
+from stages.artifacts import PosesOutputs
+from stages.scratch import note, noted
+from stages.train.checks.early_check import EarlyResult, HeldOutView, judge
+from stages.train.choices import TrainingChoices
+
+if TYPE_CHECKING:
+    from efficientnerf.training.pixels import Pixels
+    from efficientnerf.training.sparse_depth import SparseDepthRays
+    from stages.io.scene import Scene, View
+
+# docs/experiments/early-check.md
+SMALL = TrainSettings(
+    iterations=300, sample_batch_size=16384, log2_hashmap_size=15, finest_resolution=512, occupancy_resolution=96, occupancy_warmup_steps=64,
+)  # fmt: skip
+BETTER = 0.2  # of the way from the mean colour to the blurred photograph: what a trial has to be ahead by
+LOWER = 0.8  # of a near plane: what is lowered by less changes nothing
+AS_STATED = "as stated"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a short training with other choices came to."""
+
+    name: str
+    choices: TrainingChoices
+    result: EarlyResult
+
+
+def candidates(s: Scene, settings: TrainSettings) -> dict[str, TrainingChoices]:
+    """The choices that would change anything, by what a user reads of them; first what is stated."""
+    own = TrainingChoices()
+    found, priors = {AS_STATED: own}, own
+    if s.forward is None and settings.near_plane == "auto":
+        if _lowers(replace(own, near="median"), s):
+            found["near planes at most their median"] = replace(own, near="median")
+        if _lowers(replace(own, near="off"), s):
+            found["near planes off"] = priors = replace(own, near="off")
+    if any(view.mask is not None for view in s.views):
+        found["masks ignored"] = replace(own, masks=False)
+        priors = replace(priors, masks=False)
+    if s.contracted and settings.min_views != "off":
+        found["min_views off"] = replace(own, min_views=False)
+        priors = replace(priors, min_views=False)
+    if priors not in found.values():
+        found["all of these off"] = priors
+    if s.background is None and settings.exposure != "on":
+        found["exposure"] = replace(own, exposure=True)
+    if settings.camera_refinement != "on":
+        found["camera refinement"] = replace(own, camera_refinement=True)
+    return found
+
+
+def _lowers(choices: TrainingChoices, s: Scene) -> bool:
+    """Whether any near plane becomes much lower."""
+    return any(new.near < LOWER * old.near for new, old in zip(choices.scene(s).views, s.views, strict=True))
+
+
+def try_all(job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView]) -> list[Trial]:
+    """A trial of each candidate, in their order."""
+    from stages.train.data import sparse_depth_of
+
+    trials, depth = [], sparse_depth_of(job.inputs[PosesOutputs.stage], s, settings.seed)
+    for number, (name, choices) in enumerate(candidates(s, settings).items()):
+        path = job.work / f"trial_{number}.json"
+        trial = noted(path, Trial, job.warn)
+        if trial is None or (trial.name, trial.choices) != (name, choices):
+            result = _train(job, choices.scene(s), choices.settings(settings), pixels, held, depth, name)
+            if result is None:
+                continue
+            trial = Trial(name, choices, result)
+            note(path, asdict(trial))
+        job.say(f"second chance, {name}: {trial.result.psnr:.2f} dB after {SMALL.iterations} small steps", trial=asdict(trial))
+        trials.append(trial)
+    return trials
+
+
+def finished(job: Job) -> list[Trial]:
+    """The trials that this run has finished, in their order."""
+    return [trial for path in sorted(job.work.glob("trial_*.json")) if (trial := noted(path, Trial, job.warn)) is not None]
+
+
+def best_of(trials: Sequence[Trial]) -> Trial | None:
+    """The trial that is clearly better than what is stated; None: none is. Of those that are about as good the first: it changes least."""
+    stated = next((trial for trial in trials if trial.name == AS_STATED), None)
+    if stated is None:
+        return None
+    most = max(trial.result.progress for trial in trials)
+    best = next(trial for trial in trials if trial.result.progress >= most - BETTER / 4)
+    return best if best.result.progress >= stated.result.progress + BETTER else None
+
+
+def _train(
+    job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView], depth: SparseDepthRays | None, name: str
+) -> EarlyResult | None:
+    """A short training on a scene, and what it comes to; None where no pixel can be compared, or masks leave none to train on."""
+    from efficientnerf.model import model
+    from efficientnerf.rendering.field_renderer import FieldRenderer
+    from efficientnerf.training import loop
+    from stages.framing.view_coverage import kept_pixels
+    from stages.io.field_file import space_of
+    from stages.io.scene import views_of
+    from stages.train.data import depth_range
+    from stages.train.exposure import begin_exposure
+    from stages.train.priors import filled_points, mask_cells_by
+
+    views, small = views_of(s, "train"), _small(settings)
+    own = _with_views(pixels, views)
+    near, far = depth_range(s, own, small)
+    m = model(space_of(s), small, s.background, job.device, (near, far))
+    cameras, folder = [view.camera for view in views], job.inputs[PosesOutputs.stage]
+    mask_cells_by(m, cameras, own.near.tolist(), kept_pixels(folder, views), filled_points(folder, len(views)))
+    exposure = begin_exposure(folder, s, own, small.exposure, job.device)
+    for done in loop.train(loop.trainer(m, exposure, cameras=cameras), own, depth):
+        job.reached(done.step, small.iterations, f"second chance, {name}")
+    return judge(held, lambda camera: FieldRenderer(m, near, far).render(camera).colour, small.iterations)
+
+
+def _small(settings: TrainSettings) -> TrainSettings:
+    """The settings of a trial: of those that are given the ones that say what is learned, not how much of it."""
+    kept = ("seed", "near_plane", "far_plane", "min_views", "exposure", "camera_refinement", "background_color")
+    return replace(SMALL, **{name: getattr(settings, name) for name in kept})
+
+
+def _with_views(pixels: Pixels, views: Sequence[View]) -> Pixels:
+    """The same pixels with the near planes, masks and cameras of these views, whatever the training that failed made of them; the bytes are shared."""
+    own = copy.copy(pixels)
+    own.near = np.array([view.near for view in views], np.float32)
+    if all(view.mask is None for view in views):
+        own.allowed = None
+    own.leave_out(np.zeros(len(views), bool))
+    poses = np.array([view.camera.world_from_camera for view in views], np.float32)
+    if not (np.array_equal(own.rotation, poses[:, :3, :3]) and np.array_equal(own.centre, poses[:, :3, 3])):
+        own.set_cameras([view.camera for view in views])
+    return own

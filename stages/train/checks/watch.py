@@ -1,0 +1,150 @@
+"""What follows where the early check finds that nothing is learned: `train.on_failure`.
+
+What was found and decided is noted in the scratch folder, so that a run that is killed anywhere ends with the same bytes: the check's result, each trial's, and
+last what was chosen. The checkpoints of the training that failed are removed before that is noted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import StageFailed
+from pipeline.files import remove
+from pipeline.stage import Job
+from stages.scratch import note, noted
+from stages.train import budget
+from stages.train.checks.early_check import EarlyResult, check_step, held_out_views, judge
+from stages.train.checks.second_chances import best_of, finished, try_all
+from stages.train.choices import TrainingChoices, write
+
+if TYPE_CHECKING:
+    from efficientnerf.geometry.cameras import Camera
+    from efficientnerf.training.pixels import Pixels
+    from stages.io.scene import Scene
+
+DECIDED = "second_chances.json"
+REMEDY = "Look at the cameras and the photographs in the report, and try poses.masks=ignore where there are masks."
+
+
+@dataclass(frozen=True)
+class _Decision:
+    """
+    chosen   name of the trial whose choices training begins again with; None: it goes on as it is
+    choices  of that trial
+    seconds  that were trained in vain
+    """
+
+    chosen: str | None
+    choices: TrainingChoices
+    seconds: float
+
+
+class Watch:
+    """Watches a training run for whether anything is learned.
+
+    scene, settings  what is to be trained with: as they are given, or with what was chosen after an earlier training had failed
+    seconds          of that earlier training
+    """
+
+    def __init__(self, job: Job, stated: Scene, folder: Path) -> None:
+        """
+        stated  the scene, as the poses stage left it in `folder`
+        """
+        self.job, self.stated, self.folder = job, stated, folder
+        self.decision = noted(job.work / DECIDED, _Decision, job.warn)
+        self.choices = TrainingChoices() if self.decision is None else self.decision.choices
+        self.scene, self.settings = self.choices.scene(stated), self.choices.settings(job.settings)
+        self.seconds = 0.0 if self.decision is None or not self.again else self.decision.seconds
+        self.notes = [job.work / "early_check.json", *([job.work / "early_check_again.json"] if self.again else [])]
+        self.results = [noted(path, EarlyResult, job.warn) for path in self.notes]
+
+    @property
+    def again(self) -> bool:
+        """Whether an earlier training failed, and this one has other choices."""
+        return self.choices != TrainingChoices()
+
+    def begins_again(
+        self, render: Callable[[Camera], np.ndarray], pixels: Pixels, save: Callable[[], object], step: int, iterations: int, seconds: float
+    ) -> bool:
+        """Whether training has to begin again with other choices, which are noted; to be called before the first step of an attempt, and after each.
+
+        render   colours (H, W, 3) that a camera sees of the field
+        pixels   of the training views
+        save     writes a checkpoint
+        seconds  trained so far
+
+        StageFailed where nothing is learned and `train.on_failure=stop`.
+        """
+        if self.results[-1] is None:
+            due = check_step(iterations)
+            if due is None or step < due:
+                return False
+            self._look(step, render)
+        result = self.results[-1]
+        if result is None or result.learning or self.decision is not None:
+            return False
+        if self.job.settings.on_failure == "stop":
+            raise StageFailed(f"train: {_in_words(result)}. {REMEDY} train.on_failure=continue goes on all the same.")
+        if self.job.settings.on_failure == "continue":
+            return False
+        if step:
+            save()
+        return self._decide(pixels, seconds)
+
+    def _look(self, step: int, render: Callable[[Camera], np.ndarray]) -> None:
+        """Compare with the held-out views, and note what is found."""
+        result = judge(held_out_views(self.folder, self.stated), render, step)
+        if result is None:
+            return
+        self.results[-1] = result
+        note(self.notes[-1], asdict(result))
+        if result.learning:
+            return
+        follows = {"retry": " Trying what has helped others." if not self.again else "", "continue": "", "stop": ""}
+        self.job.warn(f"{_in_words(result)}.{follows[self.job.settings.on_failure]}", early_check=asdict(result))
+
+    def _decide(self, pixels: Pixels, seconds: float) -> bool:
+        """Try second chances; whether one of them is clearly better."""
+        trials = try_all(self.job, self.stated, self.job.settings, pixels, held_out_views(self.folder, self.stated))
+        best = best_of(trials)
+        self.decision = _Decision(None, TrainingChoices(), seconds) if best is None else _Decision(best.name, best.choices, seconds)
+        if best is None:
+            self.job.warn(f"none of {len(trials) - 1} second chances is clearly better than what is stated; training goes on. {REMEDY}")
+        else:
+            self._clear()
+            self.job.warn(f"training begins again with {best.name}: {best.result.psnr:.2f} dB in its short training, {trials[0].result.psnr:.2f} as stated")
+        note(self.job.work / DECIDED, asdict(self.decision))
+        return best is not None
+
+    def _clear(self) -> None:
+        """Remove what the training that failed left to go on from."""
+        for pattern in ("checkpoint_*.safetensors", "preview_*.png", budget.FILE):
+            for path in self.job.work.glob(pattern):
+                remove(path)
+
+    def write_choices(self, path: Path) -> None:
+        """Write what later stages need to know, where anything was chosen, and what was found into the manifest."""
+        self.job.record("early_check", self.report())
+        if self.again:
+            write(self.choices, path)
+
+    def report(self) -> dict[str, Any]:
+        """For report.json, and the manifest."""
+        trials = [] if self.decision is None else finished(self.job)
+        checks = [noted(path, EarlyResult, self.job.warn) for path in self.notes]
+        table = [{"name": trial.name, **asdict(trial.result)} for trial in trials]
+        return {
+            "early_check": [asdict(check) | {"learning": check.learning} for check in checks if check is not None],
+            "second_chances": table,
+            "chosen": None if self.decision is None else self.decision.chosen,
+        }
+
+
+def _in_words(result: EarlyResult) -> str:
+    plain = f"one colour comes to {result.mean_colour_psnr:.2f} dB, a blurred photograph to {result.blurred_psnr:.2f}"
+    return f"nothing has been learned in {result.step} steps: held-out views are rendered at {result.psnr:.2f} dB, where {plain}"

@@ -1,0 +1,176 @@
+"""What a scene gives training: pixels with their rays, near and far planes, and sparse depth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.settings import given
+from efficientnerf.training.settings import TrainSettings
+from stages.scratch import Warn
+
+if TYPE_CHECKING:
+    from efficientnerf.training.pixels import PixelRows, Pixels
+    from efficientnerf.training.sparse_depth import SparseDepthRays
+    from stages.io.scene import Scene, View
+
+MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
+MOST_OBSERVATIONS = 2**20  # of sparse points that are used; of more, those of points drawn at random
+POINTS_AT_ONCE = 2**16  # observed by equally many, whose cameras are compared
+CUT_SHARE = 0.25  # of a view's range that stated planes leave out, from which that is said: the corners of the scene bounds are mostly empty
+GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their whole parts, fill an interval evenly
+MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
+
+
+def with_camera_refinement(settings: TrainSettings, s: Scene) -> TrainSettings:
+    """The settings with "on" or "off" for `camera_refinement`."""  # docs/experiments/photographs.md
+    choice = "off" if settings.camera_refinement == "auto" else settings.camera_refinement
+    return replace(settings, camera_refinement=choice)
+
+
+def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None, trained: Path | None = None) -> Pixels:
+    """All pixels of some views of a scene, as bytes; one image at a time is held beside them.
+
+    rows     where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
+    trained  of the stage train, where it learned the photographs' exposure: they are as if all had been exposed alike; None: as they are
+    """
+    from efficientnerf.training.pixels import Pixels
+    from stages.io import scene
+    from stages.train.averaged import averaged_views, exposures_of
+
+    images = (scene.read_image(folder, view) for view in views)
+    masks = (scene.read_mask(folder, view) for view in views)
+    if trained is not None and exposures_of(trained) is not None:
+        read = averaged_views(folder, trained)
+        images, masks = (read(view)[0] for view in views), (read(view)[1] for view in views)
+    near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
+    return Pixels([view.camera for view in views], images, masks, near, far, channels_of(folder, views), rows)
+
+
+def count_pixels(views: tuple[View, ...]) -> int:
+    """Pixels of all views."""
+    return sum(view.camera.width * view.camera.height for view in views)
+
+
+def channels_of(folder: Path, views: tuple[View, ...]) -> int:
+    """3, or 4 where any view has alpha."""
+    from stages.io import scene
+
+    return 4 if any(scene.has_alpha(folder, view) for view in views) else 3
+
+
+def depth_range(s: Scene, pixels: Pixels, settings: TrainSettings, warn: Warn = lambda text: None) -> tuple[float, float]:
+    """Nearest and farthest of all views along their axes; where the settings state planes these, which are set for the pixels too.
+
+    warn  is told where the planes that are stated cut into most views' range
+    """
+    if (settings.near_plane, settings.far_plane) != ("auto", "auto"):
+        near, far = stated_planes(s, settings)
+        compare_with_views(s, near, far, warn)
+        pixels.near[:], pixels.far[:] = near, far
+        return near, far
+    return min(view.near for view in s.views), max(view.far for view in s.views)
+
+
+def stated_planes(s: Scene, settings: TrainSettings) -> tuple[float, float]:
+    """train.near_plane and train.far_plane in the training frame; UsageError where the scene has none, or they are not in order."""
+    from pipeline.errors import UsageError
+
+    if s.background is None:
+        raise UsageError("train.near_plane and train.far_plane are for scenes on a constant background; this one is unbounded. Leave them auto.")
+    if s.contracted:
+        raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
+    refuse_planes_out_of_order(settings)
+    near, far = given(settings.near_plane), given(settings.far_plane)
+    assert near is not None
+    assert far is not None
+    return near * float(s.world_from_capture.scale), far * float(s.world_from_capture.scale)
+
+
+def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
+    """UsageError where the stated planes, in the training frame, leave out all of what the views have of the scene: the field would be empty. A warning where
+    they leave out more than CUT_SHARE of it in most views."""
+    from pipeline.errors import UsageError
+
+    first, last = np.array([(view.near, view.far) for view in s.views], np.float64).T
+    scale = float(s.world_from_capture.scale)
+    stated, own = (f"{a / scale:.3g} to {b / scale:.3g}" for a, b in ((near, far), (first.min(), last.max())))
+    ranges = f"train.near_plane and train.far_plane are {stated} in the capture's units, and the scene lies {own} before the cameras"
+    inside = np.minimum(last, far) - np.maximum(first, near)
+    if (inside <= 0).all():
+        raise UsageError(f"{ranges}: rays would miss all of it. Leave both auto, or state planes around it.")
+    if np.median(inside / (last - first)) < 1 - CUT_SHARE:
+        warn(f"{ranges}: rays miss a part of it. Leave both auto, or state planes around it.")
+
+
+def refuse_planes_out_of_order(settings: TrainSettings) -> None:
+    """UsageError where one of train.near_plane and train.far_plane is stated without the other, for N_c samples lie between both; or where they are not in
+    order."""
+    from pipeline.errors import UsageError
+
+    near, far = given(settings.near_plane), given(settings.far_plane)
+    if near is None and far is None:
+        return
+    if near is None or far is None or near >= far:
+        found = f"train.near_plane={settings.near_plane}, train.far_plane={settings.far_plane}"
+        raise UsageError(f"{found}: expected two numbers, the second one greater, or auto for both.")
+
+
+def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | None:
+    """Rays to the sparse points that are registered in training images, from the cameras of these and from between each and the nearest of the others that see
+    the point, where held-out views may lie and nothing else keeps fog away; None: there are none.
+
+    Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
+    or in it, too. Where they are observed more than `MOST_OBSERVATIONS` times, `seed` draws the points.
+    """
+    from efficientnerf.training.sparse_depth import SparseDepthRays
+    from stages.io import scene
+
+    if not s.points:
+        return None
+    xyz, counts, observers = scene.read_observations(folder)
+    in_training = np.array([view.split == "train" for view in s.views])
+    centres = np.array([view.camera.centre for view in s.views])
+    tracked = counts >= min(MIN_TRACK, int(in_training.sum()))
+    if counts[tracked].sum() > MOST_OBSERVATIONS:
+        order = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0])).permutation(np.flatnonzero(tracked))
+        tracked[order[np.cumsum(counts[order]) > MOST_OBSERVATIONS]] = False
+    used = np.repeat(tracked, counts) & in_training[observers]
+    if not used.any():
+        return None
+    point, view = np.repeat(np.arange(len(counts)), counts)[used], observers[used]
+    offset = xyz[point] - centres[view]
+    distance = np.linalg.norm(offset, axis=1)
+    forward = np.array([v.camera.forward for v in s.views])
+    before = (offset * forward[view]).sum(1) > MIN_DISTANCE  # so is the distance; what is not a number is not before anything
+    if not before.any():
+        return None
+    point, view = point[before], view[before]
+    origins = np.concatenate([centres[view], _between(point, view, centres)])
+    offset = np.concatenate([xyz[point]] * 2) - origins
+    distance = np.linalg.norm(offset, axis=1)
+    return SparseDepthRays(origins.astype(np.float32), (offset / distance[:, None]).astype(np.float32), distance.astype(np.float32))
+
+
+def _between(point: np.ndarray, view: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """(A, 3) for each observation of a point by a view, in the order of the points, a place on the way from its camera to the nearest other one that observes
+    the same point; the camera itself where there is none. Both see the point, so that what lies between these three is most likely empty."""
+    origins = centres[view]
+    first = np.flatnonzero(np.diff(point, prepend=-1))
+    count = np.diff(np.append(first, len(point)))
+    for k in np.unique(count[count > 1]).tolist():
+        alike = first[count == k]
+        each = max(1, POINTS_AT_ONCE // k**2)
+        for begin in range(0, len(alike), each):
+            rows = alike[begin : begin + each, None] + np.arange(k)  # (n, k)
+            own = centres[view[rows]]
+            apart = np.linalg.norm(own[:, :, None] - own[:, None], axis=-1)
+            apart[apart == 0] = np.inf
+            other = np.where(np.isfinite(apart.min(axis=2)), apart.argmin(axis=2), np.arange(k))
+            share = (GOLDEN * (1 + rows) % 1)[..., None]
+            origins[rows] += share * (np.take_along_axis(own, other[..., None], axis=1) - own)
+    return origins

@@ -1,0 +1,169 @@
+"""What training takes. docs/experiments/memory.md"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.settings import given
+from efficientnerf.training.settings import TrainSettings
+from pipeline.executors.memory import size_text
+from pipeline.stage import Job
+from stages.artifacts import PosesOutputs
+from stages.io.scene import View
+from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
+from stages.train.data import MOST_OBSERVATIONS, channels_of, count_pixels
+
+if TYPE_CHECKING:
+    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.training.pixels import PixelRows
+
+PIXELS = "training pixels"
+# Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes;
+# sparse points, over those of their file, and an observation of one that is used: its rays and what they are made of.
+DIRECTION, DENSITY_VOXEL = 220, 26
+TABLES, SAVED = 4, 6  # of float32 for each parameter: itself, its gradient, Adam's moments; and while a checkpoint is written, three of these twice
+POINTS, OBSERVATION = 4, 250
+DECODED = 3  # images at a time while they are read: as decoded, and as they are put in rows
+
+
+def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict[str, int]:
+    """The terms of `efficientnerf.training.pixels.Pixels`.
+
+    stored  whether the pixels are in a file
+    """
+    from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE
+
+    cameras = [view.camera for view in views]
+    total = count_pixels(tuple(views))
+    lenses = {(camera.width, camera.height, camera.model, camera.params) for camera in cameras}
+    every = 1 if sum(width * height for width, height, *_ in lenses) <= EXACT else STRIDE
+    knots = [(width // every + 2) * (height // every + 2) for width, height, *_ in lenses]
+    # Bits of all pixels, and the numbers of those that are listed.
+    masks = total // 8 + int(4 * LISTED_SHARE * total) if any(view.mask is not None for view in views) else 0
+    largest = max(camera.width * camera.height for camera in cameras)
+    return {
+        PIXELS: (0 if stored else total * channels) + masks,
+        "reading images": DECODED * channels * largest,
+        "directions of pixels": 12 * sum(knots) + DIRECTION * max(knots),
+    }
+
+
+def parameters(settings: TrainSettings) -> int:
+    """Parameters of both fields, about."""
+    from efficientnerf.fields.hash import FEATURES, grids, level_sizes
+
+    hidden = settings.num_layers * settings.hidden_dim**2 + settings.coarse_num_layers * settings.coarse_hidden_dim**2
+    if settings.field != "hash":
+        return hidden
+    return hidden + FEATURES * sum(sum(level_sizes(**grid)[1]) for grid in grids(settings))
+
+
+def samples_of(settings: TrainSettings, intervals: int) -> int:
+    """Samples of a step at most, about.
+
+    intervals  on a ray, at most
+    """
+    fine = settings.max_pivots * settings.samples_per_pivot if settings.sampling == "efficient" else settings.num_importance_samples
+    most = settings.max_rays_per_batch * (intervals + fine)
+    return most if settings.sample_batch_size == "off" else min(most, 2 * settings.sample_batch_size)
+
+
+def sample_bytes(settings: TrainSettings) -> int:
+    """Of a sample while a step is taken: what is kept for the way back. Kernels of hash grids keep features and outputs; other fields keep each layer."""
+    outputs = 1 + 3 * (settings.sh_degree + 1) ** 2
+    if settings.field == "hash":
+        return 4 * (4 * settings.num_levels + 6 * outputs + 32)
+    return 2 * settings.hidden_dim * settings.num_layers + 4 * (4 * 63 + 6 * outputs + 32)
+
+
+def needed(
+    settings: TrainSettings, views: Sequence[View], channels: int, intervals: int, voxels: int, *, stored: bool, device: str = "cpu", points: int = 0
+) -> Need:
+    """What training takes.
+
+    settings   with numbers for what is "auto" (`stages.train.hash_resolution`)
+    channels   of the pixels
+    intervals  on a ray, at most
+    voxels     D, density voxels along a side
+    stored     whether the pixels are in a file
+    points     bytes of the file of sparse points
+    """
+    pixels = pixels_needed(views, channels, stored=stored)
+    reading = pixels["reading images"] + pixels["directions of pixels"]
+    step = samples_of(settings, intervals) * sample_bytes(settings)
+    return Need({
+        PIXELS: pixels[PIXELS],
+        "a step's samples, or reading images": max(step, reading),
+        "parameters and checkpoints": 4 * (TABLES + SAVED) * parameters(settings),
+        "density voxels": DENSITY_VOXEL * voxels**3,
+        "sparse points": POINTS * points + OBSERVATION * min(MOST_OBSERVATIONS, points // 8),
+        "libraries": libraries(device),
+    })  # fmt: skip
+
+
+def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, remedy: str, *, stored: bool) -> PixelRows | None:
+    """Where the training pixels are put: None for memory, or a file in the scratch folder. Raises UsageError where the need does not fit.
+
+    need    with the pixels there
+    remedy  as for `refuse_what_does_not_fit`
+    stored  whether in a file
+    """
+    from stages.train.pixel_file import PixelFile
+
+    refuse_what_does_not_fit(job, need, remedy)
+    if not stored:
+        return None
+    pixels = count_pixels(tuple(views))
+    job.warn(
+        f"the training pixels, {size_text(pixels * channels)}, are kept in a file, for they do not fit into memory beside the rest: reading them takes longer."
+        " Give more by --memory, or lower poses.max_image_size."
+    )
+    return PixelFile(pixels, channels, job.work)
+
+
+def rows_for_training(job: Job, folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space) -> PixelRows | None:
+    """`place_pixels` for the stage train; `settings` as for `needed`."""
+    here, there = (training_needed(folder, views, settings, space, stored=stored, device=job.device) for stored in (False, True))
+    stored = not has_room(job, here)
+    tables = f"train.log2_hashmap_size ({settings.log2_hashmap_size}), " if settings.field == "hash" else ""
+    batch = "train.max_rays_per_batch" if settings.sample_batch_size == "off" else "train.sample_batch_size"
+    remedy = f"Lower {tables}{batch} ({getattr(settings, batch[6:])}) or poses.max_image_size."
+    return place_pixels(job, there if stored else here, views, channels_of(folder, views), remedy, stored=stored)
+
+
+def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space, *, stored: bool, device: str) -> Need:
+    """What the stage train takes; `settings` and `stored` as for `needed`.
+
+    folder  of the scene
+    """
+    coarse_samples = given(settings.num_coarse_samples) or space.num_coarse_samples
+    intervals = space.max_intervals(space.sampled_length(None) / coarse_samples)
+    voxels = given(settings.occupancy_resolution) or space.occupancy_resolution
+    file = PosesOutputs(folder).points
+    points = file.stat().st_size if file.is_file() else 0
+    return needed(settings, views, channels_of(folder, views), intervals, voxels, stored=stored, device=device, points=points)
+
+
+FIELD_SAMPLES = 300  # bytes of a ray in which a first training's subject is looked for
+
+
+def first_training_needed(count: int, side: int, settings: TrainSettings, rays: int) -> Need:
+    """What a first quick training of so many photographs takes, from which silhouettes are made.
+
+    side      of the photographs at most, pixels
+    settings  without "auto" where `stages.train.hash_resolution` has numbers
+    rays      in which the subject is looked for
+    """
+    import numpy as np
+
+    from efficientnerf.geometry.spaces import space_from
+
+    space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=True)
+    camera = Camera("", side, side, "SIMPLE_PINHOLE", (side, side / 2, side / 2), np.eye(4))
+    intervals = space.max_intervals(space.sampled_length(None) / (given(settings.num_coarse_samples) or space.num_coarse_samples))
+    view = View("", None, "train", camera, camera, 0.1, 1.0)
+    need = needed(settings, [view] * count, 3, intervals, given(settings.occupancy_resolution) or space.occupancy_resolution, stored=False)
+    return Need({**need.terms, "samples of the field": FIELD_SAMPLES * rays})

@@ -1,0 +1,209 @@
+"""The train stage: a scene in, a trained field out.
+
+field.safetensors  both fields, the density voxels, what they mean; the schedule; the exposure of photographs where it was learned
+cameras.json       the training cameras, where they were refined or replaced, and the views that were left out
+choices.json       what training did otherwise than the scene and the settings state, where it learned nothing with them
+wrong_views.png    photographs and renders of these views
+report.json        steps and seconds
+log.jsonl          a line every few steps
+curve.png          PSNR over steps
+previews/          renders of a validation view
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.settings import given
+from efficientnerf.training.settings import TrainSettings
+from pipeline.errors import UsageError
+from pipeline.stage import Job, Stage
+from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
+from stages.compiling import clock, compiling_kernels
+from stages.cores import use_all_cores
+from stages.train.budget import UNKNOWN, Budget, training_budget
+from stages.train.checkpoints import Checkpoints
+from stages.train.checks.watch import Watch
+from stages.train.checks.wrong_views import cameras_of, draw_wrong_views, findings_of, left_out_of, train_and_check
+from stages.train.data import count_pixels, depth_range, pixels_of, refuse_planes_out_of_order, sparse_depth_of, with_camera_refinement
+from stages.train.exposure import begin_exposure, exposure_facts, saved_exposure
+from stages.train.log import TrainLog
+from stages.train.previews import Previews
+from stages.train.priors import Prior, mask_uncovered_cells
+
+if TYPE_CHECKING:
+    from efficientnerf.geometry.cameras import Camera
+    from efficientnerf.rendering.field_renderer import FieldRenderer
+    from efficientnerf.training.loop import Trainer
+    from efficientnerf.training.sparse_depth import SparseDepthRays
+    from stages.io.scene import Scene, View
+
+
+@compiling_kernels
+def run(job: Job) -> None:
+    while not trained(job):
+        pass
+
+
+def trained(job: Job) -> bool:
+    """Train and write the outputs; False where training has to begin again, with what `stages.train.checks.watch` has chosen."""
+    began = clock()
+    from efficientnerf.model import model
+    from efficientnerf.rendering.field_renderer import FieldRenderer
+    from efficientnerf.training import loop
+    from efficientnerf.training.readback import AsyncOccupancy
+    from stages.io import field_file, scene
+    from stages.train.hash_resolution import with_auto_sizes
+    from stages.train.memory import rows_for_training
+
+    use_all_cores()
+    folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
+    s = (watch := Watch(job, scene.load(folder), folder)).scene
+    views = scene.views_of(s, "train")
+    settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views)), s), field_file.space_of(s)
+    job.progress(0, settings.iterations, "reading images")
+    pixels = pixels_of(folder, views, rows_for_training(job, folder, views, settings, space))
+    near, far = depth_range(s, pixels, settings, job.warn)
+    exposure = begin_exposure(folder, s, pixels, settings.exposure, job.device, job.say)
+    m = model(space, replace(settings, exposure="off" if exposure is None else "on"), s.background, job.device, (near, far))
+    priors = mask_uncovered_cells(m, views, job)
+
+    t = loop.trainer(m, exposure, cameras=[view.camera for view in views])
+    checkpoints = Checkpoints(job)
+    spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
+    log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
+    render = partial(colours_seen, FieldRenderer(m, near, far))
+    previews = Previews(render, m.background, folder, s, job.work, given(settings.preview_every))
+    previews.draw_when_due(t.step)
+    budget = begin_budget(job, t, watch.seconds + spent + clock() - began)
+    fails = partial(watch.begins_again, render, pixels, partial(checkpoints.save, t, log))
+    if fails(t.step, t.schedule.iterations, log.seconds):
+        return False
+
+    log.begin_step()
+    for done in train_and_check(job, t, pixels, s, lambda scene_now: sparse_depth(job, folder, scene_now, settings)):
+        log.end_step(done)
+        if budget is not None:
+            follow_budget(job, t, budget)
+        last = done.step == t.schedule.iterations
+        goal = t.schedule.iterations if budget is None else budget.goal
+        psnr = previews.draw_when_due(done.step)
+        shown = log.record(done, goal, psnr, last=last) | previews.figures
+        job.progress(min(done.step, goal), goal, "training", **shown)
+        if psnr is not None:
+            log.draw_curve(job.work / TrainOutputs.curve)
+        if not last and fails(done.step, t.schedule.iterations, log.seconds):
+            return False
+        checkpoints.reach(t, log, every=settings.checkpoint_every, last=last)
+        log.begin_step()
+    log.flush()
+    field_file.save_model(m, near, far, outputs.field, saved_exposure(t.exposure, s), t.schedule)
+    write_cameras(outputs, t, views, folder, FieldRenderer(m, near, far))
+    watch.write_choices(outputs.choices)
+    write_report(outputs.report, job, t, log.seconds, previews.figures | watch.report() | {"wrong_views": findings_of(t, views)}, priors)
+    shutil.copyfile(log.path, outputs.log)
+    log.draw_curve(outputs.curve)
+    previews.publish(outputs.previews, job.warn)
+    return True
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where near and far planes are stated that cannot be used."""
+    own, poses = settings["train"], settings.get("poses")
+    refuse_planes_out_of_order(own)
+    if own.far_plane != "auto" and poses is not None and poses.space == "contracted":
+        raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
+
+
+def colours_seen(renderer: FieldRenderer, camera: Camera) -> np.ndarray:
+    """Colours (H, W, 3) that a camera sees."""
+    return renderer.render(camera).colour
+
+
+def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> SparseDepthRays | None:
+    """Rays to sparse points. It is said where there are points and none of them can be used."""
+    found = sparse_depth_of(folder, s, settings.seed)
+    if found is None and s.points and settings.sparse_depth_loss_weight > 0:
+        job.say("no sparse point lies before enough of the training cameras that observe it: train.sparse_depth_loss_weight has no effect")
+    return found
+
+
+def begin_budget(job: Job, t: Trainer, spent: float) -> Budget | None:
+    """The budget, so many seconds of which are spent, and its schedule for the trainer; None where there is none."""
+    if job.settings.time_budget == "off":
+        return None
+    budget = training_budget(t.model.settings, job.work, spent, clock, job.warn)
+    t.schedule = budget.schedule
+    return budget
+
+
+def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
+    """Take over the budget's schedule where a step has changed it."""
+    before, known = budget.schedule.iterations, budget.known
+    if budget.after(t.step):
+        t.schedule = budget.schedule
+        rest = f" (so far: {before})" if known else ""
+        job.say(f"{t.schedule.iterations} steps fit into the budget of {job.settings.time_budget} s{rest}")
+
+
+def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
+    """The training cameras, where they were refined or replaced, the views that were left out, and what these two show; `folder` is the scene's."""
+    if (cameras := cameras_of(t)) is not None:
+        from stages.io import refined_cameras
+
+        refined_cameras.write(views, cameras, outputs.cameras, left_out_of(t, views))
+        draw_wrong_views(outputs.wrong_views, t, views, folder, renderer)
+
+
+def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[str, Any], priors: Sequence[Prior]) -> None:
+    """What was reached; the seconds differ from run to run.
+
+    found  figures of the last preview, and what the checks found
+    """
+    settings = t.model.settings
+    job.record("schedule", t.schedule.state())
+    report = {
+        "iterations": t.schedule.iterations,
+        "schedule": t.schedule.state(),
+        "time_budget": job.settings.time_budget,
+        "seconds": round(seconds, 1),
+        "preview_psnr": None,
+        "preview_ssim": None,
+        **found,
+        "cameras": camera_changes(t),
+        "priors": {prior.name: {"masked": round(prior.masked, 4), "contradicted": round(prior.contradicted, 4), "applied": prior.applied} for prior in priors},
+        "exposure": exposure_facts(t.exposure),
+        "occupied": t.model.voxels.occupied,
+        "log2_hashmap_size": settings.log2_hashmap_size,
+        "finest_resolution": settings.finest_resolution,
+    }
+    path.write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def camera_changes(t: Trainer) -> dict[str, float] | None:
+    """How far the cameras were refined: mean and largest change, as each moves the middle of its image, and the focal length's factor."""
+    if t.cameras is None:
+        return None
+    c = t.cameras
+    pixels = np.array([camera.intrinsics["fx"] for camera in c.given])[:, None] * np.abs(c.pose[:, :2] - c.pose[:, [4, 3]] * [1, -1])
+    return {"mean_pixels": round(float(pixels.mean()), 4), "max_pixels": round(float(pixels.max()), 4), "focal_factor": round(float(np.exp(c.focal[0])), 6)}
+
+
+STAGE = Stage(
+    name="train",
+    version=10,
+    settings=TrainSettings,
+    needs=needs_of(TrainInputs),
+    run=run,
+    uses_device=True,
+    check=check,
+    volatile=(TrainOutputs.log, TrainOutputs.curve, f"{TrainOutputs.previews}/*", TrainOutputs.report),
+)

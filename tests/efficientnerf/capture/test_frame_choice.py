@@ -1,0 +1,107 @@
+"""Which frames of a video are chosen."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from efficientnerf.capture.frame_choice import ALIKE, APART, BLUR, CHOSEN, LESS_SHARP, SAME, choose, shares
+
+
+def steps_and_sharpness(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(seed)
+    return np.cumsum(random.exponential(0.01, count)), random.uniform(0.5, 1.0, count)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 90), st.integers(1, 40), st.integers(0, 99))
+def test_there_are_no_more_than_asked_for_and_no_two_alike(frames: int, count: int, seed: int) -> None:
+    motion, sharpness = steps_and_sharpness(frames, seed)
+    verdicts = choose(motion, sharpness, count)
+    chosen = [place for place, verdict in enumerate(verdicts) if verdict == CHOSEN]
+    assert len(verdicts) == frames
+    assert 1 <= len(chosen) <= count
+    assert (np.diff(motion[chosen]) >= ALIKE * (1 - 1e-9)).all()
+    assert set(verdicts) <= {CHOSEN, LESS_SHARP, SAME, BLUR}
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 100), st.integers(1, 30), st.floats(0.1, 10))
+def test_only_the_order_of_sharpness_and_the_course_of_motion_count(frames: int, count: int, factor: float) -> None:
+    motion, sharpness = steps_and_sharpness(frames)
+    assert choose(motion + 3.0, sharpness * factor, count) == choose(motion, sharpness, count)
+
+
+def test_of_each_window_the_sharpest_is_chosen() -> None:
+    motion, sharpness = np.linspace(0, 1, 100), np.full(100, 0.6)
+    sharpest = np.arange(5, 100, 10)
+    sharpness[sharpest] = 1.0
+    assert np.flatnonzero(np.array(choose(motion, sharpness, 10)) == CHOSEN).tolist() == sharpest.tolist()
+
+
+def test_equally_sharp_frames_are_spread_evenly() -> None:
+    motion = np.linspace(0, 1, 101)
+    sharpness = np.random.default_rng(0).uniform(0.95, 1.0, 101)
+    chosen = np.flatnonzero(np.array(choose(motion, sharpness, 10)) == CHOSEN)
+    assert len(chosen) == 10
+    assert np.diff(motion[chosen]).min() >= APART / 10
+
+
+def test_a_sharp_frame_is_not_left_for_being_near() -> None:
+    motion, sharpness = np.linspace(0, 1, 30), np.ones(30)
+    sharpness[[4, 5]] = 0.85
+    sharpness[2] = 1.1
+    chosen = np.array(choose(motion, sharpness, 10)) == CHOSEN
+    assert chosen[2]
+    assert chosen[[3, 6]].any()
+    assert not chosen[[4, 5]].any()
+
+
+def test_a_hand_that_shakes_takes_no_frames_from_the_rest() -> None:
+    speed, sharpness = np.ones(100), np.ones(100)
+    speed[40:50], sharpness[40:50] = 8.0, 0.5
+    chosen = np.array(choose(np.cumsum(speed) / 170, sharpness, 20)) == CHOSEN
+    assert chosen.sum() >= 18
+    assert chosen[40:50].sum() <= 2
+
+
+def test_chosen_frames_are_sharper_than_every_nth() -> None:
+    motion, sharpness = steps_and_sharpness(400, 3)
+    chosen = np.array(choose(motion, sharpness, 40)) == CHOSEN
+    assert chosen.sum() >= 30
+    assert sharpness[chosen].mean() > sharpness[::10].mean() + 0.1
+
+
+def test_a_camera_that_stands_gives_one_frame_and_what_follows_is_alike() -> None:
+    verdicts = choose(np.concatenate([np.zeros(50), np.linspace(0, 1, 21)[1:]]), np.ones(70), 500)
+    assert [verdict for verdict in verdicts[:50] if verdict == CHOSEN] == [CHOSEN]
+    assert set(verdicts[:50]) == {CHOSEN, SAME}
+    assert verdicts[50:].count(CHOSEN) == 20
+
+
+def test_time_in_which_nothing_moves_takes_no_frames_from_the_rest() -> None:
+    motion = np.linspace(0, 1, 60)
+    standing = np.concatenate([motion[:30], np.full(200, motion[29]), motion[30:]])
+    there = np.r_[0:30, 230:260]
+    assert (np.array(choose(standing, np.ones(260), 15))[there] == CHOSEN).tolist() == (np.array(choose(motion, np.ones(60), 15)) == CHOSEN).tolist()
+
+
+def test_a_long_blur_is_thinned_but_no_two_that_follow_each_other_are_left_out() -> None:
+    sharpness = np.ones(120)
+    sharpness[40:80] = 0.5
+    picked = [verdict for verdict in choose(np.linspace(0, 1, 120), sharpness, 24) if verdict in (CHOSEN, BLUR)]
+    assert 2 <= picked.count(BLUR) <= 5
+    assert all(CHOSEN in pair for pair in pairwise(picked))
+    assert choose(np.linspace(0, 1, 120), np.full(120, 0.5), 24).count(CHOSEN) == 24
+
+
+@pytest.mark.parametrize("motions", [[1.0, 1.0], [3.0, 1.0, 0.0], [0.0, 0.0], [5.0]])
+def test_videos_share_frames_by_motion(motions: list[float]) -> None:
+    found = shares(motions, 100)
+    assert min(found) >= 2
+    assert abs(sum(found) - 100) <= 2 * len(motions)
+    assert all(a >= b for a, b, m, n in zip(found, found[1:], motions, motions[1:], strict=False) if m >= n)

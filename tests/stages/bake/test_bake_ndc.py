@@ -1,0 +1,121 @@
+"""Baking in normalised device coordinates: voxels deeper than wide, and a budget that follows the pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.asset import format
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.spaces import NdcSpace
+from stages.artifacts import BakeOutputs
+from stages.bake import run as bake
+from stages.bake.pruning import NDC_RAYS_PER_VOXEL
+from stages.bake.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, budget_of, finest_resolution, ndc_pixel
+from stages.bake.run import BakeSettings
+from stages.io.field_file import load_renderer
+from stages.io.scene import load
+from stages.train import run as train
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import job, poses
+from tests.stages.forward_facing import forward_facing, painted_wall
+
+QUICK: dict[str, Any] = {"resolution": 64, "visibility_rays": 4000, "weight_threshold": 0.0, "max_mib": 8, "samples_per_voxel": 4, "refine_steps": 0}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A painted wall before nine cameras, and a network that has seen a little of it."""
+    folder = tmp_path_factory.mktemp("ndc")
+    painted_wall(folder / "poses")
+    train.run(job(folder / "train", settings(iterations=80, sample_batch_size=4096, occupancy_warmup_steps=10), poses=folder / "poses"))
+    return {"poses": folder / "poses", "train": folder / "train" / "out"}
+
+
+def baked(folder: Path, inputs: dict[str, Path], told: list[dict[str, Any]] | None = None, **changes: Any) -> NerfTree:
+    made = job(folder, BakeSettings(**{**QUICK, **changes}), events=told, **inputs)
+    bake.run(made)
+    return format.load(made.out / BakeOutputs.asset)
+
+
+def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path) -> None:
+    cubes, deep = baked(tmp_path / "cubes", inputs, ndc_voxel_depth=1.0), baked(tmp_path / "deep", inputs)
+    space = load_renderer(inputs["train"], "cpu").model.space
+    assert cubes.ndc is not None
+    assert deep.ndc is not None
+    assert space.ndc is not None
+    assert cubes.ndc.to_json() == space.ndc.to_json()
+    assert deep.ndc.slopes == pytest.approx(tuple(NdcSpace.voxel_depth * slope for slope in space.ndc.slopes))
+    # As many voxels across, half as many in depth.
+    assert deep.resolution[:2] == cubes.resolution[:2]
+    assert deep.resolution[2] == pytest.approx(cubes.resolution[2] / NdcSpace.voxel_depth, abs=4)
+    view = load(inputs["poses"]).views[0]
+    one, other = (render(tree, view.camera, background=(0.5, 0.5, 0.5)) for tree in (cubes, deep))
+    assert one.colour.std() > 0.1
+    assert np.abs(one.colour - other.colour).mean() < 0.01
+    hit = np.isfinite(one.depth) & np.isfinite(other.depth)
+    assert hit.mean() > 0.9
+    assert np.median(np.abs(other.depth[hit] / one.depth[hit] - 1)) < 0.05
+
+
+def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], tmp_path: Path) -> None:
+    import json
+
+    told: list[dict[str, Any]] = []
+    baked(tmp_path, inputs, told, refine_steps=20, refine_rays_per_batch=2048, visibility_rays=1000)
+    fitted = json.loads((tmp_path / "out" / "report.json").read_text())["optimisation"]
+    assert fitted["psnr_after"] > fitted["psnr_before"] + 0.5
+    looked = {event["total"] for event in told if event.get("text") == "rendering for voxel weights"}
+    assert looked == {min(int(NDC_RAYS_PER_VOXEL * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
+    assert max(looked) > 1000
+    assert not [event for event in told if event["event"] == "warning"]
+
+
+def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path], tmp_path: Path) -> None:
+    made = job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4, discretise=48), poses=inputs["poses"])
+    train.run(made)
+    on_voxels = {**inputs, "train": made.out}
+    told: list[dict[str, Any]] = []
+    tree = baked(tmp_path / "own", on_voxels, told, resolution=48)
+    assert tree.ndc is not None
+    assert tree.ndc.to_json() == load_renderer(made.out, "cpu").model.space.ndc.to_json()
+    assert not [event for event in told if event["event"] == "warning"]
+    baked(tmp_path / "other", on_voxels, told, resolution=48, ndc_voxel_depth=2.0)
+    assert any("bake.ndc_voxel_depth=2" in event["text"] and "train.discretise=48" in event["text"] for event in told if event["event"] == "warning")
+
+
+def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
+    scene = poses(tmp_path / "poses")
+    train.run(job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4), poses=scene))
+    told: list[dict[str, Any]] = []
+    tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_voxel_depth=2.0)
+    assert tree.ndc is None
+    assert len(set(tree.resolution)) == 1
+    assert any("bake.ndc_voxel_depth" in event["text"] for event in told if event["event"] == "warning")
+
+
+def test_a_space_of_deeper_voxels_has_the_same_grid_coordinates(inputs: dict[str, Path]) -> None:
+    space = load_renderer(inputs["train"], "cpu").model.space
+    assert isinstance(space, NdcSpace)
+    flat = space.with_voxel_depth(3.0)
+    world = space.ndc.world(np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3)))
+    np.testing.assert_allclose(flat.ndc.points(world), space.ndc.points(world) * (3, 3, 1), rtol=1e-9, atol=1e-12)
+    one, other = (s.grid(torch.from_numpy(s.ndc.points(world))) for s in (space, flat))
+    torch.testing.assert_close(one, other)
+
+
+def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:
+    small, large, huge = (forward_facing(side) for side in (200, 1000, 4000))
+    assert budget_of(small, None) == NDC_MIN_MIB
+    assert budget_of(huge, None) == NDC_MAX_MIB
+    assert large.forward is not None
+    across, down = (large.forward.bounds[1] - large.forward.bounds[0])[:2] / ndc_pixel(large, large.forward)
+    assert budget_of(large, None) == int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
+    assert budget_of(huge, 7) == 7
+    assert budget_of(load(poses(tmp_path)), None) == MAX_MIB
+    assert finest_resolution(huge, None).resolution == 1024

@@ -1,0 +1,334 @@
+"""Baking whole scenes: all that the photographs show, within the asset's size, to the same bytes whatever happens on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset import field_samples, format
+from efficientnerf.asset.cascades import cascade_sides, cascades_of, subset, voxel_cascades
+from efficientnerf.asset.file.serialisation import bytes_per_voxel
+from efficientnerf.asset.refinement import schedule
+from efficientnerf.asset.refinement.schedule import Phase
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
+from efficientnerf.rendering.field_renderer import FieldRenderer
+from efficientnerf.training.exposure.model import exposure_of
+from pipeline.errors import Interrupted, UsageError
+from pipeline.executors.memory import Limit
+from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
+from stages.bake import holes, pruning, resolution, whole_scene
+from stages.bake import run as bake
+from stages.bake.resolution import MAX_CELLS, MAX_MIB, budget_of, finest_of_cascades
+from stages.bake.run import BakeSettings
+from stages.framing.view_coverage import close_to_path
+from stages.io import field_file
+from stages.io.png import read_png, write_png
+from stages.io.scene import Scene, View, load, save
+from stages.train import averaged
+from tests.efficientnerf.surroundings import GROUND, WALL, around, photographs, surroundings
+from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job
+from tests.stages.spoilers import SPOILERS
+
+QUICK = BakeSettings(resolution=40, samples_per_voxel=1, refine_steps=8, refine_rays_per_batch=2048, environment_size=16, visibility_rays=20_000)
+BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("scene")
+    (folder / "poses" / "images").mkdir(parents=True)
+    (folder / "train").mkdir()
+    (folder / "train" / TrainOutputs.field).write_bytes(b"in closed form")
+    cameras = around(9)
+    for camera, image in zip(cameras, photographs(surroundings(), cameras), strict=True):
+        write_png(image, folder / "poses" / "images" / camera.name)
+    views = tuple(View(f"images/{c.name}", None, "test" if n == 8 else "train", c, SIMILARITY.inverse().camera(c), 0.2, 60.0) for n, c in enumerate(cameras))
+    save(Scene("photographs", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False), folder / "poses")
+    return {"poses": folder / "poses", "train": folder / "train"}
+
+
+@pytest.fixture(autouse=True)
+def field_in_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(field_file, "load_renderer", lambda folder, device="cpu": FieldRenderer(surroundings(), 0.2, 60.0))
+    monkeypatch.setattr(field_samples, "RAYS_PER_BLOCK", 2048)
+
+
+def baked(folder: Path, inputs: dict[str, Path], events: list[dict[str, Any]] | None = None, **changes: Any) -> tuple[NerfTree, dict[str, Any]]:
+    made = job(folder, replace(QUICK, **changes), events=events, **inputs)
+    bake.run(made)
+    return format.load(made.out / BakeOutputs.asset), json.loads((made.out / "report.json").read_text())
+
+
+def digest(folder: Path) -> str:
+    return hashlib.sha256((folder / "out" / BakeOutputs.asset).read_bytes() + (folder / "out" / "report.json").read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """The folder of a bake, and how often it could have been stopped."""
+    folder, never = tmp_path_factory.mktemp("undisturbed"), StopAt()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(field_file, "load_renderer", lambda folder, device="cpu": FieldRenderer(surroundings(), 0.2, 60.0))
+        patch.setattr(field_samples, "RAYS_PER_BLOCK", 2048)
+        bake.run(job(folder, QUICK, stop=never, **inputs))
+    return folder, never.count
+
+
+def test_a_view_that_was_held_back_is_shown_whole_by_the_asset_alone(inputs: dict[str, Path], undisturbed: tuple[Path, int]) -> None:
+    tree, report = format.load(undisturbed[0] / "out" / BakeOutputs.asset), json.loads((undisturbed[0] / "out" / "report.json").read_text())
+    assert len(tree.outer) >= 2
+    assert report["cascades"] == np.bincount(voxel_cascades(tree)).tolist()
+    assert min(report["cascades"]) > 0
+    assert tree.environment is not None
+    assert tree.environment.shape == (16, 32, 3)
+    assert tree.region is not None
+    assert (cascades_of(tree)[0].bounds(tree.brick)[0] <= tree.region.bounds[0] + 1e-6).all()
+    assert (cascades_of(tree)[0].bounds(tree.brick)[1] >= tree.region.bounds[1] - 1e-6).all()
+    outermost = cascades_of(tree)[-1].bounds(tree.brick)
+    assert (outermost[1][:2] > WALL).all()
+    view = load(inputs["poses"]).views[-1]
+    truth = FieldRenderer(surroundings(), 0.2, 60.0).render(view.camera)
+    seen = render(tree, view.camera)
+    assert np.sqrt(((seen.colour - truth.colour) ** 2).mean()) < 0.12
+    opaque = truth.opacity > 0.95
+    assert (seen.opacity[opaque] < 0.5).mean() < 0.05
+    assert report["optimisation"]["psnr_after"] > report["optimisation"]["psnr_before"] > 10
+    assert set(report["optimisation"]["holes"]) == {"pruned", "restored", "refined", "voxels_restored"}
+    assert report["optimisation"]["holes"]["refined"] < 0.02
+
+
+def test_a_size_that_the_environment_map_fills_is_refused_before_the_field_is_rendered(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field_samples, "field_samples", lambda *_: pytest.fail("the field was rendered"))
+    for changes, lower in (({"resolution": "auto"}, "lower "), ({}, r"lower bake\.resolution or ")):
+        with pytest.raises(UsageError, match=rf"max_mib=5: has no room .*map of 1024 rows\. Raise bake\.max_mib.*{lower}bake\.environment_size \(1024\)\.$"):
+            baked(tmp_path, inputs, max_mib=5.0, environment_size=1024, **changes)
+
+
+def test_the_room_of_a_whole_scene_counts_the_bytes_that_the_file_holds(inputs: dict[str, Path], undisturbed: tuple[Path, int]) -> None:
+    """The file keeps the environment map in bytes."""
+    m, grid = surroundings(), ((8, 8, 8), 0.1, np.zeros(3))
+    with_map, without = (whole_scene.room_of(replace(QUICK, environment_size=256, layout="sparse"), m, [grid], 20.0, environment=on) for on in (True, False))
+    per_voxel = bytes_per_voxel("sparse", m.fine.degree) + 8 / 16
+    assert (without - with_map) * per_voxel == pytest.approx(6 * 256**2, abs=per_voxel)
+
+
+def test_what_training_learned_of_the_exposure_is_left_out_of_the_asset(
+    inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photographs half of which were exposed less: with that known the asset is as good as of those that were not."""
+    shutil.copytree(inputs["poses"], tmp_path / "poses")
+    names, logs = [f"images/{camera.name}" for camera in around(9)[:8]], 0.25 * (-1.0) ** np.arange(8)
+    for name, log in zip(names, logs, strict=True):
+        path = tmp_path / "poses" / name
+        light = linear_from_srgb(read_png(path) / 255.0) * np.exp(log)
+        write_png(np.rint(255 * srgb_from_linear(light.clip(0, 1))).astype(np.uint8), path)
+    e = exposure_of(around(9)[:8], logs[:, None] * np.ones(3)).detached
+    psnr = {}
+    for known in (True, False):
+        monkeypatch.setattr(averaged, "load_exposure", lambda folder, known=known: (names, e) if known else None)
+        _, report = baked(tmp_path / str(known), {**inputs, "poses": tmp_path / "poses"})
+        psnr[known] = report["optimisation"]["psnr_after"]
+    usual = json.loads((undisturbed[0] / "out" / "report.json").read_text())["optimisation"]["psnr_after"]
+    assert psnr[True] == pytest.approx(usual, abs=0.3)
+    assert psnr[False] < usual - 1
+
+
+def test_the_same_twice_and_stopped_anywhere(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int]) -> None:
+    wanted, calls = digest(undisturbed[0]), undisturbed[1]
+    for k, call in enumerate((2, calls // 2, calls - 1)):
+        stop = StopAt(call)
+        with pytest.raises(Interrupted):
+            bake.run(job(tmp_path / str(k), QUICK, stop=stop, **inputs))
+        stop.calls = set()
+        bake.run(job(tmp_path / str(k), QUICK, stop=stop, **inputs))
+        assert digest(tmp_path / str(k)) == wanted
+
+
+@pytest.mark.parametrize("how", ["cut", "zero"])
+def test_scratch_that_is_damaged_is_made_again(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int], how: str) -> None:
+    stop = StopAt(undisturbed[1])
+    with pytest.raises(Interrupted):
+        bake.run(job(tmp_path, QUICK, stop=stop, **inputs))
+    stop.calls = set()
+    names = {path.name.partition("_")[0] for path in (tmp_path / "work").iterdir()}
+    assert {"samples", "samples.json", "cascade0", "refinement.safetensors"} <= names
+    for path in list((tmp_path / "work").iterdir()):
+        SPOILERS[how](path)
+    events: list[dict[str, Any]] = []
+    bake.run(job(tmp_path, QUICK, stop=stop, events=events, **inputs))
+    assert digest(tmp_path) == digest(undisturbed[0])
+    warned = [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"]
+    assert {"samples.json", "cascade0_000000.json", "refinement.safetensors"} <= set(warned)
+
+
+def test_samples_of_other_images_are_not_taken(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int]) -> None:
+    scene = load(inputs["poses"])
+    shutil.copytree(inputs["poses"], tmp_path / "poses")
+    save(replace(scene, views=scene.views[1:]), tmp_path / "poses")
+    given = {"poses": tmp_path / "poses", "train": inputs["train"]}
+    baked(tmp_path / "clean", given)
+    (tmp_path / "other" / "work").mkdir(parents=True)
+    stop = StopAt(undisturbed[1])
+    with pytest.raises(Interrupted):
+        bake.run(job(tmp_path / "first", QUICK, stop=stop, **inputs))
+    for path in (tmp_path / "first" / "work").glob("samples*"):
+        shutil.copy(path, tmp_path / "other" / "work" / path.name)
+    events: list[dict[str, Any]] = []
+    baked(tmp_path / "other", given, events)
+    assert digest(tmp_path / "other") == digest(tmp_path / "clean")
+    assert any("of other images" in event.get("text", "") for event in events if event["event"] == "warning")
+
+
+def test_the_asset_keeps_to_its_size(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resolution, "SCENE_VOXEL_PIXELS", 0.1)
+    tree, report = baked(tmp_path, inputs, resolution="auto", max_resolution=160, max_mib=1, refine_steps=2)
+    assert (tmp_path / "out" / BakeOutputs.asset).stat().st_size <= 2**20
+    assert report["voxels_along_longest_side"] < 160
+    assert "as its size allows" in report["resolution_decided_by"]
+    assert len(np.unique(voxel_cascades(tree))) == 1 + len(tree.outer)  # neither the subject nor what is around it is left out
+
+
+def test_one_cascade_leaves_the_rest_to_the_environment(inputs: dict[str, Path], tmp_path: Path) -> None:
+    tree, _ = baked(tmp_path, inputs, cascades=1, refine_steps=0)
+    assert tree.outer == ()
+    assert tree.environment is not None
+    assert tree.environment.std() > 0.02  # the wall
+
+
+def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the prune drops a piece of the ball that the photographs show it comes back, within the room there is."""
+    heaviest = pruning.heaviest
+    dropped: list[int] = []
+
+    def without_half(made: Any, greatest: np.ndarray, most: int) -> np.ndarray:
+        keep = heaviest(made, greatest, most)
+        lost = np.zeros(len(keep), bool)
+        lost[: int(0.4 * len(keep))] = True  # a half of the innermost cascade, along x
+        dropped.append(int((lost & keep).sum()))
+        return keep & ~lost
+
+    monkeypatch.setattr(pruning, "heaviest", without_half)
+    events: list[dict[str, Any]] = []
+    _, report = baked(tmp_path, inputs, events)
+    found = report["optimisation"]["holes"]
+    assert dropped[0] > 500
+    assert found["pruned"] > 0.02
+    assert found["restored"] < 0.2 * found["pruned"]
+    assert 0 < found["voxels_restored"] <= dropped[0]
+    assert any("holes" in event.get("text", "") and "restored" in event["text"] for event in events)
+
+
+def test_all_cascades_of_a_scene_are_split(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: tuple[Path, int]) -> None:
+    phases = (Phase("coarse", 0.5, "split"), Phase("fine", 0.25, "prune"), Phase("last", 0.25))
+    monkeypatch.setattr(schedule, "PHASES", phases)
+    tree, report = baked(tmp_path, inputs)
+    whole = format.load(undisturbed[0] / "out" / BakeOutputs.asset)
+    assert tree.voxel == pytest.approx(whole.voxel)
+    assert len(tree.outer) == len(whole.outer)
+    assert min(np.bincount(voxel_cascades(tree))) > 0
+    assert report["optimisation"]["holes"]["refined"] < 0.02
+
+
+def test_rays_that_end_in_holes_are_those_without_their_voxels(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int]) -> None:
+    from stages.train.data import pixels_of
+
+    tree = format.load(undisturbed[0] / "out" / BakeOutputs.asset)
+    scene = load(inputs["poses"])
+    pixels = pixels_of(inputs["poses"], tuple(view for view in scene.views if view.split == "train"))
+    samples = field_samples.field_samples(surroundings(), pixels, 20_000, 1e-3, lambda done, total: None)
+    made = job(tmp_path, QUICK)
+    _, before = holes.find_holes(made, tree, samples)
+    inner = voxel_cascades(tree) == 0
+    rays, share = holes.find_holes(made, subset(tree, ~inner), samples)
+    assert share > before + 0.1
+    assert (samples.opacity[rays] > 0.95).all()
+    ends = field_samples.surface_points(samples)[rays]
+    low, high = cascades_of(tree)[0].bounds(tree.brick)
+    assert ((ends > low - 0.2) & (ends < high + 0.2)).all(axis=1).mean() > 0.9
+    needed = holes.voxels_of_holes(tree, samples, rays)
+    assert inner[needed].mean() > 0.9
+    assert holes.find_holes(made, subset(tree, ~inner | needed), samples)[1] < before + 0.3 * (share - before)
+    assert not holes.voxels_of_holes(tree, samples, rays[:0]).any()
+
+
+def test_nothing_is_baked_where_the_cameras_pass(inputs: dict[str, Path], tmp_path: Path) -> None:
+    """Nearer planes far out make room that is known to be filled: there is the wall, of which what is near the cameras is left out."""
+    s = load(inputs["poses"])
+    poses = tmp_path / "poses"
+    shutil.copytree(inputs["poses"], poses)
+    cameras, near = [view.camera for view in s.views if view.split == "train"], 2.4
+    save(replace(s, views=tuple(replace(view, near=near) for view in s.views)), poses)
+
+    def close(made: NerfTree) -> int:
+        at, of = voxel_coordinates(made), voxel_cascades(made)
+        centres = np.concatenate([(at[of == n] + 0.5) * grid.voxel + grid.bounds_min for n, grid in enumerate(cascades_of(made))])
+        return int(close_to_path(centres, cameras, [near] * len(cameras), whole_scene.BAKED_CLEARANCE).sum())
+
+    with_room = baked(tmp_path / "room", {**inputs, "poses": poses}, refine_steps=0)[0]
+    without = baked(tmp_path / "none", inputs, refine_steps=0)[0]
+    assert close(without) > 0
+    assert close(with_room) == 0
+
+
+
+def test_a_scene_is_as_fine_as_pixels_cells_and_settings_allow(inputs: dict[str, Path]) -> None:
+    s = load(inputs["poses"])
+    box = np.array([[-0.5, -0.5, -0.25], [0.5, 0.5, 0.25]])
+    free = finest_of_cascades(s, box, 4, 4, None)
+    assert free.resolution == max(32, round(1.0 / (1.7 / (0.8 * 32))))
+    sharp = replace(s, views=tuple(replace(v, camera=replace(v.camera, params=(1e5, 16.0, 16.0))) for v in s.views))
+    held = finest_of_cascades(sharp, box, 4, 4, None)
+    assert 4 * 0.5 * (held.resolution / 4) ** 3 <= MAX_CELLS
+    assert held.resolution > 384
+    assert finest_of_cascades(sharp, box, 4, 4, 99).resolution == 99
+    assert budget_of(s, None) == MAX_MIB
+    assert budget_of(s, 7) == 7
+
+
+def test_a_scene_that_does_not_fit_into_memory_is_refused_before_voxels_are_baked(inputs: dict[str, Path], tmp_path: Path) -> None:
+    made = job(tmp_path, QUICK, **inputs)
+    bake.run(made)
+    short = job(tmp_path / "short", QUICK, **inputs)
+    short.memory = Limit(made.facts["memory"]["needed"] - 50_000, "--memory")
+    with pytest.raises(UsageError, match=r"needs about .* may be taken \(--memory\)"):
+        bake.run(short)
+    assert not list(short.work.glob("cascade0_*.npy"))
+
+
+def test_voxels_of_a_cascade_reach_into_the_one_before_by_one(inputs: dict[str, Path], undisturbed: tuple[Path, int]) -> None:
+    tree = format.load(undisturbed[0] / "out" / BakeOutputs.asset)
+    sides, of, at = cascade_sides(tree), voxel_cascades(tree), voxel_coordinates(tree)
+    reaching = 0
+    for n in range(1, len(sides)):
+        low, high = cascades_of(tree)[n - 1].bounds(tree.brick)
+        centre = cascades_of(tree)[n].bounds_min + (at[of == n] + 0.5) * sides[n]
+        depth = np.minimum(centre - low, high - centre).min(axis=1) / sides[n]  # inside of the box before, in voxels
+        assert depth.max() < 1
+        reaching += int((depth > 0).sum())
+    assert reaching > 0
+    ground = np.abs(cascades_of(tree)[1].bounds_min[2] + (at[of == 1, 2] + 0.5) * sides[1] - GROUND) < 2 * sides[1]
+    assert ground.any()
+
+
+def test_bounds_given_by_hand_are_the_region(tmp_path: Path, inputs: dict[str, Path]) -> None:
+    poses = shutil.copytree(inputs["poses"], tmp_path / "poses")
+    found, _ = baked(tmp_path / "found", inputs | {"poses": poses}, refine_steps=0)
+    assert found.region is not None
+    assert np.abs(found.region.bounds - BOUNDS).max() > 0.01
+    (poses / PosesOutputs.report).write_text(json.dumps({"framing": {"bounds_from": "given"}}))
+    given, _ = baked(tmp_path / "given", inputs | {"poses": poses}, refine_steps=0)
+    assert given.region is not None
+    assert np.array_equal(given.region.bounds, BOUNDS)
+    assert (given.bounds_min <= BOUNDS[0] + 1e-9).all()
+    assert (given.bounds_max >= BOUNDS[1] - 1e-9).all()

@@ -1,0 +1,63 @@
+"""The choice of a resolution: by what pixels tell apart, and by what there is room for."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from stages.bake.resolution import MIN_FILL, MIN_RESOLUTION, Choice, affordable_resolution, finest_resolution
+from stages.io.scene import load
+from tests.stages.balls import poses
+
+
+def test_the_finest_follows_the_pixels(tmp_path: Path) -> None:
+    s = load(poses(tmp_path))
+    # A pixel covers 3 / (1.3 * 16) at the centre, a voxel half of that; the box is 2 wide; 32 at least.
+    assert finest_resolution(s, 384).resolution == MIN_RESOLUTION
+    focal = 100.0
+    sharper = dataclasses.replace(s, views=tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, params=(focal, 8.0, 8.0))) for v in s.views))
+    told = round(2 / (0.5 * 3 / focal))
+    assert finest_resolution(sharper, 384) == Choice(told, "a voxel covers 0.5 of a pixel")
+    held = finest_resolution(sharper, 64)
+    assert held.resolution == 64
+    assert "bake.max_resolution" in held.why
+    assert str(told) in held.why
+
+
+@pytest.mark.parametrize("power", [1.6, 2.0, 2.4, 3.0])
+@pytest.mark.parametrize("room", [3_000, 50_000, 800_000, 10_000_000])
+def test_the_room_is_used_where_voxels_grow_by_a_power(power: float, room: int) -> None:
+    finest = Choice(800, "pixels")
+    asked = []
+
+    def count(resolution: int) -> int:
+        asked.append(resolution)
+        return int(0.4 * resolution**power + 1000)
+
+    choice = affordable_resolution(finest, count, lambda resolution: room - resolution)
+    assert len(asked) <= 6
+    if count(800) <= room - 800:
+        assert choice == finest
+    elif count(MIN_RESOLUTION) <= room - MIN_RESOLUTION:
+        assert MIN_FILL * (room - choice.resolution) - 0.1 * room <= count(choice.resolution) <= room - choice.resolution
+        assert "as its size allows" in choice.why
+    assert MIN_RESOLUTION <= choice.resolution <= 800
+
+
+def test_counts_that_jump_end_in_a_resolution_for_which_there_is_room() -> None:
+    def count(resolution: int) -> int:
+        return 100 * (resolution // 50) ** 3
+
+    choice = affordable_resolution(Choice(400, "pixels"), count, lambda resolution: 9_000)
+    assert count(choice.resolution) <= 9_000
+    assert choice.resolution >= 200
+
+
+def test_without_room_for_the_coarsest_it_is_taken_all_the_same() -> None:
+    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: resolution**2, lambda resolution: 10).resolution == MIN_RESOLUTION
+
+
+def test_nothing_at_all_is_looked_for_on_the_finest_grid() -> None:
+    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: 0, lambda resolution: 1000).resolution == 400

@@ -1,0 +1,268 @@
+"""The evaluate stage on a ball with a closed form: the right views, the right figures, over the right background, the same after a stop."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from efficientnerf.evaluation.metrics import psnr, ssim
+from efficientnerf.geometry.cameras import Camera, rays
+from pipeline.errors import Interrupted
+from stages.evaluate.splats import EvaluatedSplats
+from stages.evaluate.views import evenly_spaced, stride_for, subsample, subsample_camera, upsample
+from stages.figures.plots import to_uint8
+from stages.framing.camera_paths import pose_on_sphere
+from stages.io.png import write_png
+from stages.io.scene import View
+from stages.scratch import note
+from tests.fakes import WHITE, BallField
+from tests.stages.evaluate.balls import HEIGHT, TREE, WIDTH, figures_of, job_in, make_scene, measure, settings
+from tests.stages.spoilers import SPOILERS
+
+
+def test_a_perfect_asset_is_as_good_as_eight_bits_allow(tmp_path: Path) -> None:
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "rtrtrt"))
+    field = BallField(TREE, background=WHITE, noise=0.02)
+    measure(TREE, lambda: field, job)
+    metrics = figures_of(job)
+    assert metrics["split"] == "test"
+    assert [view["name"] for view in metrics["views"]] == ["v1.png", "v3.png", "v5.png"]
+    assert metrics["asset"]["psnr"] > 50
+    assert metrics["asset"]["ssim"] > 0.999
+    # noise of +-0.02, halved at most where clipping to white takes one side: between 10 log10(1 / 0.02^2) and 3 dB more
+    assert 33.9 < metrics["network"]["psnr"] < 37.0
+    assert metrics["network"]["psnr_in_box"] == pytest.approx(33.98, abs=0.1)
+    assert metrics["network"]["psnr"] == pytest.approx(np.mean([view["network"]["psnr"] for view in metrics["views"]]))
+    assert metrics["network"]["scale"] == 1.0
+    assert metrics["asset"]["views"] == metrics["network"]["views"] == 3
+    assert sorted(path.name for path in job.out.iterdir()) == ["contact_sheet.png", "metrics.json", "verdict.json"]
+    assert field.calls == [(f"v{k}.png", WIDTH, HEIGHT) for k in (1, 3, 5)]
+
+
+def test_gaussians_that_look_like_the_asset_have_its_figures(tmp_path: Path) -> None:
+    """Over the same background; and where a first attempt had none, its views are measured again."""
+    poses = make_scene(tmp_path / "poses", "tt")
+    splats = EvaluatedSplats(lambda camera, background: TREE.render(camera, background=background).colour, {"gaussians": 7})
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job_in(tmp_path, poses, out="none"))
+    assert json.loads((tmp_path / "none/metrics.json").read_text())["splats"] is None
+    job = job_in(tmp_path, poses)
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job, splats)
+    metrics = figures_of(job)
+    assert metrics["splats"] == {"psnr": metrics["asset"]["psnr"], "ssim": metrics["asset"]["ssim"], "gaussians": 7, "views": 2, "scale": 1.0}
+    assert [view["splats"]["psnr"] for view in metrics["views"]] == [view["asset"]["psnr"] for view in metrics["views"]]
+
+
+def test_figures_are_those_of_the_metrics(tmp_path: Path) -> None:
+    poses = make_scene(tmp_path / "poses", "rt")
+    worse = replace(TREE, radius=0.5)
+    job = job_in(tmp_path, poses)
+    measure(worse, lambda: BallField(worse, background=WHITE), job)
+    with Image.open(poses / "images" / "v1.png") as image:
+        pixels = np.asarray(image) / np.float32(255)
+    truth = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
+    camera = Camera("v1.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (70.0, WIDTH / 2, HEIGHT / 2), pose_on_sphere((0.0, 0.0, 0.0), 3.0, 30.0, 20.0))
+    image = worse.render(camera, background=WHITE).colour
+    found = figures_of(job)["views"][0]["asset"]
+    assert found["psnr"] == pytest.approx(psnr(image, truth), abs=1e-4)
+    assert found["ssim"] == pytest.approx(ssim(image, truth), abs=1e-5)
+    assert found["psnr_in_box"] == pytest.approx(psnr(image, truth, pixels[..., 3] > 0), abs=1e-4)
+    assert found["psnr_in_box"] < found["psnr"] < 30
+
+
+def test_the_network_is_bounded_in_views_and_scale_and_the_asset_is_not(tmp_path: Path) -> None:
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t" * 6), settings(field_views=2, field_image_scale=0.5))
+    field = BallField(TREE, background=WHITE)
+    measure(TREE, lambda: field, job)
+    metrics = figures_of(job)
+    assert [view["network"] is not None for view in metrics["views"]] == [False, True, False, False, True, False]
+    assert (metrics["network"]["views"], metrics["network"]["scale"], metrics["asset"]["views"]) == (2, 0.5, 6)
+    assert {call[1:] for call in field.calls} == {(30, 22)}
+    assert metrics["views"][1]["network"]["psnr"] > 50, "subsampling takes nothing from a perfect field"
+    assert metrics["views"][1]["asset"]["width"] == WIDTH
+
+
+@pytest.mark.parametrize(("splits", "expected", "warned"), [("rrv", "val", False), ("rr", "train", True), ("rvt", "test", False)])
+def test_val_stands_in_for_test_and_train_for_both_with_a_warning(tmp_path: Path, splits: str, expected: str, warned: bool) -> None:
+    events: list[dict[str, Any]] = []
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", splits), report=events.append)
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    assert figures_of(job)["split"] == expected
+    assert any("training saw" in event["text"] for event in events if event["event"] == "warning") == warned
+
+
+def test_on_photographs_the_asset_lies_over_the_networks_background(tmp_path: Path) -> None:
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "tttt", background=None), settings(field_views=2, field_background_rays=WIDTH * HEIGHT // 2))
+    field = BallField(TREE)
+    measure(TREE, lambda: field, job)
+    metrics = figures_of(job)
+    assert metrics["asset"]["psnr"] > 40, "surroundings are smooth: upsampling them loses little"
+    assert metrics["asset"]["psnr_in_box"] > 45
+    assert metrics["asset"]["background_scale"] == {"network_views": 1.0, "other_views": 0.5}
+    assert [width for _, width, _ in field.calls] == [30, WIDTH, 30, WIDTH]
+    assert metrics["network"]["psnr_in_box"] > 45
+    assert metrics["network"]["psnr"] > 50
+
+
+def test_an_asset_that_shows_nothing_is_bad_in_its_box_even_on_a_good_background(tmp_path: Path) -> None:
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t", background=None))
+    measure(replace(TREE, sigma=1e-6), lambda: BallField(TREE), job)
+    metrics = figures_of(job)
+    assert metrics["asset"]["psnr_in_box"] < 20
+    assert metrics["asset"]["psnr"] < 25
+    assert metrics["network"]["psnr_in_box"] > 45
+
+
+def test_light_before_the_box_covers_the_asset(tmp_path: Path) -> None:
+    class Fog(BallField):
+        def render(self, camera: Camera, progress: Any = None, **more: Any) -> Any:
+            seen = super().render(camera, **more)
+            before = np.broadcast_to(np.float32([0.2, 0.1, 0.0, 0.4]), (*seen.opacity.shape, 4)).copy()
+            return replace(seen, before=before, colour=before[..., :3] + 0.6 * seen.colour)
+
+    poses = make_scene(tmp_path / "poses", "t", background=None)
+    camera = Camera("v0.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (70.0, WIDTH / 2, HEIGHT / 2), pose_on_sphere((0.0, 0.0, 0.0), 3.0, 0.0, 20.0))
+    write_png(to_uint8(Fog(TREE).render(camera).colour), poses / "images" / "v0.png")
+    job = job_in(tmp_path, poses)
+    measure(TREE, lambda: Fog(TREE), job)
+    assert figures_of(job)["asset"]["psnr"] > 50
+    assert figures_of(job)["network"]["psnr"] > 50
+
+
+@pytest.mark.parametrize("background", [WHITE, None])
+def test_what_masks_hide_does_not_count(tmp_path: Path, background: tuple[float, float, float] | None) -> None:
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "tt", background=background, masked=True), settings(field_views=1))
+    measure(TREE, lambda: BallField(TREE, background=background), job)
+    metrics = figures_of(job)
+    assert metrics["asset"]["psnr"] > 45
+    assert metrics["asset"]["ssim"] > 0.99
+    assert metrics["network"]["psnr"] > 45
+
+
+def test_a_mask_that_hides_everything_leaves_the_view_out_of_the_means(tmp_path: Path) -> None:
+    poses = make_scene(tmp_path / "poses", "tt", masked=True)
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(poses / "images" / "mask0.png")
+    events: list[dict[str, Any]] = []
+    job = job_in(tmp_path, poses, report=events.append)
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    metrics = figures_of(job)
+    assert metrics["views"][0]["asset"]["psnr"] is None
+    assert metrics["asset"]["psnr"] == metrics["views"][1]["asset"]["psnr"]
+    assert any("v0.png" in event["text"] for event in events if event["event"] == "warning")
+
+
+def test_a_field_of_nans_counts_as_black_with_a_warning(tmp_path: Path) -> None:
+    class Broken(BallField):
+        def render(self, camera: Camera, progress: Any = None, **more: Any) -> Any:
+            return replace(super().render(camera, **more), colour=np.full((camera.height, camera.width, 3), np.nan, np.float32))
+
+    events: list[dict[str, Any]] = []
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t"), report=events.append)
+    measure(TREE, lambda: Broken(TREE, background=WHITE), job)
+    assert 0 < figures_of(job)["network"]["psnr"] < 10
+    assert any("not finite" in event["text"] for event in events if event["event"] == "warning")
+
+
+@pytest.mark.parametrize("moment", [1, 2, 4])
+def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp_path: Path, moment: int) -> None:
+    poses = make_scene(tmp_path / "poses", "tttt", background=None)
+    whole = job_in(tmp_path / "whole", poses, settings(field_views=2))
+    measure(TREE, lambda: BallField(TREE), whole)
+    asked, first, second = iter(range(100)), BallField(TREE), BallField(TREE)
+    stopped = job_in(tmp_path, poses, settings(field_views=2), "first", stop=lambda: 2 if next(asked) >= moment else None)
+    with pytest.raises(Interrupted):
+        measure(TREE, lambda: first, stopped)
+    job = job_in(tmp_path, poses, settings(field_views=2), "second")
+    measure(TREE, lambda: second, job)
+    for name in ("metrics.json", "verdict.json", "contact_sheet.png"):
+        assert hashlib.sha256((job.out / name).read_bytes()).digest() == hashlib.sha256((whole.out / name).read_bytes()).digest()
+    finished = len(list((tmp_path / "work").glob("view_*.json"))) - len(second.calls)
+    assert finished == moment // 2
+
+
+@pytest.mark.parametrize("how", SPOILERS)
+@pytest.mark.parametrize("pattern", ["view_*", "picture_*"])
+def test_every_scratch_file_of_an_evaluation_may_be_damaged(tmp_path: Path, pattern: str, how: str) -> None:
+    poses = make_scene(tmp_path / "poses", "tttt", background=None)
+    whole = job_in(tmp_path / "whole", poses, settings(field_views=2))
+    measure(TREE, lambda: BallField(TREE), whole)
+    shutil.copytree(whole.work, tmp_path / "work")
+    for path in sorted(whole.work.glob(pattern)):
+        SPOILERS[how](tmp_path / "work" / path.name)
+    events: list[dict[str, Any]] = []
+    job = job_in(tmp_path, poses, settings(field_views=2), report=events.append)
+    measure(TREE, lambda: BallField(TREE), job)
+    for name in ("metrics.json", "contact_sheet.png"):
+        assert (job.out / name).read_bytes() == (whole.out / name).read_bytes()
+    warned = [event["text"].partition(" ")[0] for event in events if event["event"] == "warning" and ".json" in event["text"].partition(" ")[0]]
+    assert warned == ["view_00000.json" if pattern == "view_*" else "view_00001.json"]
+
+
+@pytest.mark.parametrize(
+    "value", [None, {}, {"name": "v0.png", "network": None, "asset": {}}, {"name": "v0.png", "network": None, "asset": None}, {"name": "v9.png"}]
+)
+def test_odd_metrics_in_scratch_are_measured_again(tmp_path: Path, value: Any) -> None:
+    poses = make_scene(tmp_path / "poses", "tt")
+    whole = job_in(tmp_path / "whole", poses, settings(field_views=1))
+    measure(TREE, lambda: BallField(TREE, background=WHITE), whole)
+    for k in range(2):
+        (tmp_path / "work").mkdir(exist_ok=True)
+        note(tmp_path / "work" / f"view_{k:05d}.json", value)
+    job = job_in(tmp_path, poses, settings(field_views=1))
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    assert (job.out / "metrics.json").read_bytes() == (whole.out / "metrics.json").read_bytes()
+
+
+def test_the_field_is_not_loaded_where_nothing_needs_it(tmp_path: Path) -> None:
+    poses = make_scene(tmp_path / "poses", "tt")
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job_in(tmp_path, poses))
+
+    def refuse() -> Any:
+        raise AssertionError("loaded")
+
+    measure(TREE, refuse, job_in(tmp_path, poses, out="again"))
+
+
+def test_spread_is_even_and_complete() -> None:
+    assert evenly_spaced(10, None) == evenly_spaced(10, 12) == list(range(10))
+    assert evenly_spaced(10, 2) == [2, 7]
+    assert evenly_spaced(9, 1) == [4]
+    for count in range(1, 30):
+        for wanted in range(1, count):
+            chosen = evenly_spaced(count, wanted)
+            assert len(set(chosen)) == wanted
+            assert 0 <= chosen[0] <= chosen[-1] < count
+
+
+def test_stride_for_bounds_the_pixels() -> None:
+    view = View("a", None, "test", Camera("a", 100, 100, "SIMPLE_PINHOLE", (1.0, 50.0, 50.0), np.eye(4)), None, 0.0, 1.0)
+    assert stride_for([view] * 4, 40_000) == 1
+    assert stride_for([view] * 4, 10_000) == 2
+    assert stride_for([view] * 4, 9_999) == 3
+    assert stride_for([], 1) == 1
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 4])
+@pytest.mark.parametrize("model", [("SIMPLE_RADIAL", (70.0, 31.0, 20.0, 0.1)), ("OPENCV_FISHEYE", (70.0, 72.0, 31.0, 20.0, 0.1, 0.01, 0.0, 0.0))])
+def test_a_subsampled_camera_has_the_rays_of_the_pixels_that_are_kept(stride: int, model: tuple[str, tuple[float, ...]]) -> None:
+    camera = Camera("a", 61, 44, *model, pose_on_sphere((0.0, 0.0, 0.0), 3.0, 10.0, 20.0))
+    small = subsample_camera(camera, stride)
+    expected = subsample(rays(camera)[1].reshape(44, 61, 3), stride)
+    np.testing.assert_allclose(rays(small)[1].reshape(small.height, small.width, 3), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 4])
+def test_upsampling_gives_back_what_was_kept_and_straight_lines_between(stride: int) -> None:
+    y, x = np.mgrid[0:40, 0:50].astype(np.float32)
+    ramp = np.stack([x, y, x + 2 * y, np.ones_like(x)], -1)
+    again = upsample(subsample(ramp, stride), stride, 50, 40)
+    np.testing.assert_allclose(subsample(again, stride), subsample(ramp, stride), atol=1e-4)
+    inner = slice(stride, -stride)
+    np.testing.assert_allclose(again[inner, inner], ramp[inner, inner], atol=0.2)  # OpenCV knows 32 places between two pixels

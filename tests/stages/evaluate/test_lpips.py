@@ -1,0 +1,136 @@
+"""LPIPS against its formula with made-up weights, from files; and what is said where they are missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
+from pipeline.errors import BadInput, UsageError
+from stages.evaluate.comparison import AGAINST_NETWORK, GAP, lpips_metrics
+from stages.evaluate.lpips_weights import BACKBONES, load_lpips
+from stages.evaluate.mesh import FIGURES
+from stages.evaluate.run import STAGE, EvaluateSettings
+from stages.evaluate.summary import summary
+from stages.evaluate.views import GroundTruth
+
+
+@pytest.fixture(autouse=True)
+def nowhere_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "home"))
+
+
+def made_up(network: str) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    generator = torch.Generator().manual_seed(len(network))
+    own = _layers(network).state_dict()
+    features = {f"features.{name}": torch.randn(t.shape, generator=generator) * (2 / max(1, t[0].numel())) ** 0.5 for name, t in own.items()}
+    features["classifier.6.weight"] = torch.zeros(3)  # the rest of the network is not looked at
+    heads = {f"lin{n}.model.1.weight": torch.rand(1, c, 1, 1, generator=generator) for n, c in enumerate(CHANNELS[network])}
+    return features, heads
+
+
+def written(folder: Path, network: str) -> str:
+    folder.mkdir(exist_ok=True)
+    features, heads = made_up(network)
+    torch.save(features, folder / BACKBONES[network])
+    torch.save(heads, folder / f"{network}.pth")
+    return str(folder)
+
+
+def images(side: int = 70) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return rng.random((side, side + 9, 3)), rng.random((side, side + 9, 3))
+
+
+@pytest.mark.parametrize("network", ["alex", "vgg"])
+def test_it_is_the_formula(network: str, tmp_path: Path) -> None:
+    metric = load_lpips(network, written(tmp_path / "weights", network), bundled=[])
+    image, truth = images()
+    features, heads = made_up(network)
+    inputs = [((2 * a - 1 - np.array(SHIFT)) / np.array([0.458, 0.448, 0.450])).transpose(2, 0, 1)[None] for a in (image, truth)]
+    x, y = (torch.tensor(a, dtype=torch.float32) for a in inputs)
+    expected, tap = 0.0, 0
+    layers = _layers(network)
+    layers.load_state_dict({name.removeprefix("features."): t for name, t in features.items() if name.startswith("features.")})
+    with torch.no_grad():
+        for n, layer in enumerate(layers):
+            x, y = layer(x), layer(y)
+            if n in TAPS[network]:
+                assert isinstance(layer, torch.nn.ReLU)
+                assert x.shape[1] == CHANNELS[network][tap]
+                one, other = (f / f.norm(dim=1, keepdim=True).clamp(min=1e-4) for f in (x, y))
+                head = heads[f"lin{tap}.model.1.weight"][0, :, 0, 0].numpy()
+                expected += np.einsum("chw,c->hw", ((one - other) ** 2)[0].numpy(), head).mean()
+                tap += 1
+    assert tap == 5
+    assert metric(image, truth) == pytest.approx(expected, rel=1e-3)
+    assert metric(truth, image) == pytest.approx(metric(image, truth), rel=1e-5)
+    assert metric(truth, truth) == 0
+    assert metric(0.9 * truth + 0.1 * image, truth) < metric(image, truth)
+
+
+def test_what_a_mask_leaves_out_does_not_count(tmp_path: Path) -> None:
+    metric = load_lpips("alex", written(tmp_path / "weights", "alex"), bundled=[])
+    image, truth = images()
+    mask = np.zeros(image.shape[:2], bool)
+    assert metric(image, truth, mask) == 0
+    mask[:, :40] = True
+    assert 0 < metric(image, truth, mask) < metric(image, truth)
+
+
+def test_missing_weights_are_named_with_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"alexnet-owt-7be5be79\.pth.*download\.pytorch\.org.*lpips_weights.*lpips=off"):
+        load_lpips("alex", str(tmp_path), bundled=[])
+    folder = Path(written(tmp_path / "weights", "vgg"))
+    (folder / "vgg.pth").unlink()
+    with pytest.raises(UsageError, match=r"vgg\.pth.*efficientnerf\[lpips\]"):
+        load_lpips("vgg", str(folder), bundled=[])
+
+
+def test_weights_in_torchs_cache_are_found(tmp_path: Path) -> None:
+    folder = Path(written(tmp_path / "weights", "alex"))
+    (tmp_path / "home/hub/checkpoints").mkdir(parents=True)
+    (folder / BACKBONES["alex"]).rename(tmp_path / "home/hub/checkpoints" / BACKBONES["alex"])
+    load_lpips("alex", None, bundled=[folder])
+
+
+def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:
+    folder = Path(written(tmp_path / "weights", "alex"))
+    torch.save({"lin0.model.1.weight": torch.zeros(1, 3, 1, 1)}, folder / "alex.pth")
+    with pytest.raises(BadInput, match=r"lin0.*expected \(1, 64, 1, 1\)"):
+        load_lpips("alex", str(folder), bundled=[])
+    (folder / "alex.pth").write_bytes(b"not weights")
+    with pytest.raises(BadInput, match="not a readable file of weights"):
+        load_lpips("alex", str(folder), bundled=[])
+
+
+def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
+    metrics = {"lpips_alex": load_lpips("alex", written(tmp_path / "weights", "alex"), bundled=[])}
+    image, truth = (a.astype(np.float32) for a in images())
+    figures = lpips_metrics(metrics, image, GroundTruth(truth, None, None))
+    assert figures["lpips_alex"] is not None
+    assert figures["lpips_alex"] > 0
+    assert lpips_metrics(metrics, image[:50], GroundTruth(truth[:50], None, None)) == {"lpips_alex": None}
+    some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, "psnr_colour_fitted": 21.0, **figures}
+    network = {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0, "floaters": None}
+    against = {"asset_with_network_background": None, "gap": dict.fromkeys(GAP), **dict.fromkeys(AGAINST_NETWORK)}
+    against |= {"trivial": None, "sparse_points": None}
+    views = [{"name": "a", "network": network, "asset": {**some, "lpips_alex": None}, "mesh": dict.fromkeys(FIGURES), **against}]
+    found = summary(views, split="test", stride=1, background=None, mesh={"faces": 2}, perceptual=("lpips_alex",))
+    assert found["network"]["lpips_alex"] == figures["lpips_alex"]
+    assert found["asset"]["lpips_alex"] is None
+    assert Lpips.__doc__
+
+
+def test_missing_weights_are_told_before_any_stage_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert STAGE.check is not None
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "none"))
+    folder = written(tmp_path / "weights", "alex")
+    STAGE.check({"evaluate": EvaluateSettings()})
+    STAGE.check({"evaluate": EvaluateSettings(lpips="alex", lpips_weights=str(folder))})
+    for lpips in ("vgg", "both"):
+        with pytest.raises(UsageError, match=r"vgg16.*were not found"):
+            STAGE.check({"evaluate": EvaluateSettings(lpips=lpips, lpips_weights=str(folder))})

@@ -1,0 +1,128 @@
+"""The mesh's figures: a mesh as good as its asset is as good as that, a worse one is not, and what lies round it is the asset's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset import region
+from efficientnerf.asset.region import Region
+from efficientnerf.asset.rendering import Rendering
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.surface.mesh import Mesh, Texture
+from stages.evaluate.mesh import EvaluatedMesh, evaluated_mesh, mesh_image
+from stages.evaluate.run import evaluate
+from stages.io.scene import Scene, load
+from tests.efficientnerf.trees import random_cascades
+from tests.fakes import WHITE, BallField
+from tests.stages.evaluate.balls import BALL_MESH, TREE, ball_mesh, figures_of, job_in, make_scene, settings
+
+
+def score(tmp_path: Path, mesh: EvaluatedMesh, *, background: tuple[float, float, float] | None = WHITE, masked: bool = False) -> dict:
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "rtt", background=background, masked=masked), settings(field_views=1))
+    evaluate(TREE.evaluated(), TREE, lambda: BallField(TREE, background=background), job, mesh)
+    return figures_of(job)
+
+
+@pytest.mark.parametrize("background", [WHITE, None], ids=["constant background", "the field's surroundings"])
+def test_the_true_surface_is_about_as_good_as_the_asset(tmp_path: Path, background: tuple[float, float, float] | None) -> None:
+    """The ball's rim is soft in the photographs, and the mesh has one."""
+    found = score(tmp_path, BALL_MESH, background=background)
+    mesh = found["mesh"]
+    assert mesh["psnr"] > 28
+    assert mesh["ssim"] > 0.9
+    assert mesh["psnr_covered"] > 25
+    assert mesh["asset_psnr_covered"] > mesh["psnr_covered"]
+    assert (mesh["faces"], mesh["vertices"], mesh["texture_size"], mesh["views"]) == (1280, 642, None, 2)
+    assert mesh["psnr_vertex_colours"] == mesh["psnr"], "it has no texture"
+    assert mesh["covered"] == pytest.approx(np.pi * (0.6 * 70 / np.sqrt(3**2 - 0.6**2)) ** 2 / (60 * 44), rel=0.05)
+    assert mesh["psnr"] == pytest.approx(np.mean([view["mesh"]["psnr"] for view in found["views"]]))
+
+
+def test_less_mesh_is_worse_and_wrong_colours_are_on_its_own_pixels(tmp_path: Path) -> None:
+    whole = ball_mesh()
+    half = replace(whole, faces=whole.faces[whole.vertices[whole.faces].mean(1)[:, 2] > 0])
+    dark = replace(whole, colours=whole.colours * np.float32(0.5))
+    good, lost, wrong = (score(tmp_path / str(k), evaluated_mesh(mesh, None))["mesh"] for k, mesh in enumerate((whole, half, dark)))
+    assert lost["psnr"] < good["psnr"] - 8
+    assert lost["covered"] < 0.8 * good["covered"]
+    assert wrong["psnr_covered"] < good["psnr_covered"] - 8
+    # the same squared error, over all pixels and over those of the mesh
+    assert 10 ** (-wrong["psnr"] / 10) == pytest.approx(10 ** (-wrong["psnr_covered"] / 10) * wrong["covered"], rel=0.1)
+
+
+def test_what_masks_hide_does_not_count(tmp_path: Path) -> None:
+    assert score(tmp_path, BALL_MESH, masked=True)["mesh"]["psnr"] > 28
+
+
+def test_the_texture_counts_and_the_vertices_beside_it(tmp_path: Path) -> None:
+    """A texture with a texel for each face, in the right colours, on a mesh whose vertices are black."""
+    whole = ball_mesh()
+    side = 36  # 1296 texels
+    place = (np.stack([np.arange(1280) % side, side - 1 - np.arange(1280) // side], 1) + 0.5) / side
+    picture = np.zeros((side * side, 3), np.uint8)
+    picture[:1280] = np.round(255 * TREE.colour(whole.vertices[whole.faces].mean(1)))
+    texture = Texture(np.repeat(place[:, None], 3, 1), picture.reshape(side, side, 3))
+    mesh = replace(whole, colours=np.zeros_like(whole.colours), texture=texture)
+    found = score(tmp_path, evaluated_mesh(mesh, None))["mesh"]
+    assert found["psnr"] > 27
+    assert found["psnr_vertex_colours"] < 15
+    assert found["texture_size"] == side
+
+
+def flat(colour: tuple[float, float, float], depth: float):  # type: ignore[no-untyped-def]
+    def render(camera: Camera, *, background: tuple[float, float, float] | None = None, normals: bool = True) -> Rendering:
+        size = (camera.height, camera.width)
+        return Rendering(np.full((*size, 3), colour, np.float32), np.ones(size, np.float32), np.full(size, depth, np.float32), np.zeros((*size, 3)))
+
+    return render
+
+
+@pytest.mark.parametrize(("depth", "shown"), [(2.0, False), (6.0, True)], ids=["before it", "behind it"])
+def test_surroundings_that_are_nearer_hide_the_mesh(tmp_path: Path, depth: float, shown: bool) -> None:
+    """The cameras are three away from the middle of the ball."""
+    scene: Scene = load(make_scene(tmp_path / "poses", "t"))
+    around = replace(BALL_MESH, surroundings=flat((0.0, 1.0, 0.0), depth))
+    image, plain, covered = mesh_image(around, TREE.evaluated(), scene, scene.views[0], None, 1)
+    middle = image[22, 30]
+    np.testing.assert_allclose(image[0, 0], [0, 1, 0])
+    assert (covered[22, 30], bool(abs(middle - [0, 1, 0]).max() > 0.2)) == (float(shown), shown)
+    np.testing.assert_array_equal(image, plain)
+
+
+def test_foreground_and_surroundings_make_up_the_whole() -> None:
+    """Voxel by voxel the opacities of the two sum to the tree's; the environment belongs to the surroundings."""
+    tree = random_cascades(3)
+    middle, size = (tree.bounds_min + tree.bounds_max) / 2, tree.bounds_max - tree.bounds_min
+    tree = replace(tree, region=Region(np.stack([middle - 0.3 * size, middle + 0.3 * size]), 0.0, 0.2 * float(size.min())))
+    share = region.inside_share(tree.region, region.voxel_centres(tree))
+    front, rest = region.foreground(tree), region.surroundings(tree)
+    assert ((share > 0) & (share < 1)).any()
+    assert len(front.density_values) == (share > 0).sum()
+    assert len(rest.density_values) == (share < 1).sum()
+    side = region.voxel_sides(tree)
+
+    def alpha(part: object, kept: np.ndarray) -> np.ndarray:
+        out = np.zeros(len(share))
+        out[kept] = -np.expm1(-side[kept] * part.density_values)  # type: ignore[attr-defined]
+        return out
+
+    np.testing.assert_allclose(alpha(front, share > 0) + alpha(rest, share < 1), alpha(tree, np.ones(len(share), bool)), atol=1e-5)
+    assert front.environment is None
+    assert rest.environment is tree.environment
+    assert rest.region is None
+    alone = region.surroundings(tree, all_is_foreground=True)
+    assert len(alone.density_values) == 0
+    assert alone.environment is tree.environment
+
+
+def test_a_mesh_without_surroundings_of_its_own_stands_before_what_the_asset_is_drawn_on(tmp_path: Path) -> None:
+    scene = load(make_scene(tmp_path / "poses", "t"))
+    empty = evaluated_mesh(Mesh(np.eye(3) * 100, np.array([[0, 1, 2]]), np.eye(3), np.zeros((3, 3), np.float32)), None)
+    image, _, covered = mesh_image(empty, replace(TREE.evaluated(), render=partial(TREE.render)), scene, scene.views[0], None, 1)
+    np.testing.assert_array_equal(image, np.ones_like(image))
+    assert not covered.any()

@@ -1,0 +1,94 @@
+"""Strips at full size and the video of the captured path: what they show, what they cost, the same after a stop."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.stage import Job
+from stages.io.scene import load
+from tests.fakes import WHITE, BallField
+from tests.stages.evaluate.balls import HEIGHT, TREE, WIDTH, figures_of, job_in, make_scene, measure, settings
+from tests.stages.spoilers import SPOILERS
+
+
+def test_strips_show_worst_median_and_best_at_full_size(tmp_path: Path) -> None:
+    poses = make_scene(tmp_path / "poses", "tttt", background=None)
+    worse, job = replace(TREE, centre=(0.1, 0.0, 0.0)), job_in(tmp_path, poses, settings(strips="on", field_views=1, field_image_scale=0.5))
+    field = BallField(TREE)
+    measure(worse, lambda: field, job)
+    found = figures_of(job)
+    ranked = sorted(found["views"], key=lambda view: view["asset"]["psnr"])
+    assert [(strip["which"], strip["view"]) for strip in found["strips"]] == [("worst", ranked[0]["name"]), ("median", ranked[2]["name"]),
+                                                                              ("best", ranked[3]["name"])]  # fmt: skip
+    assert [call[1:] for call in field.calls[-3:]] == [(WIDTH, HEIGHT)] * 3
+    for strip in found["strips"]:
+        with Image.open(job.out / strip["file"]) as image:
+            assert image.width >= 3 * WIDTH
+            picture = np.asarray(image)
+        assert strip["network"]["psnr"] > 45 > strip["asset"]["psnr"]
+        view = next(view for view in load(poses).views if view.name == strip["view"])
+        with Image.open(poses / view.image) as image:
+            photograph = np.asarray(image)
+        rows, columns = np.nonzero((picture == photograph[0, 0]).all(-1))
+        assert any(np.array_equal(picture[y : y + HEIGHT, x : x + WIDTH], photograph) for y, x in zip(rows, columns, strict=True)), "pixel for pixel"
+
+
+@pytest.mark.parametrize(("splits", "expected"), [("t", ["median"]), ("tt", ["worst", "best"])])
+def test_few_views_give_few_strips(tmp_path: Path, splits: str, expected: list[str]) -> None:
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", splits), settings(strips="on"))
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    assert [strip["which"] for strip in figures_of(job)["strips"]] == expected
+    assert sorted(path.name for path in job.out.glob("strip_*")) == sorted(f"strip_{which}.png" for which in expected)
+
+
+def test_strips_of_large_photographs_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stages.evaluate.strips.STRIP_RAYS", WIDTH * HEIGHT // 4)
+    job, field = job_in(tmp_path, make_scene(tmp_path / "poses", "t"), settings(strips="on")), BallField(TREE, background=WHITE)
+    measure(TREE, lambda: field, job)
+    assert field.calls[-1][1:] == (WIDTH // 2, HEIGHT // 2)
+    assert figures_of(job)["strips"][0]["network"]["psnr"] > 50
+
+
+def test_the_captured_path_is_a_video_of_the_asset(tmp_path: Path) -> None:
+    import av
+
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "rrtr"), settings(captured_path_frames=7))
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    with av.open(str(job.out / "captured_path.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(frames) == 7
+    assert frames[0].shape == (352, 480, 3)
+    first = TREE.render(replace(load(tmp_path / "poses").views[0].camera, width=480, height=352, params=(560.0, 240.0, 176.0)), background=WHITE).colour
+    assert np.abs(frames[0] / 255.0 - first).mean() < 0.02, "it begins at the first photograph"
+    assert sorted(path.name for path in job.out.iterdir()) == ["captured_path.mp4", "contact_sheet.png", "metrics.json", "verdict.json"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Job]:
+    """Poses and a job that has been done, with its work folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    poses = make_scene(folder / "poses", "tt")
+    job = job_in(folder, poses, settings(strips="on", captured_path_frames=2))
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    return poses, job
+
+
+@pytest.mark.parametrize("pattern", ["strip_*", "captured/frame_*"])
+@pytest.mark.parametrize("how", SPOILERS)
+def test_damaged_strips_and_frames_are_made_again(whole: tuple[Path, Job], tmp_path: Path, how: str, pattern: str) -> None:
+    poses, undisturbed = whole
+    shutil.copytree(undisturbed.work, tmp_path / "work")
+    for path in sorted(undisturbed.work.glob(pattern)):
+        SPOILERS[how](tmp_path / "work" / path.relative_to(undisturbed.work))
+    job = job_in(tmp_path, poses, undisturbed.settings)
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    names = [path.name for path in sorted(undisturbed.out.iterdir())]
+    assert len(names) == 6
+    for name in names:
+        assert (job.out / name).read_bytes() == (undisturbed.out / name).read_bytes()

@@ -1,0 +1,382 @@
+"""Exports of other programs: a known point lies at the known pixel in every image, and each folder is taken by one importer."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.geometry.cameras import opengl_from_pose, project
+from pipeline.errors import BadInput
+from stages.formats import importers
+from stages.formats.importers.brown import MAX_ERROR, quotient_of_cubics
+from stages.formats.importers.description import describe_source
+from stages.io.capture import Capture
+from tests.stages import captures, exports
+from tests.stages.captures import Settings
+from tests.stages.exports import EXPORTS, POINTS, read
+
+
+def assert_seen(capture: Capture, pixels: exports.Pixels, atol: float = 1e-6) -> None:
+    """The points lie where they should in every image, and in front of it."""
+    found = {photo.image.name: project(photo.camera, POINTS) for photo in capture.photos}
+    assert set(found) == set(pixels)
+    for name, (where, depth) in found.items():
+        np.testing.assert_allclose(where, pixels[name], atol=atol, err_msg=name)
+        assert (depth > 0).all()
+
+
+# A fourth radial coefficient becomes a quotient of polynomials.
+TOLERANCE = {"metashape": 0.03, "realitycapture csv": 0.01, "realitycapture xmp": 0.01}
+
+
+@pytest.mark.parametrize("how", EXPORTS)
+def test_a_known_point_lies_at_the_known_pixel_in_every_image(how: str, tmp_path: Path) -> None:
+    name, write = EXPORTS[how]
+    folder, pixels = write(tmp_path / "source")
+    assert importers.detect(folder) == name
+    capture = read(folder)
+    assert capture.kind == name
+    assert len(capture.photos) == 6
+    assert_seen(capture, pixels, TOLERANCE.get(how, 1e-6))
+    listed = importers.files(folder, Settings())
+    assert {photo.image for photo in capture.photos} < set(listed)
+    assert all(path.is_file() for path in listed)
+    described = describe_source(folder)
+    json.dumps(described, allow_nan=False)
+    assert (described["count"], described["format"]) == (6, name)
+
+
+EVERY = {how: (name, write) for how, (name, write) in EXPORTS.items()} | {
+    how: (name, lambda folder, write=write: (write(folder), {})) for how, (name, write) in captures.WRITERS.items()
+}
+
+
+@pytest.mark.parametrize("how", EVERY)
+def test_one_importer_takes_a_folder(how: str, tmp_path: Path) -> None:
+    name, write = EVERY[how]
+    folder, _ = write(tmp_path / "source")
+    assert [other for other in importers.candidates(folder) if other != "photographs"] == [name]
+
+
+# --- what each format holds beside cameras
+
+
+def test_metashapes_project_frame_and_cameras_without_a_place(tmp_path: Path) -> None:
+    folder, pixels = exports.metashape(tmp_path / "a", {"f": 40.0, "k1": -0.1, "p1": 0.002})
+    capture = read(folder)
+    assert_seen(capture, pixels)
+    assert capture.metric
+    assert capture.rejected == (("img_9", "not aligned in Metashape"),)
+    assert {photo.camera.model for photo in capture.photos} == {"OPENCV"}
+    assert not any("listed" in warning for warning in capture.warnings), "labels state no folder"
+
+
+def test_metashapes_fisheye_lens(tmp_path: Path) -> None:
+    lens = {"f": 25.0, "cx": 0.3, "cy": -0.2, "b1": 0.4, "k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": -0.0005}
+    folder, pixels = exports.metashape(tmp_path / "a", lens, "fisheye")
+    capture = read(folder)
+    assert_seen(capture, pixels)
+    assert capture.photos[0].camera.model == "OPENCV_FISHEYE"
+
+
+def test_a_geocentric_project_keeps_scale_and_finds_up(tmp_path: Path) -> None:
+    folder, _ = exports.metashape(tmp_path / "a")
+    text = (folder / "cameras.xml").read_text()
+    place = np.array([4.0e6, 0.8e6, 4.9e6])
+    (folder / "cameras.xml").write_text(text.replace(exports.words(exports.CHUNK[1]), exports.words(place)))
+    capture = read(folder)
+    assert capture.up is not None
+    np.testing.assert_allclose(capture.up, place / np.linalg.norm(place))
+    centres = np.array([photo.camera.centre for photo in capture.photos])
+    truth = np.array([camera.centre for camera in exports.cameras()]) - exports.CHUNK[1]
+    np.testing.assert_allclose(centres, truth, atol=1e-9)
+    assert any("positions are from the chunk's own origin" in warning for warning in capture.warnings)
+
+
+@pytest.mark.parametrize(
+    ("lens", "kind", "word"),
+    [
+        ({"f": 40.0, "b2": 5.0}, "frame", "skew"),
+        ({"f": 40.0, "p3": 0.1}, "frame", "p3, p4"),
+        ({"f": 40.0}, "spherical", "a spherical camera; frame and fisheye"),
+        ({"f": 40.0, "p1": 0.1}, "fisheye", "a fisheye lens with p1, p2"),
+        ({"f": -1.0}, "frame", "focal length -1"),
+        ({"f": 4e5, "cx": 5e5, "k4": 0.5}, "frame", "radial distortion"),
+        ({"f": float("nan")}, "frame", "expected a finite number"),
+    ],
+)
+def test_lenses_of_metashape_that_no_model_describes_are_refused(lens: dict[str, float], kind: str, word: str, tmp_path: Path) -> None:
+    folder, _ = exports.metashape(tmp_path / "a", lens, kind)
+    with pytest.raises(BadInput, match=word):
+        read(folder)
+
+
+@pytest.mark.parametrize("k4", [0.2, -0.076, 0.001])
+def test_a_fourth_radial_coefficient_becomes_a_quotient(k4: float) -> None:
+    r = np.linspace(0, 0.9, 50)
+    factor = np.array([1.0, -0.1, 0.05, 0.01, k4])
+    top, bottom = quotient_of_cubics(factor, 4000.0, float(0.9 * np.polyval(factor[::-1], 0.81)), "a lens")
+    found = np.polyval(top[::-1], r * r) / np.polyval(bottom[::-1], r * r)
+    assert np.abs(found - np.polyval(factor[::-1], r * r)).max() * 4000 < MAX_ERROR
+
+
+def test_opensfms_points_and_reconstructions(tmp_path: Path) -> None:
+    folder, _ = exports.opensfm(tmp_path / "a", ".")
+    capture = read(folder)
+    assert capture.points is not None
+    np.testing.assert_allclose(capture.points.xyz, POINTS)
+    assert capture.points.tracks == ((0, 1, 2, 3),) * 3 + ((),) * 6
+    assert capture.points.rgb[4].tolist() == [10, 20, 34]
+    assert capture.metric
+    assert any("the reconstruction with 6 images is used; there are others with 1" in warning for warning in capture.warnings)
+
+
+def test_kaptures_points_and_images_without_a_pose(tmp_path: Path) -> None:
+    capture = read(exports.kapture(tmp_path / "a")[0])
+    assert capture.points is not None
+    np.testing.assert_allclose(capture.points.xyz, POINTS)
+    assert capture.points.tracks == ((), (), (0, 3), (), (1,), (), (), (), ())
+    assert capture.rejected == (("map/lost.png", "without a pose"),)
+
+
+def test_polycam_without_corrected_cameras(tmp_path: Path) -> None:
+    folder, pixels = exports.polycam(tmp_path / "a", corrected=False)
+    (folder / "keyframes/cameras/img_5.json").unlink()
+    capture = read(folder)
+    assert_seen(capture, {name: where for name, where in pixels.items() if name != "img_5.jpg"})
+    assert capture.metric
+    assert capture.up is not None
+    assert capture.up.tolist() == [0, 1, 0]
+    assert capture.rejected == (("keyframes/images/img_5.jpg", "without a camera file"),)
+    assert any("the phone's own poses" in warning for warning in capture.warnings)
+
+
+def test_splits_bounds_masks_and_bad_frames(tmp_path: Path) -> None:
+    plain = read(exports.nsvf(tmp_path / "nsvf")[0])
+    assert [photo.split for photo in plain.photos] == ["train"] * 2 + ["val"] * 2 + ["test"] * 2
+    assert plain.bounds is not None
+    np.testing.assert_allclose(plain.bounds, [[-1, -1.5, -2], [1, 1.5, 2]])
+    sphere = read(exports.idr(tmp_path / "idr")[0])
+    assert sphere.bounds is not None
+    np.testing.assert_allclose(sphere.bounds, [[-1.9, -1.8, -1.7], [2.1, 2.2, 2.3]])
+    assert [photo.mask for photo in sphere.photos] == [tmp_path / f"idr/mask/{index:03d}.png" for index in range(6)]
+    indoor = read(exports.scannetpp(tmp_path / "scannetpp")[0])
+    splits = {photo.image.name: photo.split for photo in indoor.photos}
+    assert splits == {f"img_{index}.JPG": "train" if index < 4 else "test" for index in range(6)}
+    assert ("img_9.JPG", "marked as bad by the data set") in indoor.rejected
+    assert indoor.metric
+
+
+def test_open3ds_intrinsics(tmp_path: Path) -> None:
+    folder, pixels = exports.tanks(tmp_path / "a")
+    (folder / "intrinsics.txt").unlink()
+    with pytest.raises(BadInput, match=r"without intrinsics\. Write fx fy cx cy"):
+        read(folder)
+    captures.write_json(folder / "intrinsic.json", {"width": 32, "height": 24, "intrinsic_matrix": [40, 0, 0, 0, 42, 0, 15.5, 12.5, 1]})
+    assert_seen(read(folder), pixels)
+
+
+def test_transforms_of_phone_apps_with_a_lens_for_each_frame(tmp_path: Path) -> None:
+    """As NeRFCapture writes them: names without extension, depth beside the images, a size and a lens in every frame."""
+    frames, pixels = [], {}
+    for index, camera in enumerate(exports.cameras()):
+        matrix = opengl_from_pose(camera.world_from_camera)
+        lens = {"fl_x": 40.0 + index, "fl_y": 41.0, "cx": 15.5, "cy": 12.5, "w": 32, "h": 24}
+        pixels[camera.name] = exports.opengl_pinhole(matrix, *list(lens.values())[:4])
+        frame = {"file_path": f"images/img_{index}", "depth_path": f"images/img_{index}.depth.png", "transform_matrix": matrix.tolist()}
+        frames.append(frame | {"timestamp": index} | lens)
+    captures.write_json(tmp_path / "transforms.json", {"frames": frames, "integer_depth_scale": 1.0, "fl_x": 1.0, "fl_y": 1.0})
+    captures.write_pictures(tmp_path / "images", [*pixels, *(f"img_{index}.depth.png" for index in range(6))])
+    assert importers.detect(tmp_path) == "instant-ngp"
+    assert_seen(read(tmp_path), pixels)
+
+
+# --- images elsewhere
+
+
+def moved(folder: Path, to: str) -> Path:
+    (folder / "images").rename(folder / to)
+    return folder
+
+
+@pytest.mark.parametrize("how", ["nerfstudio", "colmap bin"])
+def test_images_under_another_folder_are_found_and_said(how: str, tmp_path: Path) -> None:
+    folder = moved(captures.WRITERS[how][1](tmp_path / "a"), "photographs of today")
+    capture = read(folder)
+    captures.assert_same_rays(capture, captures.cameras())
+    assert any("6 images are not where they are listed" in warning and "photographs of today/img_0.png" in warning for warning in capture.warnings)
+    assert len([path for path in importers.files(folder, Settings()) if path.suffix == ".png"]) == 6
+
+
+def test_two_folders_that_hold_as_many_are_not_chosen_between(tmp_path: Path) -> None:
+    folder = moved(captures.nerfstudio(tmp_path / "a"), "left")
+    captures.write_pictures(folder / "right", [f"img_{index}.png" for index in range(6)])
+    with pytest.raises(BadInput, match="6 of 6 listed images are missing"):
+        read(folder)
+    (folder / "right/img_5.png").unlink()
+    assert {photo.image.parent.name for photo in read(folder).photos} == {"left"}
+
+
+def test_depth_and_masks_do_not_stand_in_for_images(tmp_path: Path) -> None:
+    folder = moved(captures.nerfstudio(tmp_path / "a"), "depth")
+    (folder / "depth").rename(folder / "Depth")
+    with pytest.raises(BadInput, match="listed images are missing"):
+        read(folder)
+
+
+def test_what_is_missing_from_a_folder_that_is_there_is_missing(tmp_path: Path) -> None:
+    folder = captures.nerfstudio(tmp_path / "a")
+    (folder / "other").mkdir()
+    (folder / "images/img_0.png").rename(folder / "other/img_0.png")
+    capture = read(folder)
+    assert len(capture.photos) == 5
+    assert capture.rejected == (("images/img_0.png", "listed but missing on disk"),)
+
+
+def test_an_image_of_another_split_does_not_stand_in(tmp_path: Path) -> None:
+    """Blender's splits have files of the same names."""
+    made = captures.cameras()
+    renamed = [replace(camera, name=f"r_{index % 4}.png") for index, camera in enumerate(made)]
+    folder = captures.blender(tmp_path / "a", renamed)
+    for path in (folder / "train").iterdir():
+        path.unlink()
+    (folder / "train").rmdir()
+    with pytest.raises(BadInput, match="4 of 6 listed images are missing"):
+        read(folder)
+
+
+def test_bare_names_lie_in_the_usual_folder_of_several(tmp_path: Path) -> None:
+    folder, pixels = exports.metashape(tmp_path / "a")
+    captures.write_pictures(folder / "images_2", list(pixels))
+    assert {photo.image.parent.name for photo in read(folder).photos} == {"images"}
+
+
+# --- hostile
+
+
+BESIDE = ("pair.txt", "mesh_info.json", "bbox.txt", "points3d.txt", "observations.txt")
+LISTS = (".xml", ".csv", ".xmp", ".json", ".txt", ".npz", ".log")
+
+
+def lists_of(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*")) if path.suffix in LISTS and path.name not in BESIDE]
+
+
+@pytest.mark.parametrize("how", EXPORTS)
+def test_no_link_out_of_the_source_is_followed(how: str, tmp_path: Path) -> None:
+    for what in ("image", "list"):
+        folder, pixels = EXPORTS[how][1](tmp_path / what)
+        path = next(folder.rglob(list(pixels)[2])) if what == "image" else lists_of(folder)[0]
+        if how == "polycam":  # the corrected ones are used
+            path = folder / ("keyframes/corrected_images/img_2.jpg" if what == "image" else "keyframes/corrected_cameras/img_2.json")
+        (tmp_path / f"elsewhere {what}").mkdir()
+        target = path.rename(tmp_path / f"elsewhere {what}" / path.name)
+        path.symlink_to(target)
+        for attempt in (importers.files, lambda source, settings: read(source)):
+            with pytest.raises(BadInput, match=r"leads out of the source folder .* pass --allow-outside"):
+                attempt(folder, Settings())
+
+
+@pytest.mark.parametrize("how", EXPORTS)
+def test_damaged_lists_are_refused_or_read(how: str, tmp_path: Path) -> None:
+    """Cut off anywhere, with bytes of no encoding, with NaN, and with numbers that grow: BadInput of one printable line, or a capture."""
+    name, write = EXPORTS[how]
+    folder, _ = write(tmp_path / "a")
+    random = np.random.default_rng(3)
+    path = lists_of(folder)[0]
+    if how == "polycam":
+        path = folder / "keyframes/corrected_cameras/img_2.json"
+    data = path.read_bytes()
+    changed = [data[: int(at)] for at in random.integers(0, len(data), 6)]
+    changed += [b"", b"\xff\xfe" + data, data.replace(b"0", b"nan"), data.replace(b"1", b"9" * 400), data.replace(b"4", b"1e300"), b"[" * 2000 + data]
+    refused = []
+    for content in changed:
+        path.write_bytes(content)
+        capture = tried(name, folder)
+        if isinstance(capture, BadInput):
+            refused.append(str(capture))
+        else:
+            assert len(capture.photos) >= 3
+            assert all(np.isfinite(photo.camera.world_from_camera).all() for photo in capture.photos)
+    assert len(refused) >= 4
+    assert all(text.isprintable() and len(text) < 1000 for text in refused)
+
+
+def tried(name: str, folder: Path) -> Capture | BadInput:
+    try:
+        return importers.IMPORTERS[name].read(folder, Settings())
+    except BadInput as error:
+        return error
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/hostname", "..\\secret.png", "a\0b.png", "x" * 5000])
+@pytest.mark.parametrize("how", ["metashape", "realitycapture csv", "opensfm", "kapture", "scannet++"])
+def test_foreign_paths_lead_nowhere(how: str, name: str, tmp_path: Path) -> None:
+    folder, pixels = EXPORTS[how][1](tmp_path / "source")
+    captures.write_picture(tmp_path / "secret.png", captures.picture())
+    path = next(path for path in lists_of(folder) if list(pixels)[1] in path.read_text())
+    listed = next(word for word in ("map/img_1.png", list(pixels)[1]) if word in path.read_text())
+    if "\0" in name and path.suffix != ".json":
+        name = "&#1;" if path.suffix == ".xml" else "a\x01b.png"
+    path.write_text(path.read_text().replace(listed, json.dumps(name)[1:-1] if path.suffix == ".json" else name))
+    capture = tried(EXPORTS[how][0], folder)
+    if isinstance(capture, BadInput):
+        assert str(capture).isprintable()
+    else:
+        assert {photo.image.name for photo in capture.photos} == set(pixels) - {list(pixels)[1]}
+        assert all(folder in photo.image.parents for photo in capture.photos)
+
+
+ENTITIES = '<!DOCTYPE d [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize("how", ["metashape", "realitycapture xmp"])
+def test_entities_are_refused_before_they_expand(how: str, encoding: str, tmp_path: Path) -> None:
+    folder, _ = EXPORTS[how][1](tmp_path / "a")
+    path = lists_of(folder)[0]
+    text = path.read_text().replace('<?xml version="1.0" encoding="UTF-8"?>', "")
+    path.write_bytes((ENTITIES + text).encode(encoding))
+    with pytest.raises(BadInput, match="holds a document type; XML with entities is not read"):
+        read(folder)
+
+
+def test_xml_nested_deep_is_refused(tmp_path: Path) -> None:
+    folder, _ = exports.metashape(tmp_path / "a")
+    path = folder / "cameras.xml"
+    path.write_text(path.read_text().replace("<sensors", "<x>" * 100 + "</x>" * 100 + "<sensors"))
+    with pytest.raises(BadInput, match="within each other"):
+        read(folder)
+
+
+def test_an_archive_with_objects_or_bombs_is_refused(tmp_path: Path) -> None:
+    folder, _ = exports.idr(tmp_path / "a")
+    file = folder / "cameras_sphere.npz"
+    good = file.read_bytes()
+    np.savez(file, world_mat_0=np.array([{}], object), allow_pickle=True)
+    with pytest.raises(BadInput, match="expected numbers of shape"):
+        read(folder)
+    np.savez_compressed(file, world_mat_0=np.zeros((1000, 1000)))
+    with pytest.raises(BadInput, match="more than 4096 bytes"):
+        read(folder)
+    file.write_bytes(good[: len(good) // 2])
+    with pytest.raises(BadInput, match="not a NumPy archive, or truncated"):
+        read(folder)
+
+
+@pytest.mark.parametrize("how", EXPORTS)
+def test_missing_images_are_named_and_too_few_are_refused(how: str, tmp_path: Path) -> None:
+    folder, pixels = EXPORTS[how][1](tmp_path / "a")
+    for count, name in enumerate(list(pixels)[:4], 1):
+        for path in list(folder.rglob(name)):
+            path.unlink()
+        if how in ("idr", "tanks and temples", "record3d", "polycam", "3d scanner app") and count == 1:
+            continue  # which go by the files that are there, or refuse a count that differs
+        if count == 1:
+            assert any("1 of 6 listed images are missing" in warning for warning in read(folder).warnings)
+    with pytest.raises(BadInput):
+        read(folder)

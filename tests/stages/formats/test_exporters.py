@@ -1,0 +1,224 @@
+"""One contract for all exporters of meshes and points: written by us, read by others, and the same."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.surface.mesh import Mesh, PointCloud
+from pipeline.errors import BadInput, UsageError
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.las import step_of
+from stages.formats.exporters.writing import SourceFrame, source_frame
+from tests.stages.io.meshes import NEEDS_LAS, NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
+
+
+def cloud() -> PointCloud:
+    mesh = block()
+    return PointCloud(mesh.vertices, mesh.normals, mesh.colours)
+
+
+Read = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]  # vertices, normals, colours (sRGB 0-1), faces
+
+
+def read_by_trimesh(path: Path) -> Read:
+    import trimesh
+
+    mesh = trimesh.load(path, process=False, maintain_order=True)
+    if isinstance(mesh, trimesh.PointCloud):
+        return np.asarray(mesh.vertices), np.asarray(mesh.metadata["_ply_raw"]["vertex"]["data"][["nx", "ny", "nz"]].tolist()), mesh.colors[:, :3] / 255, None
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(6)
+    return np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), mesh.visual.vertex_colors[:, :3] / 255, np.asarray(mesh.faces)
+
+
+def read_glb(path: Path) -> Read:
+    document, blob = glb_document(path)
+    primitive = document["meshes"][0]["primitives"][0]
+    vertices, normals, colours = (accessor(document, blob, primitive["attributes"][name]) for name in ("POSITION", "NORMAL", "COLOR_0"))
+    assert document["accessors"][primitive["attributes"]["POSITION"]]["min"] == vertices.min(0).tolist()
+    assert document["accessors"][primitive["attributes"]["POSITION"]]["max"] == vertices.max(0).tolist()
+    assert colours.dtype == np.uint16
+    assert (colours[:, 3] == 65535).all()
+    linear = colours[:, :3] / 65535
+    srgb = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+    back = np.array(document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"])[:3, :3].T
+    return vertices @ back.T, normals @ back.T, srgb, accessor(document, blob, primitive["indices"]).reshape(-1, 3)
+
+
+def read_by_numpy(path: Path) -> Read:
+    rows = np.loadtxt(path)
+    return rows[:, :3], rows[:, 6:], rows[:, 3:6] / 255, None
+
+
+def read_by_usd(path: Path) -> Read:
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/surface/mesh"))
+    back = np.array(stage.GetRootLayer().customLayerData["usdFromCapture"]).reshape(3, 3)
+    linear = np.array(UsdGeom.PrimvarsAPI(shape).GetPrimvar("displayColor").Get())
+    srgb = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+    faces = np.array(shape.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    return np.array(shape.GetPointsAttr().Get()) @ back, np.array(shape.GetNormalsAttr().Get()) @ back, srgb, faces
+
+
+def read_by_laspy(path: Path) -> Read:
+    import laspy
+
+    read = laspy.read(path)
+    assert (str(read.header.version), read.point_format.id) == ("1.4", 7)
+    assert read.header.are_points_compressed == (path.suffix == ".laz")
+    normals = np.stack([read[name] for name in ("NormalX", "NormalY", "NormalZ")], axis=1)
+    return np.asarray(read.xyz), normals, np.stack([read.red, read.green, read.blue], axis=1) / 65535, None
+
+
+READERS: dict[str, Callable[[Path], Read]] = {".ply": read_by_trimesh, ".obj": read_by_trimesh, ".glb": read_glb, ".xyz": read_by_numpy,
+                                              ".usdz": read_by_usd, ".usdc": read_by_usd, ".las": read_by_laspy, ".laz": read_by_laspy}  # fmt: skip
+EXTENSIONS = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in MESH_EXPORTERS]
+
+
+@pytest.mark.parametrize("frame", [Z_UP, Y_DOWN], ids=["z up", "y down"])
+@pytest.mark.parametrize(
+    ("table", "extension"),
+    [
+        *(pytest.param("mesh", each, marks=NEEDS_USD if each.startswith(".usd") else ()) for each in READERS if each in MESH_EXPORTERS),
+        *(pytest.param("points", each, marks=NEEDS_LAS if POINT_EXPORTERS[each].extra else ()) for each in POINT_EXPORTERS),
+    ],
+)
+def test_others_read_what_was_written(table: str, extension: str, frame: SourceFrame, tmp_path: Path) -> None:
+    path, mesh = tmp_path / f"thing{extension}", block()
+    if table == "mesh":
+        MESH_EXPORTERS[extension](mesh, path, frame)
+    else:
+        POINT_EXPORTERS[extension](cloud(), path, frame)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the readers' own
+        vertices, normals, colours, faces = READERS[extension](path)
+    np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
+    np.testing.assert_allclose(normals, mesh.normals, atol=2e-5)
+    np.testing.assert_allclose(colours, mesh.colours, atol=0.5 / 255 + 1e-6 if extension in (".ply", ".obj", ".xyz", ".las", ".laz") else 2e-4)
+    if table == "mesh":
+        np.testing.assert_array_equal(faces, mesh.faces)
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_the_ply_header_is_the_agreed_one(tmp_path: Path) -> None:
+    MESH_EXPORTERS[".ply"](block(), tmp_path / "a.ply", Y_DOWN)
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    lines = head.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert lines[2] == "comment frame of the capture; up 0 -1 0; unit metre"
+    assert [line for line in lines if line.startswith("property")] == [
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        "property list uchar int vertex_indices",
+    ]
+    assert len(body) == 8 * 27 + 12 * 13
+
+
+def test_glb_stands_upright_in_linear_light(tmp_path: Path) -> None:
+    """The two mistakes that validators do not find, and the material that keeps lamps off."""
+    MESH_EXPORTERS[".glb"](block(), tmp_path / "a.glb", Z_UP)
+    document, blob = glb_document(tmp_path / "a.glb")
+    x, y, z = block().vertices.T
+    np.testing.assert_allclose(accessor(document, blob, 0), np.stack([x, z, -y], 1))
+    np.testing.assert_allclose(accessor(document, blob, 2)[2, :3] / 65535, [0.21404, 0.05088, 0.52252], atol=2e-5)
+    assert document["materials"][0]["extensions"] == {"KHR_materials_unlit": {}}
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert document["nodes"][0]["extras"]["source_frame"]["unit"] == "unknown"
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (0.6, -0.8, 0), (0, -1 + 1e-13, 1e-13), tuple(np.ones(3) / 3**0.5)])
+def test_the_turn_takes_up_to_y(up: tuple[float, ...]) -> None:
+    rotation = gltf_from_capture(np.array(up, float))
+    np.testing.assert_allclose(rotation @ up, [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def spoilt(**changes: np.ndarray) -> Mesh:
+    return replace(block(), **changes)
+
+
+BROKEN = {
+    "no faces": (spoilt(faces=np.zeros((0, 3), np.int64)), "no faces"),
+    "nan": (spoilt(vertices=np.where(np.arange(8)[:, None] == 3, np.nan, block().vertices)), "1 of 8 vertices are not finite"),
+    "too large": (spoilt(vertices=block().vertices * 1e39), "vertices are not finite in single precision"),
+    "infinite colour": (spoilt(colours=np.full((8, 3), np.inf, np.float32)), "8 of 8 colours"),
+    "stray face": (spoilt(faces=block().faces + 1), "faces name vertices 1 to 8"),
+}
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+@pytest.mark.parametrize("flaw", BROKEN)
+def test_broken_meshes_are_refused(extension: str, flaw: str, tmp_path: Path) -> None:
+    mesh, message = BROKEN[flaw]
+    path = tmp_path / f"a{extension}"
+    path.write_bytes(b"older")
+    with pytest.raises(BadInput, match=message):
+        MESH_EXPORTERS[extension](mesh, path, Z_UP)
+    assert path.read_bytes() == b"older"
+
+
+@NEEDS_LAS
+@pytest.mark.parametrize("extension", [".las", ".laz"])
+@pytest.mark.parametrize(("size", "at"), [(1.0, 0.0), (1e-4, 0.0), (3e5, 0.0), (20.0, 5e6)])
+def test_las_coordinates_are_fine_wherever_the_points_lie(extension: str, size: float, at: float, tmp_path: Path) -> None:
+    """To a millionth of their reach, as far as doubles go; and the same points are the same bytes."""
+    places = np.random.default_rng(0).random((50, 3)) * size + at
+    points = PointCloud(places, np.tile([0.0, 0, 1], (50, 1)), np.zeros((50, 3), np.float32))
+    for name in ("a", "b"):
+        POINT_EXPORTERS[extension](points, tmp_path / f"{name}{extension}", Z_UP)
+    np.testing.assert_allclose(read_by_laspy(tmp_path / f"a{extension}")[0], places, rtol=0, atol=0.5e-6 * size + 1e-15 * at)
+    assert (tmp_path / f"a{extension}").read_bytes() == (tmp_path / f"b{extension}").read_bytes()
+
+
+def test_las_steps_leave_room_in_32_bits() -> None:
+    for reach, largest in ((0.0, 0.0), (0.0, 7.0), (3.0, 3.0), (9.99, 1e6), (1e-7, 1.0), (1e30, 1e30)):
+        step = step_of(reach, largest)
+        assert reach / 2 / step < 2**31 - 1
+        assert step <= max(reach * 1e-6, largest * 1e-15, 1e-30) * (1 + 1e-9)
+
+
+def test_las_is_refused_where_its_package_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stages.formats.exporters.las.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[las\]'"):
+        POINT_EXPORTERS[".laz"](cloud(), tmp_path / "a.laz", Z_UP)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("extension", POINT_EXPORTERS)
+def test_broken_points_are_refused(extension: str, tmp_path: Path) -> None:
+    empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    with pytest.raises(BadInput, match="empty"):
+        POINT_EXPORTERS[extension](empty, tmp_path / "a", Z_UP)
+    with pytest.raises(BadInput, match="normals are not finite"):
+        POINT_EXPORTERS[extension](replace(cloud(), normals=np.full((8, 3), np.nan)), tmp_path / "a", Z_UP)
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_a_failed_write_leaves_what_was_there(extension: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / f"a{extension}"
+    path.write_bytes(b"older")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        MESH_EXPORTERS[extension](block(), path, Z_UP)
+    assert [(each.name, each.read_bytes()) for each in tmp_path.iterdir()] == [(path.name, b"older")]
+
+
+def test_the_frame_is_read_from_the_metadata() -> None:
+    frame = source_frame({"world_from_capture": {"scale": 0.5, "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "translation": [1, 2, 3]}, "metric": True})
+    np.testing.assert_allclose(frame.up, [0, -1, 0])
+    assert frame.metric
+    np.testing.assert_allclose(source_frame({}).up, [0, 0, 1])

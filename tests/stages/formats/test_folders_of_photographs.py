@@ -1,0 +1,243 @@
+"""Which files of a folder are photographs: nothing is left aside without a word, and nothing is read that is none."""
+
+from __future__ import annotations
+
+import os
+import unicodedata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.errors import BadInput
+from stages.formats import importers
+from stages.formats.importers.description import describe_source
+from stages.formats.importers.masks import masks_of
+from stages.formats.importers.photographs import photographs
+from stages.formats.importers.source import Source, images_in, walk
+from stages.io.material import find_material
+from tests.stages import captures
+from tests.stages.captures import HEIGHT, WIDTH, Settings
+
+BLACK = np.zeros((HEIGHT, WIDTH), np.uint8)
+
+
+def write(folder: Path, *names: str) -> Path:
+    """Photographs, masks, and videos, which nobody opens here."""
+    for seed, name in enumerate(names):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".mp4":
+            path.write_bytes(b"")
+        else:
+            captures.write_picture(path, BLACK if "mask" in name.lower() else captures.picture(seed))
+    return folder
+
+
+def read(folder: Path, **more: Any) -> tuple[list[str], str]:
+    """The names of what is read, and what is said."""
+    source = Source(folder, **more)
+    found = [source.name_of(path) for path in photographs(source)]
+    return found, "\n".join(source.warnings())
+
+
+# --- where they lie
+
+
+def test_photographs_below_come_before_a_video(tmp_path: Path) -> None:
+    found, said = read(write(tmp_path, "clip.mp4", "photos/1.png", "photos/2.png", "photos/3.png"))
+    assert found == ["photos/1.png", "photos/2.png", "photos/3.png"]
+    assert "1 video (clip.mp4) is not read, for there are photographs." in said
+
+
+def test_a_video_comes_before_fewer_photographs_than_make_a_data_set(tmp_path: Path) -> None:
+    found, said = read(write(tmp_path, "clip.mp4", "cover.png", "photos/2.png"))
+    assert found == ["clip.mp4"]
+    assert "2 photographs (cover.png, photos/2.png) are not read, for there are videos." in said
+
+
+def test_a_cover_does_not_hide_the_photographs_below(tmp_path: Path) -> None:
+    found, _ = read(write(tmp_path, "cover.png", "photos/1.png", "photos/2.png", "photos/3.png"))
+    assert found == ["cover.png", "photos/1.png", "photos/2.png", "photos/3.png"]
+    assert find_material({"": tmp_path}, False, lambda text: None).paths.keys() == set(found)
+
+
+def test_images_is_enough_and_the_cover_is_named(tmp_path: Path) -> None:
+    found, said = read(write(tmp_path, "cover.png", "images/1.png", "images/2.png", "images/3.png", "images_4/1.png"))
+    assert found == ["images/1.png", "images/2.png", "images/3.png"]
+    assert "1 more image in other folders (.) is not read, for 3 lie directly in images." in said
+
+
+def test_photographs_in_other_folders_are_named(tmp_path: Path) -> None:
+    folder = write(tmp_path, "1.png", "2.png", "3.png", "day 1/4.png", "day 2/5.png", "day 2/6.png", "masks/1.png", "Depth/1.png", "images_2/1.png")
+    found, said = read(folder)
+    assert found == ["1.png", "2.png", "3.png"]
+    assert "3 more images in other folders (day 1, day 2) are not read, for 3 lie directly in it. Name the folders as sources of their own" in said
+    told: list[str] = []
+    find_material({"": folder}, False, told.append)
+    assert "\n".join(told) == said
+    assert said in describe_source(folder)["warnings"]
+    assert read(write(tmp_path / "alone", "1.png", "2.png", "3.png", "masks/1.png"))[1] == ""
+
+
+def test_hostile_names_are_shown_escaped(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a\nb", "1.png", "2.png", "3.png", "x\x1b[2J/4.png")
+    (folder / "l\ni").symlink_to(tmp_path)
+    source = Source(folder)
+    photographs(source)
+    assert len(source.warnings()) == 2
+    assert not any(character in sentence for sentence in source.warnings() for character in "\n\x1b")
+
+
+# --- masks
+
+
+@pytest.mark.parametrize("name", ["1_mask.png", "1.mask.png", "1.jpg_mask.png", "1.jpg.mask", "1_MASK.PNG"])
+def test_masks_beside_their_photographs_are_no_photographs(name: str, tmp_path: Path) -> None:
+    photograph = captures.write_picture(tmp_path / "1.jpg", captures.picture())
+    with open(tmp_path / name, "wb") as file:
+        Image.fromarray(BLACK).save(file, "PNG")
+    other = captures.write_picture(tmp_path / "2_mask.png", captures.picture(1))  # of no photograph: it is one
+    assert images_in(tmp_path) == photographs(Source(tmp_path)) == [photograph, other]
+    assert masks_of(Source(tmp_path), [photograph, other]) == {photograph: tmp_path / name}
+    assert importers.files(tmp_path, Settings()) == sorted([photograph, tmp_path / name, other])
+
+
+@pytest.mark.parametrize("masks", ["Masks", "MASK", "mask", "masks"])
+def test_folders_of_masks_have_any_case(masks: str, tmp_path: Path) -> None:
+    folder = write(tmp_path, "photos/a/1.png", f"{masks}/photos/a/1.png", "photos/b/1.png", f"photos/b/{masks}/1_mask.png")
+    source = Source(folder)
+    found = photographs(source)
+    assert found == [folder / "photos/a/1.png", folder / "photos/b/1.png"]
+    assert masks_of(source, found) == {found[0]: folder / masks / "photos/a/1.png", found[1]: folder / f"photos/b/{masks}/1_mask.png"}
+
+
+def test_masks_of_a_list_that_names_none(tmp_path: Path) -> None:
+    folder = write(captures.nerfstudio(tmp_path), "masks/img_0.png", "images/img_1_mask.png")
+    capture = importers.IMPORTERS["nerfstudio"].read(folder, Settings())
+    assert [photo.mask for photo in capture.photos[:3]] == [folder / "masks/img_0.png", folder / "images/img_1_mask.png", None]
+    assert {folder / "masks/img_0.png", folder / "images/img_1_mask.png"} < set(importers.files(folder, Settings()))
+
+
+def test_a_photograph_of_the_list_is_no_mask(tmp_path: Path) -> None:
+    folder = write(tmp_path, "1.png", "1_mask.png")
+    assert masks_of(Source(folder), [folder / "1.png", folder / "1_mask.png"]) == {}
+
+
+# --- one picture in two formats
+
+
+def heic(path: Path, pixels: np.ndarray, **more: Any) -> Path:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, "HEIF", quality=90, **more)
+    return path
+
+
+def smooth(seed: int) -> np.ndarray:
+    """A picture that compression does little to."""
+    small = Image.fromarray(captures.picture(seed, 6, 4))
+    return np.asarray(small.resize((192, 128), Image.Resampling.BICUBIC))
+
+
+def taken(time: str) -> bytes:
+    exif = Image.Exif()
+    exif.get_ifd(34665)[36867] = time
+    return bytes(exif.tobytes())
+
+
+def test_a_picture_in_two_formats_is_read_once(tmp_path: Path) -> None:
+    folder = tmp_path / "shoot"
+    for seed in range(3):
+        captures.write_picture(folder / f"IMG_{seed}.JPG", smooth(seed), quality=90)
+        heic(folder / f"IMG_{seed}.HEIC", smooth(seed))
+    found, said = read(folder)
+    assert found == ["IMG_0.JPG", "IMG_1.JPG", "IMG_2.JPG"]
+    assert "3 pictures lie there twice, in two formats, and are read once (IMG_0.HEIC is IMG_0.JPG, " in said
+    assert len(importers.files(folder, Settings())) == 6  # what they hold decides
+    assert read(tmp_path)[0] == [f"shoot/{name}" for name in found]  # anywhere below, too
+
+
+def test_two_pictures_of_one_name_are_two(tmp_path: Path) -> None:
+    captures.write_picture(tmp_path / "a.jpg", smooth(0))
+    heic(tmp_path / "a.heic", smooth(1))
+    captures.write_picture(tmp_path / "b.jpg", smooth(2))
+    captures.write_picture(tmp_path / "b.png", smooth(2)[:64])
+    captures.write_picture(tmp_path / "c.jpg", smooth(3))
+    captures.write_picture(tmp_path / "elsewhere" / "c.png", smooth(3))
+    found, said = read(tmp_path)
+    assert found == ["a.heic", "a.jpg", "b.jpg", "b.png", "c.jpg"]
+    assert "twice" not in said
+
+
+def test_the_time_tells_pictures_apart_and_the_one_that_has_it_is_read(tmp_path: Path) -> None:
+    captures.write_picture(tmp_path / "a.jpg", smooth(0), exif=taken("2026:11:23 10:00:00"))
+    heic(tmp_path / "a.heic", smooth(0), exif=taken("2026:11:23 10:00:01"))
+    captures.write_picture(tmp_path / "b.jpg", smooth(1))
+    heic(tmp_path / "b.heic", smooth(1), exif=taken("2026:11:23 10:00:02"))
+    captures.write_picture(tmp_path / "c.jpg", smooth(2) // 2, exif=taken("2026:11:23 10:00:03"))  # edited
+    heic(tmp_path / "c.heic", smooth(2), exif=taken("2026:11:23 10:00:03"))
+    assert read(tmp_path)[0] == ["a.heic", "a.jpg", "b.heic", "c.jpg"]
+
+
+def test_whether_pictures_are_alike_is_asked_again_when_one_has_changed(tmp_path: Path) -> None:
+    captures.write_picture(tmp_path / "a.jpg", smooth(0))
+    captures.write_picture(tmp_path / "a.png", smooth(0))
+    assert read(tmp_path)[0] == ["a.jpg"]
+    captures.write_picture(tmp_path / "a.png", smooth(1))
+    os.utime(tmp_path / "a.png", (1, 1))
+    assert read(tmp_path)[0] == ["a.jpg", "a.png"]
+
+
+# --- linked folders
+
+
+def test_linked_folders_are_named_and_followed_where_that_is_allowed(tmp_path: Path) -> None:
+    write(tmp_path / "disk", "1.png", "2.png", "sub/3.png")
+    (tmp_path / "disk/sub/back").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk/sub/home").symlink_to(tmp_path / "source")
+    source = tmp_path / "source"
+    source.mkdir()
+    (source / "photos").symlink_to(tmp_path / "disk")
+    with pytest.raises(BadInput, match=r"no files\. .*linked folders, which are not followed \(photos -> .*disk\): name the target itself, or pass --allow-"):
+        photographs(Source(source))
+    assert read(source, allow_outside=True) == (["photos/1.png", "photos/2.png", "photos/sub/3.png"], "")
+    write(source, "4.png")
+    found, said = read(source)
+    assert found == ["4.png"]
+    assert "holds linked folders, which are not followed (photos -> " in said
+
+
+def test_links_within_the_source_are_not_walked_twice(tmp_path: Path) -> None:
+    write(tmp_path, "photos/1.png")
+    (tmp_path / "a").symlink_to(tmp_path / "photos")
+    (tmp_path / "photos/up").symlink_to(tmp_path)
+    links: set[Path] = set()
+    for follow in (False, True):
+        assert walk(tmp_path, links=links, follow=follow) == [tmp_path / "photos/1.png"]
+    assert links == set()
+
+
+# --- names
+
+
+def test_names_are_compared_composed(tmp_path: Path) -> None:
+    """Archives made on macOS hold the letter and its accent, lists one character."""
+    made = captures.cameras(4)
+    composed = ["caf\u00e9_0.png", "\u00fcber_1.png", "images/\u00e5_2.png", "C:\\sets\\\u00e9t\u00e9_3.png"]
+    frames = captures.frames(made)
+    for seed, (frame, name) in enumerate(zip(frames, composed, strict=True)):
+        frame["file_path"] = name if "/" in name or "\\" in name else f"images/{name}"
+        file = unicodedata.normalize("NFD", name.replace("\\", "/").split("/")[-1])
+        captures.write_picture(tmp_path / "images" / file, captures.picture(seed))
+        captures.write_picture(tmp_path / "masks" / unicodedata.normalize("NFC", file), BLACK)
+    captures.write_json(tmp_path / "transforms.json", {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "frames": frames, "camera_model": "OPENCV"})
+    capture = importers.IMPORTERS["nerfstudio"].read(tmp_path, Settings())
+    assert len(capture.photos) == 4
+    assert all(photo.mask is not None for photo in capture.photos)
+    assert not any("another extension" in warning for warning in capture.warnings)
+    assert any("1 images are not where they are listed" in warning for warning in capture.warnings)  # that of the other computer

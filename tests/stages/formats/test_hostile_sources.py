@@ -1,0 +1,238 @@
+"""Sources from anybody: nothing outside of them is read, their names do no harm, and runs inside of them are no part of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.errors import BadInput
+from pipeline.run import Run
+from pipeline.stage import Job
+from stages.formats import importers
+from stages.formats.importers.description import describe_source
+from stages.formats.importers.source import Source, walk
+from stages.io import pictures, scene
+from stages.poses import run as poses
+from stages.poses.run import PosesSettings
+from tests.stages import captures
+from tests.stages.captures import Settings
+
+# Bytes of no encoding, a line end, a terminal escape, a change of direction, and a tabulator; "plain.png" is what a name should be.
+NAMES = ("img_\udcff\udcfe.png", "img_\nline.png", "img_\x1b[31mred.png", "img_\u202eodd.png", "img_ \t tab.png", "plain.png")
+SHOWN = {r"img_\udcff\udcfe.png", r"img_\nline.png", r"img_\x1b[31mred.png", r"img_\u202eodd.png", r"img_ \t tab.png", "plain.png"}
+RED = np.full((24, 32, 3), (255, 0, 0), np.uint8)
+
+
+def run(source: Path, out: Path, **settings: Any) -> tuple[scene.Scene, list[str]]:
+    """The scene, and the warnings."""
+    events: list[dict[str, Any]] = []
+    job = Job(settings=PosesSettings(**settings), out=out / "poses", work=out / "work", source=source, stage="poses", report=events.append)
+    poses.run(job)
+    return scene.load(out / "poses"), [event["text"] for event in events if event["event"] == "warning"]
+
+
+def frames_of(folder: Path, change: Callable[[list[dict[str, Any]]], object]) -> None:
+    document = json.loads((folder / "transforms.json").read_text())
+    change(document["frames"])
+    (folder / "transforms.json").write_text(json.dumps(document))
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Real paths of the files that Python opens."""
+    paths: list[str] = []
+    io_open, os_open = io.open, os.open
+
+    def spy(original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(path: Any, *arguments: Any, **more: Any) -> Any:
+            if isinstance(path, str | os.PathLike):
+                paths.append(os.path.realpath(path))
+            return original(path, *arguments, **more)
+
+        return call
+
+    monkeypatch.setattr(io, "open", spy(io_open))
+    monkeypatch.setattr("builtins.open", spy(io_open))
+    monkeypatch.setattr(os, "open", spy(os_open))
+    return paths
+
+
+# --- one gate
+
+
+def test_a_picture_outside_of_the_source_does_not_reach_the_contact_sheet(tmp_path: Path, opened: list[str]) -> None:
+    source = captures.nerfstudio(tmp_path / "source")
+    secret = captures.write_picture(tmp_path / "secret/images/img_1.png", RED)
+    frames_of(source, lambda frames: frames.append({**frames[1], "file_path": str(secret)}))
+    opened.clear()
+    made, warnings = run(source, tmp_path / "out")
+    assert len(made.views) == 6
+    assert any("name an image that an earlier frame has" in warning for warning in warnings)
+    assert os.path.realpath(secret) not in opened
+    with Image.open(tmp_path / "out/poses/contact_sheet.png") as sheet:
+        assert not (np.asarray(sheet)[..., :3] == (255, 0, 0)).all(-1).any()
+
+
+@pytest.mark.parametrize("how", captures.WRITERS)
+@pytest.mark.parametrize("what", ["image", "mask", "list"])
+def test_no_link_out_of_the_source_is_followed(tmp_path: Path, opened: list[str], how: str, what: str) -> None:
+    source = captures.WRITERS[how][1](tmp_path / "source")
+    images = sorted(path for path in source.rglob("img_2.png"))
+    lists = [path for path in sorted(source.rglob("*")) if path.suffix in (".json", ".npy", ".bin", ".txt")]
+    masks = captures.write_picture(source / "masks" / images[0].relative_to(source), RED)
+    masked = how in ("llff", "colmap bin", "colmap txt")
+    if what == "mask" and not masked:
+        pytest.skip("this format names its masks")
+    for path in {"image": images, "mask": [masks], "list": lists}[what]:
+        elsewhere = tmp_path / "elsewhere" / path.name
+        elsewhere.parent.mkdir(exist_ok=True)
+        os.replace(path, elsewhere)
+        path.symlink_to(elsewhere)
+    settings = Settings()
+    for attempt in (lambda: importers.files(source, settings), lambda: run(source, tmp_path / "out"), lambda: describe_source(source)):
+        with pytest.raises(BadInput, match=r"leads out of the source folder .* pass --allow-outside"):
+            attempt()
+    assert not [path for path in opened if path.startswith(os.path.realpath(tmp_path / "elsewhere"))]
+    assert len(run(source, tmp_path / "allowed", allow_outside=True)[0].views) == 6
+
+
+def test_photographs_linked_from_outside_are_refused(tmp_path: Path) -> None:
+    captures.write_pictures(tmp_path / "elsewhere", [f"{index}.png" for index in range(3)])
+    (tmp_path / "source").mkdir()
+    (tmp_path / "source/images").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BadInput, match="leads out of the source folder"):
+        importers.files(tmp_path / "source", Settings())
+    with pytest.raises(BadInput, match="leads out of the source folder"):
+        run(tmp_path / "source", tmp_path / "out")
+
+
+def test_a_link_is_followed_once(tmp_path: Path) -> None:
+    source = captures.nerfstudio(tmp_path / "source")
+    image = source / "images/img_2.png"
+    os.replace(image, source / "kept.png")
+    image.symlink_to(source / "kept.png")
+    capture = importers.IMPORTERS["nerfstudio"].read(source, Settings())
+    image.unlink()
+    image.symlink_to(captures.write_picture(tmp_path / "secret.png", RED))
+    photo = next(photo for photo in capture.photos if photo.camera.name.endswith("img_2.png"))
+    assert photo.image == source / "kept.png"
+
+
+def test_a_source_may_itself_be_reached_by_a_link(tmp_path: Path) -> None:
+    captures.nerfstudio(tmp_path / "real")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    made, _ = run(tmp_path / "link", tmp_path / "out")
+    assert [view.name for view in made.views] == [f"images/img_{index}.png" for index in range(6)]
+
+
+# --- names
+
+
+@pytest.mark.parametrize("how", captures.WRITERS)
+def test_hostile_names_are_shown_escaped(tmp_path: Path, how: str) -> None:
+    made = [dataclasses.replace(camera, name=name) for camera, name in zip(captures.cameras(), NAMES, strict=True)]
+    if how == "colmap txt":  # whose lines cannot hold a line end
+        made[1] = dataclasses.replace(made[1], name="img_line.png")
+    source = captures.WRITERS[how][1](tmp_path / "source", made)
+    found, warnings = run(source, tmp_path / "out")
+    shown = {view.name.rpartition("/")[2] for view in found.views}
+    assert shown == (SHOWN if how != "colmap txt" else SHOWN - {r"img_\nline.png"} | {"img_line.png"})
+    for text in [*warnings, (tmp_path / "out/poses/report.json").read_text(), *(str(path) for path in (tmp_path / "out").rglob("*"))]:
+        assert all(character.isprintable() or character == "\n" for character in text)
+    for view in found.views:
+        np.testing.assert_array_equal(scene.read_image(tmp_path / "out/poses", view).shape[:2], (24, 32))
+
+
+def test_messages_about_hostile_names_are_one_printable_line(tmp_path: Path) -> None:
+    for number, name in enumerate(NAMES[:5]):
+        source = tmp_path / str(number)
+        captures.write_pictures(source, [name, "b.png", "c.png"])
+        (source / name).write_bytes(b"nothing")
+        described = describe_source(source)
+        assert described["rejected"][0]["name"] in SHOWN
+        os.unlink(source / name)
+        (source / name).symlink_to("/etc/hostname")
+        for attempt in (lambda source=source: importers.files(source, Settings()), lambda source=source: describe_source(source)):
+            with pytest.raises(BadInput) as caught:
+                attempt()
+            assert str(caught.value).isprintable()
+        with pytest.raises(BadInput) as caught:
+            run(source, tmp_path / "out")
+        assert str(caught.value).isprintable()
+
+
+def test_names_in_lists_are_escaped_too(tmp_path: Path) -> None:
+    source = captures.nerfstudio(tmp_path / "source")
+    hostile = ["\ud800.png", "a\0b.png", "\x1b[2J.png", "x" * 5000, "/" * 300 + "y", "new\nline.png"]
+    frames_of(source, lambda frames: frames.extend({**frames[0], "file_path": name} for name in hostile))
+    made, warnings = run(source, tmp_path / "out")
+    assert len(made.views) == 6
+    assert all(warning.isprintable() and len(warning) < 3000 for warning in warnings)
+    assert len(json.loads((tmp_path / "out/poses/report.json").read_text())["rejected"]) == len(hostile)
+
+
+def test_no_two_pictures_have_one_name(tmp_path: Path) -> None:
+    source = Source(tmp_path)
+    names = [source.name_of(tmp_path / name) for name in ("\udcff.png", r"\udcff.png", "\udcff.png")]
+    assert names == [r"\udcff.png", r"\udcff.png (2)", r"\udcff.png"]
+
+
+def test_a_long_name_leaves_room_for_its_working_image(tmp_path: Path) -> None:
+    names = ["\udcff" * 120 + f"{index}.jpg" for index in range(3)] + ["y" * 250 + ".jpg", "z.png", "é" * 124 + ".png"]
+    made = [dataclasses.replace(camera, name=name) for camera, name in zip(captures.cameras(), names, strict=True)]
+    found, _ = run(captures.nerfstudio(tmp_path / "source", made), tmp_path / "out")
+    assert len({view.image for view in found.views}) == 6
+
+
+# --- runs inside of the source
+
+
+def test_a_run_below_its_source_is_no_part_of_it(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    captures.write_pictures(source / "shots", ["a.png", "b.png", "c.png"])
+    before = importers.files(source, Settings())
+    mine = Run.create(source / "shots/run", source)
+    captures.write_pictures(mine.path / "poses/images", ["a.png", "b.png", "c.png"])
+    captures.write_pictures(source / ".hidden", ["h.png"])
+    assert importers.files(source, Settings()) == before
+    assert [path.name for path in walk(source)] == ["a.png", "b.png", "c.png"]
+    described = describe_source(source)
+    assert described["count"] == 3
+    assert "shots/run: a run inside the source folder; what was made there is not read." in described["warnings"]
+
+
+def test_a_folder_with_another_run_json_is_read(tmp_path: Path) -> None:
+    captures.write_pictures(tmp_path / "a", ["a.png", "b.png", "c.png"])
+    for text in ('{"format": "something"}', "[]", "nothing", "[" * 100_000):
+        (tmp_path / "a/run.json").write_text(text)
+        assert len(importers.files(tmp_path, Settings())) == 3
+
+
+def test_pictures_of_a_run_stand_in_for_none_that_are_missing(tmp_path: Path) -> None:
+    source = captures.nerfstudio(tmp_path / "source")
+    mine = Run.create(source / "run", source)
+    captures.write_pictures(mine.path / "poses/images", ["img_0.png"])
+    os.unlink(source / "images/img_0.png")
+    frames_of(source, lambda frames: frames[0].update(file_path="/home/me/images/img_0.png"))
+    capture = importers.IMPORTERS["nerfstudio"].read(source, Settings())
+    assert len(capture.photos) == 5
+    assert capture.rejected == (("/home/me/images/img_0.png", "listed but missing on disk"),)
+
+
+def test_pictures_are_read_where_the_gate_leads(tmp_path: Path) -> None:
+    """Headers, masks and pixels are asked for by paths without links."""
+    source = captures.colmap_bin(tmp_path / "source")
+    (source / "images").rename(source / "stored")
+    (source / "images").symlink_to("stored")
+    capture = importers.IMPORTERS["colmap"].read(source, Settings())
+    assert {photo.image.parent for photo in capture.photos} == {source / "stored"}
+    assert all(pictures.read_header(photo.image).size == (32, 24) for photo in capture.photos)

@@ -1,0 +1,283 @@
+"""Every importer: the same cameras written in each format give the same rays; real data sets read right."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.geometry.cameras import opengl_from_pose, project, rotated_clockwise
+from stages.formats import importers
+from stages.formats.importers import colmap_model
+from stages.formats.importers.description import describe_source
+from stages.io.capture import Capture
+from tests.stages import captures
+from tests.stages.captures import HEIGHT, LENSES, SHARED, WIDTH, WRITERS, Settings, assert_same_rays
+
+
+def read(folder: Path, **settings: object) -> Capture:
+    chosen = Settings(**settings)  # type: ignore[arg-type]
+    return importers.IMPORTERS[importers.detect(folder)].read(folder, chosen)
+
+
+@pytest.mark.parametrize("how", WRITERS)
+def test_every_format_gives_the_same_rays(how: str, tmp_path: Path) -> None:
+    name, write = WRITERS[how]
+    folder = write(tmp_path / "source")
+    assert importers.detect(folder) == name
+    capture = read(folder)
+    assert capture.kind == name
+    assert not capture.warnings
+    assert not capture.rejected
+    assert_same_rays(capture, captures.cameras())
+    assert all(photo.image.is_file() and photo.image == folder / photo.camera.name for photo in capture.photos)
+    listed = importers.files(folder, Settings())
+    assert {photo.image for photo in capture.photos} < set(listed)
+    assert len(listed) - len(capture.photos) == {"blender": 2, "colmap": 3}.get(name, 1)
+    described = describe_source(folder)
+    json.dumps(described, allow_nan=False)
+    assert described["count"] == 6
+    assert described["format"] == name
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("write", [captures.colmap_bin, captures.colmap_txt])
+def test_colmap_lenses(model: str, write: object, tmp_path: Path) -> None:
+    made = captures.cameras(model=model, params=LENSES[model])
+    capture = read(write(tmp_path / "a", made))  # type: ignore[operator]
+    assert_same_rays(capture, made)
+    assert capture.photos[0].camera.params == LENSES[model]
+    assert capture.points is not None
+    assert capture.points.tracks[0] == tuple(range(6))
+    assert capture.points.rgb[0].tolist() == [200, 100, 50]
+    assert capture.reprojection_error == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_nerfstudio_lenses(model: str, tmp_path: Path) -> None:
+    made = captures.cameras(model=model, params=LENSES[model])
+    k = made[0].intrinsics
+    intrinsics = {"fl_x": k["fx"], "fl_y": k["fy"]} | {name: k[name] for name in ("cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
+    assert_same_rays(read(captures.nerfstudio(tmp_path / "top", made, camera_model=model, **intrinsics)), made)
+    per_frame = [frame | intrinsics | {"camera_model": model} for frame in captures.frames(made)]
+    assert_same_rays(read(captures.nerfstudio(tmp_path / "frames", made, fl_x=1.0, fl_y=1.0, frames=per_frame)), made)
+
+
+def test_a_model_written_by_colmap_with_rigs_and_frames(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    folder = captures.colmap_bin(tmp_path / "a")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for write, suffix in ((model.write_text, "txt"), (model.write_binary, "bin")):
+        other = tmp_path / suffix
+        (other / "sparse/0").mkdir(parents=True)
+        (other / "images").symlink_to(folder / "images")
+        write(other / "sparse/0")
+        assert (other / "sparse/0" / f"frames.{suffix}").is_file()
+        capture = read(other, allow_outside=True)
+        assert_same_rays(capture, captures.cameras())
+        assert capture.points is not None
+        np.testing.assert_allclose(np.sort(capture.points.xyz, 0), np.sort(captures.sparse_points(), 0))
+
+
+def test_of_several_models_the_one_with_most_images_is_taken(tmp_path: Path) -> None:
+    folder = captures.colmap_bin(tmp_path / "a", captures.cameras()[:3])
+    captures.colmap_txt(folder, place="sparse/1")
+    capture = read(folder)
+    assert capture.facts["model"] == "sparse/1"
+    assert len(capture.photos) == 6
+    assert any("sparse/0 (3 images)" in warning for warning in capture.warnings)
+
+
+def test_blenders_splits_and_axes(tmp_path: Path) -> None:
+    capture = read(captures.blender(tmp_path / "a"))
+    assert [photo.split for photo in capture.photos] == ["train"] * 4 + ["test"] * 2
+    assert capture.up is not None
+    assert capture.up.tolist() == [0, 0, 1]
+
+
+def test_nerfstudio_extras(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    made = captures.cameras()
+    frames = captures.frames(made)
+    frames[0] |= {"mask_path": "masks/img_0.png", "depth_file_path": "depth/img_0.png"}
+    folder = tmp_path / "a"
+    applied = [[1, 0, 0, 5], [0, 0, 1, 0], [0, -1, 0, 0]]
+    names = {"train_filenames": [f"./images/img_{i}.png" for i in range(4)], "val_filenames": ["images/img_4.png"], "test_filenames": ["images/img_5.png"]}
+    captures.nerfstudio(folder, frames=frames, applied_transform=applied, ply_file_path="cloud.ply", **names)
+    captures.write_picture(folder / "masks/img_0.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    points = captures.sparse_points(20)
+    trimesh.PointCloud(points, np.full((20, 4), 90, np.uint8)).export(folder / "cloud.ply")
+    capture = read(folder)
+    assert_same_rays(capture, made)  # the frame is that of the matrices as they stand
+    assert capture.facts["applied_transform"] == applied
+    assert capture.metric
+    assert [photo.split for photo in capture.photos] == ["train"] * 4 + ["val", "test"]
+    assert capture.photos[0].mask == folder / "masks/img_0.png"
+    assert capture.photos[0].mask_ignore == "black"
+    assert capture.points is not None
+    np.testing.assert_allclose(capture.points.xyz, points, atol=1e-6)
+    assert {folder / "cloud.ply", folder / "masks/img_0.png"} < set(importers.files(folder, Settings()))
+
+
+def test_instant_ngp_extras(tmp_path: Path) -> None:
+    made = captures.cameras()
+    frames = captures.frames(made)
+    # The sensor is read while the camera turns: the middle counts.
+    turn = np.array([[np.cos(0.1), -np.sin(0.1), 0, 0], [np.sin(0.1), np.cos(0.1), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    matrix = np.array(frames[0].pop("transform_matrix"))
+    frames[0] |= {"transform_matrix_start": (matrix @ turn).tolist(), "transform_matrix_end": (matrix @ turn.T).tolist()}
+    folder = captures.instant_ngp(tmp_path / "a", frames=frames, k1=-0.1)
+    captures.write_picture(folder / "images/dynamic_mask_img_1.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    capture = read(folder)
+    assert_same_rays(capture, captures.cameras(model="OPENCV", params=(40.0, 40.0, 16.0, 12.0, -0.1, 0, 0, 0)))
+    assert capture.photos[1].mask == folder / "images/dynamic_mask_img_1.png"
+    assert capture.photos[1].mask_ignore == "white"
+    assert any("rolling shutter" in warning for warning in capture.warnings)
+    # scale 0.25, offset (0.5, 0.5, 0.75): x -> 0.25 x + offset lies in the unit cube
+    assert capture.bounds is not None
+    np.testing.assert_allclose(capture.bounds, [[-2, -2, -3], [2, 2, 1]])
+
+
+def test_llff_takes_the_largest_images_and_scales_the_focal_length(tmp_path: Path) -> None:
+    folder = captures.llff(tmp_path / "a")
+    names = [camera.name for camera in captures.cameras()]
+    for seed, name in enumerate(names):
+        captures.write_picture(folder / "images_2" / name, captures.picture(seed, 2 * WIDTH, 2 * HEIGHT))
+    capture = read(folder)
+    assert capture.facts["image_folder"] == "images_2"
+    assert capture.photos[0].camera.params == (80.0, 32.0, 24.0)
+    assert (capture.photos[0].near, capture.photos[0].far) == (2.0, 7.0)
+    assert_same_rays(read(folder, llff_factor=4), captures.cameras())
+
+
+def test_masks_beside_photographs(tmp_path: Path) -> None:
+    from stages.formats.importers.masks import masks_of
+    from stages.formats.importers.photographs import photographs
+    from stages.formats.importers.source import Source
+
+    black = np.zeros((HEIGHT, WIDTH), np.uint8)
+    for layout, mask in {"a": "masks/1.png", "b": "masks/1.jpg.png", "images/c": "images/masks/1.png", "images": "masks/1.PNG"}.items():
+        root = tmp_path / layout.replace("/", "_") / "source"
+        image = captures.write_picture(root / ("images" if layout.startswith("images") else ".") / "1.jpg", captures.picture())
+        made = captures.write_picture(root / mask, black)
+        assert photographs(Source(root)) == [image]
+        assert masks_of(Source(root), [image]) == {image: made}
+        assert importers.files(root, Settings()) == sorted([image, made])
+
+
+def test_photographs_anywhere_below(tmp_path: Path) -> None:
+    captures.write_pictures(tmp_path / "a" / "day 1", ["1.png"])
+    captures.write_pictures(tmp_path / "a" / "day 2", ["1.png"])
+    captures.write_pictures(tmp_path / "a" / "masks", ["1.png"])
+    described = describe_source(tmp_path / "a")
+    assert described["format"] == "photographs"
+    assert described["count"] == 2
+
+
+def test_lists_that_have_travelled(tmp_path: Path) -> None:
+    made = captures.cameras()
+    frames = captures.frames(made)
+    absolute = ["/home/someone/set/images/img_0.png", "C:\\sets\\x\\images\\img_1.png"]
+    relative = ["images/img_2.jpg", "data/set/images/img_3.png", "./images/img_4.PNG", "images\\img_5.png"]
+    for frame, name in zip(frames, absolute + relative, strict=True):
+        frame["file_path"] = name
+    capture = read(captures.nerfstudio(tmp_path / "a", frames=frames))
+    assert_same_rays(capture, made)
+    assert any("3 images are not where they are listed" in warning and "img_0.png" in warning for warning in capture.warnings)
+    assert any("another extension" in warning for warning in capture.warnings)
+
+
+def test_images_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
+    folder = captures.nerfstudio(tmp_path / "a", w=129, h=97, fl_x=161.25, fl_y=161.6666666667, cx=64.5, cy=48.5)  # 4 times, an odd pixel more
+    capture = read(folder)
+    assert_same_rays(capture, captures.cameras())
+    assert any("not of the stated size" in warning for warning in capture.warnings)
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_cameras_stated_for_the_pixels_as_stored_turn_with_them(tmp_path: Path, orientation: int) -> None:
+    from PIL import Image
+
+    folder = captures.nerfstudio(tmp_path / "a")
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    for index in range(6):
+        captures.write_picture(folder / f"images/img_{index}.png", captures.picture(index), exif=exif)
+    capture = read(folder)
+    assert any("the cameras were rotated too" in warning for warning in capture.warnings)
+    turns = {6: 1, 8: 3}[orientation]
+    truth = captures.cameras()
+    for _ in range(turns):
+        truth = [rotated_clockwise(camera) for camera in truth]
+    assert_same_rays(capture, truth)
+
+
+def test_an_image_listed_twice_counts_once(tmp_path: Path) -> None:
+    frames = captures.frames(captures.cameras())
+    capture = read(captures.nerfstudio(tmp_path / "a", frames=[*frames, frames[0]]))
+    assert len(capture.photos) == 6
+    assert capture.rejected[0][0] == "images/img_0.png"
+
+
+def test_several_formats_in_one_folder_are_named(tmp_path: Path) -> None:
+    folder = captures.nerfstudio(captures.colmap_bin(tmp_path / "a"))
+    assert importers.candidates(folder) == ["nerfstudio", "colmap", "photographs"]
+    assert any("--as colmap" in odd for odd in describe_source(folder)["warnings"])
+
+
+def shared(name: str) -> Path:
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there")
+    return folder
+
+
+def test_chair() -> None:
+    folder = shared("chair_200")
+    capture = read(folder)
+    assert capture.kind == "blender"
+    assert not capture.warnings
+    assert [sum(photo.split == split for photo in capture.photos) for split in ("train", "val", "test")] == [100, 20, 40]
+    first = json.loads((folder / "transforms_train.json").read_text())["frames"][0]
+    photo = capture.photos[0]
+    assert photo.camera.name == "train/r_0.png"
+    np.testing.assert_allclose(opengl_from_pose(photo.camera.world_from_camera), first["transform_matrix"], atol=1e-6)
+    assert photo.camera.params == pytest.approx((100 / np.tan(0.5 * 0.6911112070083618), 100, 100))
+    assert all(abs(project(p.camera, np.zeros((1, 3)))[0] - 100).max() < 20 for p in capture.photos), "every camera looks at the chair"
+
+
+def test_fern() -> None:
+    capture = read(shared("fern_8"))
+    assert capture.kind == "llff"
+    assert len(capture.photos) == 20
+    camera = capture.photos[0].camera
+    assert (camera.width, camera.height) == (504, 378)
+    assert camera.params == pytest.approx((3260.52633 / 8, 252, 189))
+    directions = np.array([photo.camera.forward for photo in capture.photos])
+    assert (directions @ directions.mean(0)).min() > 0.95, "forward facing"
+    assert (np.array([photo.camera.up for photo in capture.photos]) @ camera.up).min() > 0.95
+
+
+def test_door_points_lie_where_colmap_saw_them() -> None:
+    folder = shared("lund_door_colmap")
+    capture = read(folder)
+    assert len(capture.photos) == 12
+    assert capture.points is not None
+    assert len(capture.points.xyz) == 11384
+    observed: dict[str, dict[int, tuple[float, float]]] = {}
+    for _, line, points in colmap_model._image_lines(folder / "sparse/0/images.txt"):
+        values = (points or "").split()
+        triples = zip(values[::3], values[1::3], values[2::3], strict=True)
+        observed[line.split()[9]] = {index: (float(x), float(y)) for index, (x, y, _) in enumerate(triples)}
+    ids = {int(line.split()[0]): line.split()[9] for _, line, _ in colmap_model._image_lines(folder / "sparse/0/images.txt")}
+    lines = [line.split() for line in (folder / "sparse/0/points3D.txt").read_text().splitlines() if not line.startswith("#")]
+    seen = {photo.image.name: project(photo.camera, capture.points.xyz)[0] for photo in capture.photos}  # (N, 2) each
+    stated = [float(words[7]) for words in lines]
+    found = []
+    for point, words in enumerate(lines):
+        track = [(ids[int(image)], int(index)) for image, index in zip(words[8::2], words[9::2], strict=True)]
+        found.append(np.mean([np.hypot(*(seen[name][point] - observed[name][index])) for name, index in track]))
+    assert capture.reprojection_error == pytest.approx(np.mean(stated))
+    assert np.mean(found) == pytest.approx(np.mean(stated), rel=0.05)

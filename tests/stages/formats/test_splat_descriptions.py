@@ -1,0 +1,248 @@
+"""What is said of files of 3D Gaussians, ours and those of others; and that damaged ones are named, whatever their headers say."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import random
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.splats.gaussians import Gaussians
+from pipeline.errors import BadInput
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.splats import description
+from stages.formats.exporters.splats.description import describe_splats
+from stages.formats.exporters.splats.frames import with_y_up
+from tests.stages.formats.gaussians import scattered
+from tests.stages.io.meshes import Y_DOWN, Z_UP, block
+
+COUNT = 41
+
+
+def written(path: Path, gaussians: Gaussians, frame: Any = Z_UP) -> Path:
+    SPLAT_EXPORTERS[path.suffix](gaussians, path, frame)
+    return path
+
+
+def same(facts: dict[str, Any] | None, gaussians: Gaussians, coded: bool) -> None:
+    assert facts is not None
+    assert (facts["gaussians"], facts["sh_degree"], facts["not_finite"]) == (len(gaussians), gaussians.degree, None)
+    np.testing.assert_allclose(facts["bounds"], [gaussians.means.min(axis=0), gaussians.means.max(axis=0)], atol=2.0**-12 if coded else 1e-6)
+    scales = [gaussians.scales.min(), gaussians.scales.max()]
+    np.testing.assert_allclose(np.log(facts["scales"]), np.log(scales), atol=1 / 32 + 1e-6 if coded else 1e-5)
+    opacities = [gaussians.opacities.min(), gaussians.opacities.max()]
+    np.testing.assert_allclose(facts["opacities"], opacities, atol=0.5 / 255 + 1e-6 if coded else 1e-6)
+
+
+@pytest.mark.parametrize("at_once", [7, 2**16])
+@pytest.mark.parametrize("frame", [Z_UP, Y_DOWN], ids=["z up", "y down"])
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("extension", SPLAT_EXPORTERS)
+def test_what_was_written_is_described(extension: str, degree: int, frame: Any, at_once: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the file's frame, whatever the pieces in which it is read."""
+    monkeypatch.setattr(description, "AT_ONCE", at_once)
+    gaussians = scattered(COUNT, degree)
+    facts = describe_splats(written(tmp_path / f"a{extension}", gaussians, frame))
+    same(facts, gaussians if extension == ".ply" else with_y_up(gaussians, frame), extension == ".spz")
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_a_ply_of_others_has_its_columns_in_any_order_and_of_any_type(order: str, tmp_path: Path) -> None:
+    gaussians = scattered(COUNT, 1)
+    columns = {
+        "x": "f8", "segment": "u1", "y": "f4", "z": "f4", "opacity": "f4", "rot_0": "f4", "rot_1": "f4", "rot_2": "f4", "rot_3": "f4", "scale_2": "f4",
+        "scale_1": "f4", "scale_0": "f8", **{f"f_dc_{k}": "f4" for k in range(3)}, **{f"f_rest_{k}": "f4" for k in range(9)},
+    }  # fmt: skip
+    rows = np.zeros(COUNT, [(name, (">" if order == "big" else "<") + kind) for name, kind in columns.items()])
+    for k in range(3):
+        rows["xyz"[k]], rows[f"scale_{k}"] = gaussians.means[:, k], np.log(gaussians.scales[:, k])
+    rows["opacity"] = np.log(gaussians.opacities / (1 - gaussians.opacities))
+    names = {"f8": "double", "f4": "float", "u1": "uchar"}
+    head = f"ply\r\nformat binary_{order}_endian 1.0\r\ncomment made by \x1b[31m another\r\nelement vertex {COUNT}\r\n"
+    head += "".join(f"property {names[kind]} {name}\r\n" for name, kind in columns.items()) + "element face 0\r\nproperty list uchar int i\r\nend_header\r\n"
+    path = tmp_path / "a.ply"
+    path.write_bytes(head.encode() + rows.tobytes())
+    facts = describe_splats(path)
+    same(facts, gaussians, coded=False)
+    assert facts is not None
+    assert len(facts["notes"]) == 1
+    assert "\x1b" not in facts["notes"][0]
+
+
+def spz(version: int, count: int, degree: int, body: bytes, bits: int = 12, flags: int = 0) -> bytes:
+    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, 0) + body)
+
+
+def test_the_older_spz_versions(tmp_path: Path) -> None:
+    """1: places of half floats; 1 and 2: rotations of three bytes."""
+    path, at = tmp_path / "a.spz", np.array([[1.5, -2, 0.25], [-1, 4, 8]])
+    rest = bytes([0, 255]) + bytes(6) + bytes([160] * 6) + bytes(6) + bytes(18)  # opacities, colours, scales, rotations, harmonics of degree 1
+    path.write_bytes(spz(1, 2, 1, at.astype("<f2").tobytes() + rest))
+    first = describe_splats(path)
+    fixed = (at * 2**12).astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3].tobytes()
+    path.write_bytes(spz(2, 2, 1, fixed + rest, flags=1))
+    second = describe_splats(path)
+    assert first is not None
+    assert second is not None
+    assert first["bounds"] == second["bounds"] == [at.min(axis=0).tolist(), at.max(axis=0).tolist()]
+    assert first["scales"] == second["scales"] == [1.0, 1.0]
+    assert first["opacities"] == second["opacities"] == [0.0, 1.0]
+    assert (first["format"], second["format"], first["notes"], second["notes"]) == ("SPZ 1", "SPZ 2", [], ["antialiased"])
+
+
+def spz4(count: int = 5, degree: int = 1, streams: int = 6, table: int = 32, stored: bytes = b"zstd" * 6, places: int | None = None) -> bytes:
+    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, 12, 0, streams, table)
+    sizes = [number for k in range(streams) for number in (4, (9 * count if places is None else places) if k == 0 else 1)]
+    return head + bytes(table - 32 if table < 1000 else 0) + struct.pack(f"<{2 * streams}Q", *sizes) + stored
+
+
+def test_spz_4_says_what_its_header_says(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(spz4())
+    facts = describe_splats(tmp_path / "a.spz")
+    assert facts is not None
+    assert (facts["format"], facts["gaussians"], facts["sh_degree"], facts["bounds"]) == ("SPZ 4", 5, 1, None)
+    assert "zstd" in facts["notes"][0]
+
+
+@pytest.mark.parametrize("extension", [".ply", ".glb"])
+def test_a_mesh_is_none_of_it(extension: str, tmp_path: Path) -> None:
+    from stages.formats.exporters import MESH_EXPORTERS
+
+    MESH_EXPORTERS[extension](block(), tmp_path / f"a{extension}", Z_UP)
+    assert describe_splats(tmp_path / f"a{extension}") is None
+
+
+def test_numbers_that_are_not_finite_are_counted(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.ply", scattered(COUNT, 0))
+    content = path.read_bytes()
+    body = content.index(b"end_header\n") + 11
+    path.write_bytes(content[:body] + np.float32(np.nan).tobytes() + content[body + 4 :])
+    facts = describe_splats(path)
+    assert facts is not None
+    assert facts["not_finite"] == 1
+    assert np.isfinite(facts["bounds"]).all()
+
+
+def described_or_refused(path: Path) -> dict[str, Any] | str | None:
+    """The facts, or the refusal."""
+    try:
+        return describe_splats(path)
+    except BadInput as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("extension", SPLAT_EXPORTERS)
+def test_what_is_cut_short_is_named(extension: str, tmp_path: Path) -> None:
+    """At every byte; a header that is cut leaves nothing that could be told from another file of that extension."""
+    path = written(tmp_path / f"a{extension}", scattered(2, 1))
+    whole = path.read_bytes()
+    begin = {".ply": whole.find(b"end_header\n") + 11, ".glb": whole.find(b"BIN\0") + 4, ".spz": 0}[extension]
+    assert begin >= 0
+    for end in range(0, len(whole), 1 if extension != ".glb" else 5):
+        path.write_bytes(whole[:end])
+        if end >= begin:
+            with pytest.raises(BadInput, match=rf"a\{extension}: .*Write the file again"):
+                describe_splats(path)
+        else:
+            found = described_or_refused(path)
+            assert found is None or isinstance(found, str)
+
+
+@pytest.mark.parametrize("extension", SPLAT_EXPORTERS)
+def test_no_altered_byte_does_more_than_a_refusal(extension: str, tmp_path: Path) -> None:
+    """Facts that are finite, or BadInput."""
+    path, draw = written(tmp_path / f"a{extension}", scattered(3, 1)), random.Random(1)
+    whole = path.read_bytes()
+    for _ in range(1500):
+        altered = bytearray(whole)
+        for _ in range(draw.randrange(1, 4)):
+            altered[draw.randrange(len(whole) if draw.random() < 0.3 else min(len(whole), 1200))] = draw.choice([0, 1, 2, 45, 48, 57, 127, 128, 255])
+        path.write_bytes(altered)
+        found = described_or_refused(path)
+        if isinstance(found, str):
+            assert found.startswith(f"{path}: ")
+            assert found.isprintable()
+        else:
+            json.dumps(found, allow_nan=False)
+
+
+def glb_with(change: Callable[[dict[str, Any]], None]) -> Callable[[bytes], bytes]:
+    def damaged(whole: bytes) -> bytes:
+        size = struct.unpack_from("<I", whole, 12)[0]
+        document = json.loads(whole[20 : 20 + size])
+        change(document)
+        text = json.dumps(document).encode()
+        text += b" " * (-len(text) % 4)
+        rest = whole[20 + size :]
+        return struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON") + text + rest
+
+    return damaged
+
+
+def replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
+    def damaged(whole: bytes) -> bytes:
+        assert old in whole
+        return whole.replace(old, new, 1)
+
+    return damaged
+
+
+PREFIX = "KHR_gaussian_splatting"
+HOSTILE: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+    "more Gaussians than bytes": (".ply", replaced(b"vertex 4", b"vertex 999999999999"), "expected"),
+    "a list": (".ply", replaced(b"property float x", b"property list uchar int x"), "property list"),
+    "a column twice": (".ply", replaced(b"property float nx", b"property float x"), "each once"),
+    "a type unknown": (".ply", replaced(b"property float nx", b"property quad nx"), "quad"),
+    "seven f_rest": (".ply", replaced(b"property float f_rest_0", b"property float other_00"), r"f_rest"),
+    "text": (".ply", replaced(b"binary_little_endian", b"ascii"), "not binary"),
+    "another element before": (".ply", replaced(b"element vertex", b"element camera 0\nproperty float a\nelement vertex"), "first element"),
+    "columns of another element": (".ply", replaced(b"property float x", b"property float y\nelement other 1\nproperty float x"), "lack columns|each once"),
+    "of SuperSplat": (".ply", replaced(b"property float nx", b"property uint packed_position\nproperty uint packed_rotation"), "SuperSplat"),
+    "no gzip": (".spz", lambda whole: b"\0" * 50, "gzip"),
+    "another magic": (".spz", lambda whole: gzip.compress(bytes(50)), "version 0"),
+    "a later version": (".spz", lambda whole: spz(9, 1, 0, bytes(20)), "version 9"),
+    "degree 9": (".spz", lambda whole: spz(3, 1, 9, bytes(20)), "degree 9"),
+    "no Gaussian": (".spz", lambda whole: spz(3, 0, 0, b""), "hold none"),
+    "four thousand million": (".spz", lambda whole: spz(3, 2**32 - 1, 0, bytes(20)), "4294967295 Gaussians"),
+    "a bomb": (".spz", lambda whole: spz(3, 1, 0, bytes(10_000_000)), "goes on after"),
+    "a bomb behind the Gaussians": (".spz", lambda whole: spz(3, 1, 0, bytes(20_000_000), flags=2), "goes on after"),
+    "two million Gaussians of nothing": (".spz", lambda whole: spz(3, 2_000_000, 0, bytes(40_000_000)), "not as many"),
+    "a wrong checksum": (".spz", lambda whole: whole[:-8] + b"abcd" + whole[-4:], "gzip"),
+    "no room for the table": (".spz", lambda whole: spz4(table=2**31), "table of 6 streams"),
+    "too few streams": (".spz", lambda whole: spz4(streams=1), "table of 1 streams"),
+    "streams beyond the end": (".spz", lambda whole: spz4(stored=b""), "for its streams"),
+    "places of another size": (".spz", lambda whole: spz4(places=7), "places of 7 bytes"),
+    "an accessor that is not there": (".glb", glb_with(lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(POSITION=99)), "IndexError"),
+    "a list for a document": (".glb", glb_with(lambda d: d.update(meshes=3)), "TypeError"),
+    "a view beyond the end": (".glb", glb_with(lambda d: d["bufferViews"][0].update(byteOffset=10**9)), "beyond the binary part"),
+    "a view below the start": (".glb", glb_with(lambda d: d["bufferViews"][0].update(byteOffset=-8)), "row by row"),
+    "a count of words": (".glb", glb_with(lambda d: d["accessors"][0].update(count="many")), "row by row|of numbers"),
+    "two counts": (".glb", glb_with(lambda d: d["accessors"][3].update(count=1)), "as many of each"),
+    "a huge count": (".glb", glb_with(lambda d: [each.update(count=2**52) for each in d["accessors"]]), "beyond the binary part"),
+    "sparse": (".glb", glb_with(lambda d: d["accessors"][0].update(sparse={})), "row by row"),
+    "matrices": (".glb", glb_with(lambda d: d["accessors"][0].update(type="MAT4")), "MAT4"),
+    "a lying stride": (".glb", glb_with(lambda d: d["bufferViews"][0].update(byteStride=1)), "bytes apart"),
+    "rows far apart": (".glb", glb_with(lambda d: d["bufferViews"][0].update(byteStride=256)), "to 252"),
+    "compressed": (
+        ".glb",
+        glb_with(lambda d: d["meshes"][0]["primitives"][0]["extensions"][PREFIX].update(extensions={f"{PREFIX}_compression_spz_2": {}})),
+        "compressed by KHR_gaussian_splatting_compression_spz_2",
+    ),
+    "not a number": (".glb", lambda whole: whole.replace(b'"scene":0', b'"scene":NaN', 1), "JSON"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_are_refused(name: str, tmp_path: Path) -> None:
+    extension, damaged, message = HOSTILE[name]
+    path = written(tmp_path / f"a{extension}", scattered(4, 1))
+    path.write_bytes(damaged(path.read_bytes()))
+    with pytest.raises(BadInput, match=message) as caught:
+        describe_splats(path)
+    assert str(caught.value).startswith(str(path))

@@ -1,0 +1,308 @@
+"""Meshes with a texture in every format: read back by small parsers of the tests' own (and USD's library), the same surface in the same colours."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from efficientnerf.surface.mesh import Mesh, Texture
+from efficientnerf.surface.texturing.corners import split_at_seams
+from pipeline.errors import BadInput, UsageError
+from stages.formats.exporters import MESH_EXPORTERS
+from stages.formats.exporters.textures import open_faces, plain_stem
+from tests.stages.io.meshes import NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
+
+SIDE = 48
+
+
+def textured(*, normals: bool = False) -> Mesh:
+    """The block with each of its six sides in a cell of an atlas, which is 3 wide and 2 high."""
+    quad = 0.05 + 0.9 * np.array([(0.0, 0), (0, 1), (1, 1), (1, 0)])
+    cells = [(np.array([k % 3, k // 3]) + quad) / [3, 2] for k in range(6)]
+    coordinates = np.array([part for cell in cells for part in (cell[[0, 1, 2]], cell[[0, 2, 3]])])
+    y, x = np.mgrid[0:SIDE, 0:SIDE] / SIDE
+    colours = np.stack([255 * x, 255 * y, 128 + 100 * np.sin(20 * x) * np.cos(14 * y)], -1).astype(np.uint8)
+    flat = np.full((SIDE, SIDE, 3), (128, 128, 255), np.uint8)
+    return replace(block(), texture=Texture(coordinates, colours, flat if normals else None))
+
+
+# corners (F, 3, 3) in the capture's frame, texture coordinates (F, 3, 2) with v up, the picture, the normal map
+Read = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]
+
+
+def picture_of(data: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(data)))
+
+
+def read_glb(path: Path) -> Read:
+    document, blob = glb_document(path)
+    assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
+    primitive = document["meshes"][0]["primitives"][0]
+    tangent = ["TANGENT"] if "normalTexture" in document["materials"][0] else []
+    assert sorted(primitive["attributes"]) == ["NORMAL", "POSITION", *tangent, "TEXCOORD_0"], "colours of vertices would darken the texture"
+    vertices, places = (accessor(document, blob, primitive["attributes"][name]) for name in ("POSITION", "TEXCOORD_0"))
+    faces = accessor(document, blob, primitive["indices"]).reshape(-1, 3)
+    back = np.array(document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"])[:3, :3]
+    pictures = []
+    for image in document["images"]:
+        view = document["bufferViews"][image["bufferView"]]
+        pictures.append(picture_of(blob[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]))
+    material = document["materials"][0]
+    assert document["textures"][material["pbrMetallicRoughness"]["baseColorTexture"]["index"]]["source"] == 0
+    assert ("KHR_materials_unlit" in material.get("extensions", {})) == ("normalTexture" not in material) == ("extensionsUsed" in document)
+    return (vertices @ back)[faces], (places * [1, -1] + [0, 1])[faces], pictures[0], pictures[1] if len(pictures) > 1 else None
+
+
+def read_obj(path: Path) -> Read:
+    lines = [line.split() for line in path.read_text("ascii").splitlines()]
+    vertices, places = (np.array([line[1:] for line in lines if line[0] == name], float) for name in ("v", "vt"))
+    corners = np.array([[part.split("/") for part in line[1:]] for line in lines if line[0] == "f"], int) - 1
+    (library,) = [line[1:] for line in lines if line[0] == "mtllib"]
+    assert len(library) == 1, "readers part names at blanks"
+    material = {line.split()[0]: line.split()[1:] for line in path.with_name(library[0]).read_text("ascii").splitlines()}
+    (used,) = [line[1:] for line in lines if line[0] == "usemtl"]
+    assert material["newmtl"] == used
+    (colours,) = material["map_Kd"]
+    normals = path.with_name(material["norm"][0]).read_bytes() if "norm" in material else None
+    picture = picture_of(path.with_name(colours).read_bytes())
+    return vertices[corners[..., 0]], places[corners[..., 1]], picture, None if normals is None else picture_of(normals)
+
+
+def read_usd(path: Path) -> Read:
+    from pxr import Ar, Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert stage.HasAuthoredMetadata("metersPerUnit")
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/surface/mesh"))
+    back = np.array(stage.GetRootLayer().customLayerData["usdFromCapture"]).reshape(3, 3)
+    faces = np.array(shape.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    st = UsdGeom.PrimvarsAPI(shape).GetPrimvar("st")
+    places = np.array(st.ComputeFlattened()).reshape(-1, 3, 2)
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/surface/material/surface"))
+    pictures = {}
+    for name in ("emissiveColor", "diffuseColor", "normal"):
+        found = surface.GetInput(name)
+        if found and found.HasConnectedSource():
+            source = UsdShade.Shader(found.GetConnectedSources()[0][0].source.GetPrim())
+            asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(source.GetInput("file").Get().resolvedPath))
+            pictures[name] = picture_of(bytes(asset.GetBuffer()))
+    assert sorted(pictures) in (["emissiveColor"], ["diffuseColor", "normal"])
+    colours = pictures.get("emissiveColor", pictures.get("diffuseColor"))
+    assert colours is not None
+    return (np.array(shape.GetPointsAttr().Get()) @ back)[faces], places, colours, pictures.get("normal")
+
+
+READERS: dict[str, Callable[[Path], Read]] = {".glb": read_glb, ".obj": read_obj, ".usdz": read_usd, ".usdc": read_usd}
+TEXTURED = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in READERS]
+
+
+def test_every_format_with_textures_is_read_here() -> None:
+    assert {each.extension for each in MESH_EXPORTERS.values() if each.textures} == READERS.keys()
+
+
+@pytest.mark.parametrize("picture", ["png", "jpeg"])
+@pytest.mark.parametrize("normals", [False, True], ids=["unlit", "normal map"])
+@pytest.mark.parametrize("extension", TEXTURED)
+def test_the_same_surface_in_the_same_colours(extension: str, normals: bool, picture: str, tmp_path: Path) -> None:
+    mesh, path = textured(normals=normals), tmp_path / f"thing{extension}"
+    exporter = MESH_EXPORTERS[extension]
+    exporter(mesh, path, Y_DOWN, picture=picture)
+    corners, places, colours, bent = READERS[extension](path)
+    assert mesh.texture is not None
+    np.testing.assert_allclose(corners, mesh.vertices[mesh.faces], atol=1e-5)
+    np.testing.assert_allclose(places, mesh.texture.coordinates, atol=1e-6)
+    if picture == "png":
+        np.testing.assert_array_equal(colours, mesh.texture.colours)
+    else:
+        assert 30 < -10 * np.log10(((colours / 255.0 - mesh.texture.colours / 255.0) ** 2).mean()) < 70
+    assert (bent is not None) == normals
+    if normals:
+        np.testing.assert_array_equal(bent, mesh.texture.normals)
+    written = sorted(each.name for each in tmp_path.iterdir())
+    assert written == sorted([path.name, *(each.name for each in exporter.companions(path, picture, normals))])
+
+
+def test_stl_and_ply_have_the_same_surface(tmp_path: Path) -> None:
+    mesh = textured()
+    MESH_EXPORTERS[".stl"](mesh, tmp_path / "a.stl", Z_UP)
+    data = (tmp_path / "a.stl").read_bytes()
+    assert not data.startswith(b"solid")
+    rows = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")], struct.unpack_from("<I", data, 80)[0], 84)
+    np.testing.assert_allclose(rows["corners"], mesh.vertices[mesh.faces])
+    edges = rows["corners"][:, 1:] - rows["corners"][:, :1]
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    np.testing.assert_allclose(rows["normal"], normal / np.linalg.norm(normal, axis=1, keepdims=True), atol=1e-6)
+    assert len(data) == 84 + 50 * len(mesh.faces)
+    MESH_EXPORTERS[".ply"](mesh, tmp_path / "a.ply", Z_UP)
+    MESH_EXPORTERS[".ply"](block(), tmp_path / "b.ply", Z_UP)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+@pytest.mark.parametrize("extension", [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in MESH_EXPORTERS])
+def test_the_same_mesh_is_the_same_bytes(extension: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On another day, elsewhere on the earth, in another folder."""
+    found = []
+    for name, zone in (("one", "UTC"), ("two", "Asia/Tokyo")):
+        monkeypatch.setenv("TZ", zone)
+        (tmp_path / name).mkdir()
+        MESH_EXPORTERS[extension](textured(), tmp_path / name / f"thing{extension}", Z_UP)
+        os.utime(tmp_path / name / f"thing{extension}", (1e9, 1e9))
+        found.append([each.read_bytes() for each in sorted((tmp_path / name).iterdir())])
+    assert found[0] == found[1]
+
+
+def test_vertices_are_split_at_seams_alone() -> None:
+    mesh = textured()
+    corners = split_at_seams(mesh)
+    assert len(corners.vertex) == 24, "three sides meet in each of eight corners"
+    np.testing.assert_array_equal(corners.vertex[corners.faces], mesh.faces)
+    assert mesh.texture is not None
+    np.testing.assert_allclose(corners.coordinates[corners.faces], mesh.texture.coordinates, atol=1e-6)
+    whole = replace(mesh, texture=Texture((mesh.vertices[mesh.faces][..., :2] - 1) / 3, mesh.texture.colours))
+    np.testing.assert_array_equal(split_at_seams(whole).vertex, np.arange(8))
+    np.testing.assert_array_equal(split_at_seams(whole).faces, mesh.faces)
+
+
+def test_open_meshes_are_seen_from_both_sides(tmp_path: Path) -> None:
+    closed = textured()
+    assert closed.texture is not None
+    part = replace(closed, faces=closed.faces[:-1], texture=replace(closed.texture, coordinates=closed.texture.coordinates[:-1]))
+    assert (open_faces(closed.faces), open_faces(part.faces)) == (False, True)
+    for mesh, expected in ((closed, False), (part, True)):
+        MESH_EXPORTERS[".glb"](mesh, tmp_path / "a.glb", Z_UP)
+        assert glb_document(tmp_path / "a.glb")[0]["materials"][0].get("doubleSided", False) == expected
+
+
+@NEEDS_USD
+def test_usdz_is_a_zip_of_aligned_stored_files_without_dates(tmp_path: Path) -> None:
+    path = tmp_path / "a.usdz"
+    MESH_EXPORTERS[".usdz"](textured(normals=True), path, Z_UP)
+    data = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        assert [entry.filename for entry in archive.infolist()] == ["surface.usdc", "surface.png", "surface_normal.png"]
+        for entry in archive.infolist():
+            name, extra = struct.unpack_from("<HH", data, entry.header_offset + 26)
+            assert (entry.header_offset + 30 + name + extra) % 64 == 0
+            assert entry.compress_type == zipfile.ZIP_STORED
+            assert entry.date_time == (1980, 1, 1, 0, 0, 0)
+        assert archive.testzip() is None
+
+
+@NEEDS_USD
+@pytest.mark.parametrize("mesh", [block(), textured(), textured(normals=True)], ids=["vertex colours", "texture", "normal map"])
+def test_usds_own_validators_find_nothing(mesh: Mesh, tmp_path: Path) -> None:
+    from pxr import Usd, UsdValidation
+
+    path = tmp_path / "a.usdz"
+    MESH_EXPORTERS[".usdz"](mesh, path, Z_UP)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10
+    errors = UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path)))
+    assert [error.GetMessage() for error in errors] == []
+
+
+def test_the_names_of_an_objs_other_files_are_plain(tmp_path: Path) -> None:
+    names = ["my scan", "my_scan", "ünï", "日本", "-o", ".hidden", "a" * 140, "mesh"]
+    stems = [plain_stem(Path(f"{name}.obj")) for name in names]
+    assert stems[1::6] == ["my_scan", "mesh"]
+    assert len(set(stems)) == len(names)
+    assert all(stem.isascii() and not {" ", "/"} & set(stem) and stem[0] not in ".-" for stem in stems)
+    for name in names[:4]:
+        MESH_EXPORTERS[".obj"](textured(), tmp_path / f"{name}.obj", Z_UP)
+        read_obj(tmp_path / f"{name}.obj")
+    assert len(list(tmp_path.iterdir())) == 12
+
+
+@pytest.mark.parametrize("call", [0, 1, 2, 3])
+@pytest.mark.parametrize("function", ["fsync", "replace"])
+def test_a_full_disk_leaves_no_part_of_an_obj(function: str, call: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three files, whichever cannot be written or renamed; the fourth call to sync is of the folder, and all is there by then."""
+    calls, real = iter(range(100)), getattr(os, function)
+
+    def full(*arguments: object, **more: object) -> object:
+        if next(calls) == call:
+            raise OSError(28, "No space left on device")
+        return real(*arguments, **more)
+
+    monkeypatch.setattr(os, function, full)
+    if function == "replace" and call == 3:
+        MESH_EXPORTERS[".obj"](textured(), tmp_path / "a.obj", Z_UP)
+        assert len(list(tmp_path.iterdir())) == 3
+        return
+    with pytest.raises(OSError, match="No space"):
+        MESH_EXPORTERS[".obj"](textured(), tmp_path / "a.obj", Z_UP)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_obj_appears_after_what_it_refers_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order, real = [], os.replace
+
+    def replaced(source: Path, target: Path) -> None:
+        order.append(Path(target).suffix)
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replaced)
+    MESH_EXPORTERS[".obj"](textured(), tmp_path / "a.obj", Z_UP)
+    assert order == [".png", ".mtl", ".obj"]
+
+
+def spoilt(**changes: np.ndarray) -> Mesh:
+    mesh = textured()
+    assert mesh.texture is not None
+    return replace(mesh, texture=replace(mesh.texture, **changes))
+
+
+BROKEN = {
+    "nan": (spoilt(coordinates=np.full((12, 3, 2), np.nan)), "36 of 36 texture coordinates are not finite"),
+    "another mesh's": (spoilt(coordinates=np.zeros((11, 3, 2))), r"shape \(11, 3, 2\), expected \(12, 3, 2\)"),
+    "outside": (spoilt(coordinates=np.full((12, 3, 2), 1.5)), "from 1.5 to 1.5, expected 0 to 1"),
+    "floating": (spoilt(colours=np.zeros((4, 4, 3))), "a texture of float64"),
+    "grey": (spoilt(colours=np.zeros((4, 4), np.uint8)), r"in shape \(4, 4\)"),
+    "empty": (spoilt(colours=np.zeros((0, 4, 3), np.uint8)), r"in shape \(0, 4, 3\)"),
+    "too large": (spoilt(colours=np.broadcast_to(np.uint8(0), (20000, 20000, 3))), "at most 16384 a side"),
+    "normals": (spoilt(normals=np.zeros((4, 4, 4), np.uint8)), r"in shape \(4, 4, 4\)"),
+}
+
+
+@pytest.mark.parametrize("extension", [".glb", ".obj", ".usdz"])
+@pytest.mark.parametrize("flaw", BROKEN)
+def test_broken_textures_are_refused(extension: str, flaw: str, tmp_path: Path) -> None:
+    mesh, message = BROKEN[flaw]
+    with pytest.raises(BadInput, match=message):
+        MESH_EXPORTERS[extension](mesh, tmp_path / f"a{extension}", Z_UP)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_textures_of_eight_thousand_texels_a_side(tmp_path: Path) -> None:
+    colours = np.zeros((8192, 8192, 3), np.uint8)
+    colours[::512] = 255
+    MESH_EXPORTERS[".glb"](spoilt(colours=colours), tmp_path / "a.glb", Z_UP)
+    np.testing.assert_array_equal(read_glb(tmp_path / "a.glb")[2], colours)
+
+
+@pytest.mark.parametrize("extension", [".usdz", ".usdc"])
+def test_without_usd_the_message_says_what_to_install(extension: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stages.formats.exporters.usd.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"usd-core, which is not installed. Install it: pip install 'efficientnerf\[usd\]'"):
+        MESH_EXPORTERS[extension](textured(), tmp_path / f"a{extension}", Z_UP)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_documents_hold_no_number_that_json_does_not_know(tmp_path: Path) -> None:
+    MESH_EXPORTERS[".glb"](textured(), tmp_path / "a.glb", Z_UP)
+    text = json.dumps(glb_document(tmp_path / "a.glb")[0])
+    assert "NaN" not in text
+    assert "Infinity" not in text

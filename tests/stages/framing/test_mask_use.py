@@ -1,0 +1,384 @@
+"""Masks and alpha channels: silhouettes of an object, or pixels to be ignored; decided, said, and what becomes of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.geometry.cameras import Camera, rays
+from pipeline.errors import BadInput
+from pipeline.stage import Job
+from stages.framing.mask_use import compactness
+from stages.io import scene, working_images
+from stages.io.capture import Capture, Photo, Silhouettes
+from stages.io.scene import Scene
+from stages.poses import run as poses
+from stages.poses.run import PosesSettings
+from stages.renamed_settings import moved, updated
+from stages.train.data import pixels_of
+from tests.stages import captures
+from tests.stages.captures import HEIGHT, WIDTH
+
+BALL, RADIUS = np.array([0.2, -0.1, 0.1]), 0.8
+WHITE = (1.0, 1.0, 1.0)
+Drawing = Callable[[int, Camera], np.ndarray]
+
+
+def ball(index: int, camera: Camera, centre: np.ndarray = BALL, radius: float = RADIUS) -> np.ndarray:
+    """(H, W) uint8: how much of each pixel a ball covers."""
+    fine = Camera(camera.name, 4 * WIDTH, 4 * HEIGHT, camera.model, tuple(4 * number for number in camera.params), camera.world_from_camera)
+    origins, directions = (np.asarray(part).reshape(-1, 3) for part in rays(fine))
+    along = ((centre - origins) * directions).sum(1)
+    distance = np.linalg.norm(origins + along[:, None] * directions - centre, axis=1)
+    return np.rint(255 * (distance < radius).reshape(HEIGHT, 4, WIDTH, 4).mean((1, 3))).astype(np.uint8)
+
+
+def off_centre(index: int, camera: Camera) -> np.ndarray:
+    return ball(index, camera, np.array([0.7, 0.4, 0.3]), 0.5)
+
+
+def but_for_a_thing(index: int, camera: Camera) -> np.ndarray:
+    """White but for a disc that moves."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return np.where(np.hypot(x - 6 - 4 * index, y - 12) < 4, np.uint8(0), np.uint8(255))
+
+
+def wandering(index: int, camera: Camera) -> np.ndarray:
+    """A disc here and there, which is no view of one object."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return np.where(np.hypot(x - (5, 27, 14, 8, 25, 18)[index], y - (6, 18, 5, 19, 5, 18)[index]) < 4, np.uint8(255), np.uint8(0))
+
+
+def lens(index: int, camera: Camera) -> np.ndarray:
+    """The round picture of a fisheye lens."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return np.where(np.hypot((x - WIDTH / 2) / 15, (y - HEIGHT / 2) / 11.5) < 1, np.uint8(255), np.uint8(0))
+
+
+def with_masks(how: str, folder: Path, draw: Drawing) -> Path:
+    """A source whose photographs have masks beside them."""
+    made = captures.cameras()
+    if how == "nerfstudio":
+        frames = captures.frames(made)
+        for frame in frames:
+            frame["mask_path"] = frame["file_path"].replace("images/", "masks/")
+        captures.nerfstudio(folder, frames=frames)
+    else:
+        {"llff": captures.llff, "colmap": captures.colmap_bin}[how](folder)
+    for index, camera in enumerate(made):
+        captures.write_picture(folder / "masks" / camera.name, draw(index, camera))
+    return folder
+
+
+def with_alpha(how: str, folder: Path, draw: Drawing) -> Path:
+    """The same as alpha channels."""
+    {"llff": captures.llff, "colmap": captures.colmap_bin, "nerfstudio": captures.nerfstudio}[how](folder)
+    for index, camera in enumerate(captures.cameras()):
+        path = folder / ("images_4" if how == "llff" else "images") / camera.name
+        captures.write_picture(path, np.dstack([captures.picture(index), draw(index, camera)]))
+    return folder
+
+
+def run(source: Path, out: Path, **settings: Any) -> tuple[Scene, list[str], list[str]]:
+    """The scene, what was said, and the warnings."""
+    events: list[dict[str, Any]] = []
+    job = Job(settings=PosesSettings(**settings), out=out / "poses", work=out / "work", source=source, stage="poses", report=events.append)
+    poses.run(job)
+    said, warned = ([event["text"] for event in events if event["event"] == kind] for kind in ("message", "warning"))
+    return scene.load(out / "poses"), said, warned
+
+
+@pytest.mark.parametrize("how", ["nerfstudio", "llff", "colmap"])
+@pytest.mark.parametrize("write", [with_masks, with_alpha])
+def test_silhouettes_of_one_object_bound_the_scene(how: str, write: Callable[..., Path], tmp_path: Path) -> None:
+    made, said, warned = run(write(how, tmp_path / "source", ball), tmp_path)
+    assert made.background == WHITE
+    assert made.space == "box"
+    assert [text for text in warned if "sparse points" not in text] == []  # the fixture has few of them
+    assert any("are silhouettes: " in text for text in said)
+    report = json.loads((tmp_path / "poses/report.json").read_text())
+    assert {facts["use"] for facts in report["masks"].values()} == {"silhouette"}
+    assert report["framing"]["bounds_from"] == "silhouettes"
+    corners = made.world_from_capture.inverse().points(np.array([[x, y, z] for x in made.bounds[:, 0] for y in made.bounds[:, 1] for z in made.bounds[:, 2]]))
+    assert (corners.min(0) <= BALL - RADIUS).all()
+    assert (corners.max(0) >= BALL + RADIUS).all()
+    assert 1 / made.world_from_capture.scale < 2.5 * RADIUS
+    for index, view in enumerate(made.views):
+        assert view.mask is None
+        camera = captures.cameras()[index]
+        found = scene.read_image(tmp_path / "poses", view)[..., 3].astype(int)
+        assert abs(found - ball(index, camera)).max() <= working_images.TRANSPARENT, "soft edges stay"
+        assert ((found > 0) & (found < 255)).any()
+
+
+@pytest.mark.parametrize("how", ["nerfstudio", "llff", "colmap"])
+@pytest.mark.parametrize("draw", [but_for_a_thing, wandering, lens])
+def test_other_masks_leave_pixels_out(how: str, draw: Drawing, tmp_path: Path) -> None:
+    made, said, _ = run(with_masks(how, tmp_path / "source", draw), tmp_path)
+    assert made.background is None
+    assert any(text.startswith("masks leave pixels out: ") for text in said)
+    for index, view in enumerate(made.views):
+        assert scene.read_image(tmp_path / "poses", view).shape[2] == 3
+        np.testing.assert_array_equal(scene.read_mask(tmp_path / "poses", view), draw(index, captures.cameras()[index]) > 0)
+
+
+@pytest.mark.parametrize("how", ["nerfstudio", "llff", "colmap"])
+def test_alpha_over_a_moving_thing_leaves_pixels_out(how: str, tmp_path: Path) -> None:
+    made, said, _ = run(with_alpha(how, tmp_path / "source", but_for_a_thing), tmp_path)
+    assert made.background is None
+    assert all(view.mask is not None for view in made.views)
+    assert any(text.startswith("alpha channels leave pixels out: ") for text in said)
+
+
+@pytest.mark.parametrize(("draw", "choice"), [(ball, "ignore"), (but_for_a_thing, "silhouette")])
+def test_the_choice_can_be_made_by_hand(draw: Drawing, choice: str, tmp_path: Path) -> None:
+    made, said, _ = run(with_masks("llff", tmp_path / "source", draw), tmp_path, masks=choice)
+    assert (made.background == WHITE) == (choice == "silhouette")
+    assert any(text.endswith("poses.masks says so") for text in said)
+
+
+def test_the_choice_is_the_same_again(tmp_path: Path) -> None:
+    source = with_masks("colmap", tmp_path / "source", ball)
+    folders = []
+    for name in "ab":
+        run(source, tmp_path / name)
+        folders.append({path.relative_to(tmp_path / name): path.read_bytes() for path in (tmp_path / name / "poses").rglob("*") if path.is_file()})
+    assert folders[0] == folders[1]
+
+
+def test_the_reason_is_named() -> None:
+    picture = np.zeros((24, 32), bool)
+    picture[8:16, 8:20] = True
+    assert compactness(picture) is None
+    assert compactness(~picture) == "keep more than 80% of the picture"
+    assert compactness(picture & False) == "keep next to nothing"
+    half = np.zeros((24, 32), bool)
+    half[:, :18] = True
+    assert compactness(half) == "keep more than 40% of the picture's border"
+    dots = np.zeros((24, 32), bool)
+    dots[2:22:3, 2:30:3] = True
+    assert compactness(dots) == "keep more than 5 parts"
+
+
+def test_masks_and_alpha_are_judged_apart(tmp_path: Path) -> None:
+    source = with_alpha("colmap", tmp_path / "source", but_for_a_thing)
+    for index, camera in enumerate(captures.cameras()):
+        captures.write_picture(source / "masks" / camera.name, ball(index, camera))
+    made, said, _ = run(source, tmp_path)
+    assert [text.partition(":")[0] for text in said if "silhouette" in text or "leave" in text] == ["alpha channels leave pixels out", "masks are silhouettes"]
+    assert made.background == WHITE
+    np.testing.assert_array_equal(scene.read_mask(tmp_path / "poses", made.views[1]), but_for_a_thing(1, captures.cameras()[1]) > 0)
+    assert scene.read_image(tmp_path / "poses", made.views[1])[0, 0, 3] == 0
+
+
+def test_photographs_without_a_silhouette_are_left_out(tmp_path: Path) -> None:
+    source = with_masks("colmap", tmp_path / "source", ball)
+    (source / "masks/img_2.png").unlink()
+    captures.write_picture(source / "masks/img_4.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    made, _, warned = run(source, tmp_path / "a", masks="silhouette")
+    assert [view.name for view in made.views] == [f"images/img_{index}.png" for index in (0, 1, 3, 5)]
+    assert any("1 of 6 images have no silhouette, and the others do: images/img_2.png" in text for text in warned)
+    assert any("images/img_4.png has an empty silhouette" in text for text in warned)
+    assert {len(track) for track in scene.read_points(tmp_path / "a/poses").tracks} == {4}
+    for index in (0, 1, 3):
+        (source / f"masks/img_{index}.png").unlink()
+    with pytest.raises(BadInput, match="2 of 6 images have a mask or an alpha channel; at least 3"):
+        run(source, tmp_path / "b", masks="silhouette")
+
+
+def test_points_of_the_background_go(tmp_path: Path) -> None:
+    source = with_masks("colmap", tmp_path / "source", lambda index, camera: ball(index, camera, radius=0.5))
+    made, _, _ = run(source, tmp_path)
+    found = made.world_from_capture.inverse().points(scene.read_points(tmp_path / "poses").xyz)
+    distance = np.linalg.norm(found - BALL, axis=1)
+    everything = np.linalg.norm(captures.sparse_points() - BALL, axis=1)
+    assert distance.max() < 0.7 < everything.max()
+    assert (everything < 0.45).sum() <= len(found) < len(everything)
+
+
+def test_cameras_are_judged_by_the_points_of_the_background_too(tmp_path: Path) -> None:
+    """They were found with them: that few lie on the object makes no camera less sure."""
+    run(with_masks("colmap", tmp_path / "source", ball), tmp_path)
+    judged = json.loads((tmp_path / "poses/verdict.json").read_text())["points"]
+    assert judged == len(captures.sparse_points())
+    assert len(scene.read_points(tmp_path / "poses").xyz) < judged
+
+
+@pytest.mark.parametrize(
+    ("levels", "suffix", "expected"),
+    [
+        ((0, 1), "png", (0, 255)),
+        ((0, 255), "png", (0, 255)),
+        ((0, 40, 90), "png", (0, 255, 255)),
+        ((3, 128, 252), "png", (0, 128, 255)),
+        ((0, 64, 192, 255), "png", (0, 64, 192, 255)),
+        ((9, 128, 246), "jpg", (0, 128, 255)),
+    ],
+)
+def test_levels_of_masks(levels: tuple[int, ...], suffix: str, expected: tuple[int, ...], tmp_path: Path) -> None:
+    """Labels count as they are; greys are soft."""
+    mask = np.repeat(np.repeat(np.array([levels], np.uint8), 64, 0), 64, 1)
+    captures.write_picture(tmp_path / f"m.{suffix}", mask)
+    camera = Camera("a.png", mask.shape[1], 64, "SIMPLE_PINHOLE", (40.0, 32.0, 32.0), np.eye(4))
+    found, warned = working_images.mask_levels(Photo(camera, tmp_path / "a.png", tmp_path / f"m.{suffix}"), 1)
+    assert not warned
+    assert [int(found[32, 64 * n + 32]) for n in range(len(levels))] == list(expected)
+    inverse = working_images.mask_levels(Photo(camera, tmp_path / "a.png", tmp_path / f"m.{suffix}", "white"), 1)[0]
+    np.testing.assert_array_equal(inverse, 255 - found)
+
+
+def test_a_mask_of_another_size_and_alpha_meet(tmp_path: Path) -> None:
+    """The lower of alpha and the mask's levels; colours outside do not bleed in where the image is reduced."""
+    pixels = np.zeros((24, 32, 4), np.uint8)
+    pixels[:] = (0, 255, 0, 255)
+    pixels[:, :17] = (255, 0, 0, 255)
+    pixels[:4, :, 3] = 0
+    captures.write_picture(tmp_path / "a.png", pixels)
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:, :34] = 255
+    captures.write_picture(tmp_path / "m.png", mask)
+    photo = Photo(captures.cameras(1)[0], tmp_path / "a.png", tmp_path / "m.png")
+    written = working_images.write(photo, tmp_path / "out", "a.png", max_side=16, silhouettes=Silhouettes(alpha=True, masks=True))
+    assert written.mask is None
+    assert any("the mask is 64x48, its image 32x24; it was resized" in text for text in written.warnings)
+    found = working_images.decode(tmp_path / "out" / written.image).pixels
+    assert found.shape == (12, 16, 4)
+    assert (found[:2, :, 3] == 0).all()
+    np.testing.assert_array_equal(found[3, :, 3], [255] * 8 + [128] + [0] * 7)
+    assert (found[2:, :9, :3] == (255, 0, 0)).all()
+
+
+def test_a_mask_of_another_aspect_is_refused(tmp_path: Path) -> None:
+    source = with_masks("llff", tmp_path / "source", ball)
+    captures.write_picture(source / "masks/img_1.png", np.full((HEIGHT, 20), 255, np.uint8))
+    with pytest.raises(BadInput, match=r"masks/img_1.png: the mask is 20x24, its image 32x24, of another aspect"):
+        run(source, tmp_path / "a")
+    (source / "masks/img_1.png").write_bytes(b"nothing")
+    _, _, warned = run(source, tmp_path / "b", masks="silhouette")
+    assert any("its mask img_1.png is unreadable" in text for text in warned)
+
+
+def test_soft_edges_reach_training(tmp_path: Path) -> None:
+    made, _, _ = run(with_masks("llff", tmp_path / "source", ball), tmp_path)
+    pixels = pixels_of(tmp_path / "poses", scene.views_of(made, "train"))
+    assert pixels.images.shape[1] == 4
+    assert pixels.usable is None
+    levels = np.unique(pixels.images[:, 3])
+    assert len(levels) > 4
+    assert {0, 255} <= set(levels.tolist())
+
+
+def photographs_with(folder: Path, draw: Drawing, *, turned: bool) -> Path:
+    """Photographs with masks; `turned`: the object turned, before a background that stood still."""
+    for index, camera in enumerate(captures.cameras()):
+        captures.write_picture(folder / camera.name, captures.picture(0 if turned else index))
+        captures.write_picture(folder / "masks" / camera.name, draw(index, camera))
+    return folder
+
+
+class Found:
+    """In place of structure from motion: true cameras with the surroundings, the object alone, or both; others are mixed up."""
+
+    def __init__(self, *right: str) -> None:
+        self.right, self.asked = right, list[str]()
+
+    def __call__(self, folder: Path, names: dict[str, Path], *, masks: dict[str, Path | None], work: Path, **options: Any) -> Capture:
+        everywhere = not masks if (folder / "masks").is_dir() else bool(masks) and not any(masks.values())
+        self.asked.append("surroundings" if everywhere else "object")
+        made = captures.cameras()
+        if self.asked[-1] not in self.right:
+            poses_of_others = [camera.world_from_camera for camera in (*made[3:], *made[:3])]
+            heights = [np.diag([1.0, -1.0, -1.0, 1.0]) if index % 2 else np.eye(4) for index in range(len(made))]
+            made = [replace(camera, world_from_camera=turn @ pose) for camera, pose, turn in zip(made, poses_of_others, heights, strict=True)]
+        photos = tuple(Photo(camera, folder / camera.name, masks.get(camera.name)) for camera in made)
+        return Capture("photographs", photos, None)
+
+
+@pytest.mark.parametrize(
+    ("draw", "turned", "right", "asked"),
+    [
+        (off_centre, False, ("surroundings",), ["surroundings"]),
+        (off_centre, True, ("object",), ["object"]),
+        (off_centre, False, ("object",), ["surroundings", "object"]),
+        (off_centre, False, ("surroundings", "object"), ["surroundings"]),
+        (but_for_a_thing, False, ("object",), ["object"]),
+    ],
+)
+def test_features_outside_of_silhouettes(
+    draw: Drawing, turned: bool, right: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They count where the background moves with the object, and not where the silhouettes contradict what they tell, nor for other masks."""
+    find = Found(*right)
+    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find)
+    made, said, _ = run(photographs_with(tmp_path / "source", draw, turned=turned), tmp_path)
+    assert find.asked == asked
+    if draw is off_centre:
+        assert (made.background, made.space) == (WHITE, "box")
+        assert any(text.startswith("masks are silhouettes: 6 of 6 photographs keep one object") for text in said)
+    else:
+        assert made.background is None
+        assert all(view.mask is not None for view in made.views)
+
+
+@pytest.mark.parametrize(("blank", "asked"), [(False, ["surroundings"]), (True, ["object"])])
+def test_colours_below_transparent_pixels_are_surroundings(blank: bool, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for index, camera in enumerate(captures.cameras()):
+        cover = off_centre(index, camera)
+        colour = np.where(cover[..., None] > 0, captures.picture(index), 0) if blank else captures.picture(index)
+        captures.write_picture(tmp_path / "source" / camera.name, np.dstack([colour.astype(np.uint8), cover]))
+    find = Found("surroundings", "object")
+    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find)
+    made, said, _ = run(tmp_path / "source", tmp_path)
+    assert find.asked == asked
+    assert (made.background, made.space) == (WHITE, "box")
+    assert any(text.startswith("alpha channels are silhouettes: 6 of 6 photographs keep one object") for text in said)
+
+
+def test_the_old_setting_is_answered_and_read() -> None:
+    assert moved("poses", "alpha") == "poses.alpha is now poses.masks, composite is now silhouette, mask is now ignore."
+    for before, after in {"composite": "silhouette", "mask": "ignore", "auto": "auto"}.items():
+        assert updated("poses", PosesSettings, {"alpha": before}) == {"masks": after}
+
+
+@pytest.mark.parametrize("how", ["nerfstudio", "colmap"])
+def test_masks_that_show_the_object_in_black_are_turned_round_and_said(how: str, tmp_path: Path) -> None:
+    """The same scene, byte for byte but for what its report says."""
+    made, said, _ = run(with_masks(how, tmp_path / "source", lambda index, camera: 255 - ball(index, camera)), tmp_path / "black")
+    usual, as_ever, _ = run(with_masks(how, tmp_path / "usual", ball), tmp_path / "white")
+    assert any(text.startswith("masks keep what is black") for text in said)
+    assert not any("black" in text for text in as_ever)
+    assert made.background == usual.background == WHITE
+    np.testing.assert_array_equal(made.bounds, usual.bounds)
+    for one, other in zip(made.views, usual.views, strict=True):
+        np.testing.assert_array_equal(scene.read_image(tmp_path / "black/poses", one), scene.read_image(tmp_path / "white/poses", other))
+
+
+def test_which_level_is_kept_can_be_stated(tmp_path: Path) -> None:
+    source = with_masks("colmap", tmp_path / "source", lambda index, camera: 255 - ball(index, camera))
+    made, said, _ = run(source, tmp_path / "white", mask_polarity="white")
+    assert made.background is None
+    assert not any("keep what is black" in text for text in said)
+    usual = with_masks("colmap", tmp_path / "usual", but_for_a_thing)
+    made, said, _ = run(usual, tmp_path / "black", mask_polarity="black", masks="ignore")
+    assert "masks keep what is black: what is white in them is left out" in said
+    for index, view in enumerate(made.views):
+        np.testing.assert_array_equal(scene.read_mask(tmp_path / "black/poses", view), but_for_a_thing(index, captures.cameras()[index]) == 0)
+
+
+def test_a_mask_may_be_an_alpha_channel(tmp_path: Path) -> None:
+    """As Brush has it: whatever the colours below it are."""
+    source = with_masks("colmap", tmp_path / "source", ball)
+    for index, camera in enumerate(captures.cameras()):
+        level = (0, 255)[index % 2]
+        captures.write_picture(source / "masks" / camera.name, np.dstack([np.full((HEIGHT, WIDTH, 3), level, np.uint8), ball(index, camera)]))
+    made, _, _ = run(source, tmp_path)
+    assert made.background == WHITE
+    for index, view in enumerate(made.views):
+        found = scene.read_image(tmp_path / "poses", view)[..., 3].astype(int)
+        assert abs(found - ball(index, captures.cameras()[index])).max() <= working_images.TRANSPARENT

@@ -1,0 +1,301 @@
+"""The stage `mesh` on a real asset file that holds a ball."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from efficientnerf.asset import format
+from efficientnerf.asset.region import Region
+from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.geometry.cameras import Camera, Similarity, rays
+from efficientnerf.surface.mesh import Mesh
+from pipeline.errors import CorruptArtifact, Interrupted, StageFailed, UsageError
+from pipeline.stage import Job
+from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
+from stages.evaluate.mesh import load_mesh
+from stages.io.png import write_png
+from stages.io.scene import Orbit, Scene, View, load, save
+from stages.mesh import run as stage
+from stages.mesh.files import read_mesh
+from stages.mesh.run import MeshSettings
+from stages.mesh.texture import textured
+from stages.mesh.timing import Stopwatch
+
+# The capture lies on its side (y down), is four times as large as the training frame and somewhere else.
+WORLD_FROM_CAPTURE = Similarity(0.25, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([0.1, 0.2, 0.3]))
+RADIUS = 0.55
+
+
+def bake_ball(folder: Path, density: float = 300.0) -> Path:
+    """A folder with asset.nerftree: a ball around the origin of the training frame, orange above and blue below."""
+    cells, brick = 10, 4
+    voxel = 2 / (cells * brick)
+    index = np.stack(np.meshgrid(*[np.arange(cells * brick)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    centre = (index + 0.5) * voxel - 1
+    distance = np.linalg.norm(centre, axis=1) - RADIUS
+    kept = distance < voxel
+    colour = np.where(centre[kept, 2:] > 0, [0.9, 0.5, 0.1], [0.1, 0.2, 0.8])
+    sh = (np.log(colour / (1 - colour)) / 0.28209479177387814)[:, None]
+    level = density * np.clip(0.5 - distance[kept] / voxel, 0, 1)
+    similarity = WORLD_FROM_CAPTURE
+    metadata = {
+        "world_from_capture": {"scale": similarity.scale, "rotation": similarity.rotation.tolist(), "translation": similarity.translation.tolist()},
+        "orbit": {"centre": [0.0, 0.0, 0.0], "radius": 3.0, "elevation": 25.0, "forward_facing": False, "heading": 40.0},
+        "metric": True,
+        "provenance": {},
+    }
+    tree = tree_from_voxels((cells,) * 3, voxel, np.full(3, -1.0), index[kept], level, sh.astype(np.float32), metadata=metadata)
+    folder.mkdir(parents=True)
+    format.save(tree, folder / "asset.nerftree")
+    return folder
+
+
+def photograph_ball(folder: Path, colours: tuple[tuple[float, ...], ...] = ((0.9, 0.5, 0.1), (0.1, 0.2, 0.8)), splits: tuple[str, ...] = ("train",)) -> Path:
+    """A scene (the artifact of poses) with photographs of that ball from eight sides, in two colours, above and below, on white. `splits` in turn."""
+    width, height = 64, 48
+    views = []
+    (folder / "images").mkdir(parents=True)
+    for number in range(8):
+        turn, height_of_camera = number * np.pi / 4, 1.0 if number % 2 else -1.0
+        centre = np.array([2.5 * np.cos(turn), 2.5 * np.sin(turn), height_of_camera])
+        forward = -centre / np.linalg.norm(centre)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
+        camera = Camera(f"{number}.png", width, height, "SIMPLE_PINHOLE", (70.0, width / 2, height / 2), pose)
+        origins, directions = rays(camera)
+        along = -(origins * directions).sum(1)
+        apart = RADIUS**2 - (origins**2).sum(1) + along**2
+        up = (origins + (along - np.sqrt(np.maximum(apart, 0)))[:, None] * directions)[:, 2] > 0
+        shown = np.where((apart > 0)[:, None], np.where(up[:, None], colours[0], colours[1]), 1.0)
+        write_png(np.round(shown * 255).astype(np.uint8).reshape(height, width, 3), folder / "images" / camera.name)
+        source = replace(camera, world_from_camera=WORLD_FROM_CAPTURE.inverse().pose(pose))
+        views.append(View(f"images/{camera.name}", None, splits[number % len(splits)], camera, source, 0.5, 5.0))
+    orbit = Orbit((0.0, 0.0, 0.0), 3.0, 20.0, False, 0.0)
+    save(Scene("photographs", tuple(views), np.array([[-1.0] * 3, [1.0] * 3]), (1.0, 1.0, 1.0), WORLD_FROM_CAPTURE, orbit, metric=True), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photograph_ball(tmp_path_factory.mktemp("photographed") / "poses")
+
+
+def inputs(bake: Path, poses: Path) -> dict[str, Path]:
+    """Of the stage: training refined no cameras."""
+    return {"bake": bake, "poses": poses, "train": poses}
+
+
+@pytest.fixture(scope="session")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bake_ball(tmp_path_factory.mktemp("ball") / "bake")
+
+
+def test_the_mesh_lies_in_the_captures_frame(ball: Path, photographed: Path, tmp_path: Path) -> None:
+    import trimesh
+    from PIL import Image
+
+    events: list[dict] = []
+    settings = MeshSettings(max_faces=4000, density_threshold=150.0, texture_size=256)
+    stage.run(Job(settings=settings, inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work", report=events.append))
+    files = ["check.png", "mesh.glb", "mesh.mtl", "mesh.obj", "mesh.ply", "mesh.png", "preview.png", "report.json", "timings.json"]
+    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == files
+    mesh = trimesh.load(tmp_path / "out" / "mesh.ply", process=False)
+    centre = WORLD_FROM_CAPTURE.inverse().points(np.zeros(3))
+    np.testing.assert_allclose(mesh.bounds.mean(0), centre, atol=0.05)
+    outward = mesh.vertices - centre
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), RADIUS * 4, atol=0.2)
+    assert (mesh.vertex_normals * outward / np.linalg.norm(outward, axis=1, keepdims=True)).sum(1).min() > 0.8
+    # Up in the capture is -y: that is where it is orange.
+    top = mesh.visual.vertex_colors[outward[:, 1] < -0.5][:, :3].mean(0)
+    np.testing.assert_allclose(top, [0.9 * 255, 0.5 * 255, 0.1 * 255], atol=3)
+
+    seconds = json.loads((tmp_path / "out" / "timings.json").read_text())
+    assert list(seconds) == [
+        "views of the asset", "surface", "cleaning and decimation", "colours at vertices", "photographs", "charts", "preview", "files", "check",
+    ]  # fmt: skip
+
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["watertight"] is True
+    assert report["components"] == 1
+    assert report["faces"] == len(mesh.faces) <= 4000
+    assert report["unit"] == "metre"
+    np.testing.assert_allclose(report["bounds"], mesh.bounds, atol=1e-5)
+    assert report["volume"] == pytest.approx(4 / 3 * np.pi * (RADIUS * 4) ** 3, rel=0.03)
+    (said,) = (event for event in events if "faces" in event)
+    assert said["faces"] == report["faces"]
+    assert said["text"].startswith(f"{report['faces']} faces in 1 component, with a texture of 128x128, 9")
+
+    standing = trimesh.load(tmp_path / "out" / "mesh.glb", force="mesh", process=False)
+    corners = np.asarray(standing.vertices)[standing.faces]  # its vertices are split where the texture has seams
+    np.testing.assert_allclose(corners, (mesh.vertices * [1, -1, -1])[mesh.faces], atol=1e-5)
+
+    preview = np.asarray(Image.open(tmp_path / "out" / "preview.png"))
+    assert preview.shape == (840, 1680, 3)
+    np.testing.assert_allclose(preview[120, 210], [230, 128, 26], atol=6)
+    np.testing.assert_allclose(preview[320, 210], [26, 51, 204], atol=6)
+
+
+def test_the_same_asset_gives_the_same_bytes(ball: Path, photographed: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        stage.run(Job(settings=MeshSettings(max_faces=1000), inputs=inputs(ball, photographed), out=tmp_path / name, work=tmp_path / "work"))
+    for file in (tmp_path / "a").iterdir():
+        assert file.name in stage.STAGE.volatile or file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
+
+
+def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, photographed: Path, tmp_path: Path) -> None:
+    with pytest.raises(StageFailed, match=r"nowhere reaches 1e\+04.*Lower mesh.density_threshold"):
+        stage.run(Job(settings=MeshSettings(density_threshold=1e4), inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
+
+
+def test_an_empty_asset_makes_an_empty_mesh_that_can_be_measured_and_names_the_remedy(photographed: Path, tmp_path: Path) -> None:
+    bake = bake_ball(tmp_path / "bake", density=0.01)
+    events: list[dict[str, Any]] = []
+    stage.run(Job(settings=MeshSettings(), inputs=inputs(bake, photographed), out=tmp_path / "out", work=tmp_path / "work", report=events.append))
+    (warning,) = [event["text"] for event in events if event["event"] == "warning"]
+    assert "empty" in warning
+    assert "train longer" in warning
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (report["faces"], report["bounds"], report["watertight"]) == (0, None, False)
+    outputs = MeshOutputs(tmp_path / "out")
+    for path in (outputs.ply, outputs.glb, outputs.obj, outputs.preview, outputs.check):
+        assert path.stat().st_size
+    assert len(trimesh.load(outputs.glb, force="scene").geometry) == 0
+    tree = format.load(bake / "asset.nerftree")
+    measured = load_mesh(outputs, tree, "foreground")
+    assert measured.facts == {"faces": 0, "vertices": 0, "texture_size": None}
+    for image in measured.shader.images(load(photographed).views[0].camera):
+        assert not image.covered.any()
+        assert np.isinf(image.depth).all()
+
+
+def test_a_signal_stops_it(ball: Path, photographed: Path, tmp_path: Path) -> None:
+    with pytest.raises(Interrupted):
+        stage.run(Job(settings=MeshSettings(), inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work", stop=lambda: 2))
+
+
+def test_progress_never_goes_back(ball: Path) -> None:
+    tree = format.load(ball / "asset.nerftree")
+    told: list[tuple[int, int, str]] = []
+    stage.mesh_of(tree, MeshSettings(max_faces=500), lambda *each: told.append(each))
+    assert [each[:2] for each in told] == sorted(each[:2] for each in told)
+    assert {each[2] for each in told} == {"views of the asset", *stage.PARTS}
+    assert told[-1][0] == told[-1][1]
+
+
+def with_region(ball: Path, folder: Path) -> Path:
+    """The same asset whose foreground is its upper half and a little more."""
+    folder.mkdir(parents=True)
+    region = Region(np.array([[-0.9, -0.9, -0.2], [0.9, 0.9, 0.9]]), 0.9, 0.05)
+    format.save(replace(format.load(ball / "asset.nerftree"), region=region), folder / "asset.nerftree")
+    return folder
+
+
+@pytest.mark.parametrize(("region", "lowest"), [("foreground", -0.2), ("all", -RADIUS)])
+def test_the_foreground_is_meshed_unless_all_is_asked_for(ball: Path, photographed: Path, tmp_path: Path, region: str, lowest: float) -> None:
+    bake = with_region(ball, tmp_path / "bake")
+    settings = MeshSettings(max_faces=3000, region=region)  # type: ignore[arg-type]
+    stage.run(Job(settings=settings, inputs=inputs(bake, photographed), out=tmp_path / "out", work=tmp_path / "work"))
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    corners = WORLD_FROM_CAPTURE.points(np.array(report["bounds"]))
+    assert corners[:, 2].min() == pytest.approx(lowest, abs=0.06)
+    assert corners[:, 2].max() == pytest.approx(RADIUS, abs=0.05)
+    assert report["watertight"]
+
+
+def test_a_region_without_anything_is_said(ball: Path, photographed: Path, tmp_path: Path) -> None:
+    (tmp_path / "bake").mkdir()
+    far = Region(np.array([[0.9, 0.9, 0.9], [0.95, 0.95, 0.95]]))
+    format.save(replace(format.load(ball / "asset.nerftree"), region=far), tmp_path / "bake" / "asset.nerftree")
+    with pytest.raises(UsageError, match="nothing of the asset lies in its foreground region"):
+        stage.run(Job(settings=MeshSettings(), inputs=inputs(tmp_path / "bake", photographed), out=tmp_path / "out", work=tmp_path / "work"))
+
+
+@pytest.mark.parametrize(("choice", "above"), [("auto", (0.2, 0.9, 0.3)), ("photographs", (0.2, 0.9, 0.3)), ("asset", (0.9, 0.5, 0.1))])
+def test_the_texture_shows_what_was_asked_for(ball: Path, tmp_path: Path, choice: str, above: tuple[float, ...]) -> None:
+    poses = photograph_ball(tmp_path / "poses", ((0.2, 0.9, 0.3), (0.9, 0.1, 0.4)))
+    job = Job(settings=None, inputs=inputs(ball, poses), out=tmp_path / "out", work=tmp_path / "work")
+    tree = format.load(ball / "asset.nerftree")
+    surface = stage.mesh_of(tree, MeshSettings(max_faces=2000), lambda *each: None)
+    found = textured(surface, tree, inputs_of(MeshInputs, job.inputs), choice, 256, lambda *each: None)
+    assert found.texture is not None
+    side = len(found.texture.colours)
+    u, v = found.texture.coordinates.mean(1).T
+    shown = found.texture.colours[((1 - v) * side).astype(int), (u * side).astype(int)] / 255
+    top = found.vertices[found.faces].mean(1)[:, 2] > 0.25
+    np.testing.assert_allclose(np.median(shown[top], axis=0), above, atol=0.03)
+    assert np.abs(shown[top] - above).max(1).mean() < 0.05
+
+
+def test_held_back_photographs_are_not_looked_at(ball: Path, tmp_path: Path) -> None:
+    """Where all photographs but the training ones are gone, nothing changes."""
+    poses = photograph_ball(tmp_path / "poses", splits=("train", "test", "train", "val"))
+    settings = MeshSettings(max_faces=1000, texture_size=256)
+    stage.run(Job(settings=settings, inputs=inputs(ball, poses), out=tmp_path / "a", work=tmp_path / "work"))
+    for number in (1, 3, 5, 7):
+        (poses / "images" / f"{number}.png").unlink()
+    stage.run(Job(settings=settings, inputs=inputs(ball, poses), out=tmp_path / "b", work=tmp_path / "work"))
+    assert (tmp_path / "a" / "report.json").read_bytes() == (tmp_path / "b" / "report.json").read_bytes()
+    assert json.loads((tmp_path / "a" / "report.json").read_text())["texture_observed"] > 0.5
+
+
+def test_without_a_photograph_that_shows_it_the_asset_is_the_texture(ball: Path, tmp_path: Path) -> None:
+    poses = photograph_ball(tmp_path / "poses", splits=("test",))
+    stage.run(Job(settings=MeshSettings(max_faces=1000, texture_size=256), inputs=inputs(ball, poses), out=tmp_path / "out", work=tmp_path / "work"))
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["texture"] == "asset"
+
+
+def test_a_normal_map_is_written_and_read_again(ball: Path, photographed: Path, tmp_path: Path) -> None:
+    settings = MeshSettings(max_faces=300, texture_size=256, normal_map=True)
+    stage.run(Job(settings=settings, inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["normal_map_met"] > 0.98
+    outputs = MeshOutputs(tmp_path / "out")
+    found = read_mesh(outputs)
+    assert found.texture is not None
+    assert found.texture.normals is not None
+    assert found.texture.normals.shape == found.texture.colours.shape
+    assert "normal map" in json.loads(outputs.timings.read_text())
+    outputs.normal_map.unlink()
+    with pytest.raises(CorruptArtifact, match=r"mesh_normal\.png"):
+        read_mesh(outputs)
+
+
+def test_a_normal_map_without_a_texture_is_refused(ball: Path, photographed: Path, tmp_path: Path) -> None:
+    settings = MeshSettings(normal_map=True, texture="off")
+    with pytest.raises(UsageError, match=r"mesh\.normal_map lies on the coordinates of a texture"):
+        stage.run(Job(settings=settings, inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
+
+
+def test_time_passes_for_the_part_that_is_reported_next() -> None:
+    now = [0.0]
+    watch = Stopwatch(lambda: now[0])
+    report = watch.listening(lambda done, total, text: None)
+    for seconds, text in ((1, "marching cubes"), (2, "marching cubes"), (4, "colours"), (8, "colours"), (16, "texture"), (32, "charts"), (64, "texture")):
+        now[0] += seconds
+        report(0, 1, text)
+    now[0] += 128
+    watch.lap("files")
+    assert watch.seconds == {"surface": 3, "cleaning and decimation": 4, "colours at vertices": 8, "photographs": 80, "charts": 32, "files": 128}
+
+
+def test_the_preview_of_a_capture_from_one_side_shows_all_of_a_subject_that_is_clipped() -> None:
+    """What is not clipped may reach far behind the subject: there the outmost fifth is left out."""
+    y, z = (part.ravel() for part in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij"))
+    corner = 21 * np.arange(20)[:, None] + np.arange(20)
+    faces = np.concatenate([np.stack([corner, corner + 21, corner + 22], -1), np.stack([corner, corner + 22, corner + 1], -1)]).reshape(-1, 3)
+    outer = np.abs(y * z) > 0.6
+    square = Mesh(np.stack([0 * y, y, z], 1), faces, np.tile([1.0, 0, 0], (441, 1)), np.where(outer[:, None], [1.0, 0, 0], [0, 1.0, 0]), {})
+    orbit = {"orbit": {"heading": 0.0, "elevation": 20.0, "forward_facing": True}}
+    whole, middle = (stage.preview_of(square, orbit, clipped=clipped) for clipped in (True, False))
+    assert whole.shape == middle.shape == (840, 1680, 3)
+    assert (whole == (255, 0, 0)).all(-1).sum() > 1000
+    assert not (middle == (255, 0, 0)).all(-1).any()

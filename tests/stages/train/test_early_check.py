@@ -1,0 +1,302 @@
+"""Whether anything is learned, and what follows where nothing is: a training that fails by construction is reported, rescued, and repeatable to the byte."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.errors import CorruptArtifact, Interrupted, StageFailed
+from stages.artifacts import TrainOutputs
+from stages.evaluate.trivial import blurred
+from stages.io import scene as scenes
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import View
+from stages.train import choices as training_choices
+from stages.train import run as train
+from stages.train.checks import early_check, second_chances, watch
+from stages.train.checks.early_check import HeldOutView, check_step, judge
+from stages.train.choices import TrainingChoices
+from stages.train.data import pixels_of
+from tests.efficientnerf import balls
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import StopAt, job, poses
+from tests.stages.forward_facing import painted_wall
+
+LOOKED, STEPS = 40, 80
+QUICK = {"iterations": STEPS, "checkpoint_every": 15}
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(early_check, "MIN_STEP", LOOKED)
+    monkeypatch.setattr(second_chances, "SMALL", settings(iterations=LOOKED))
+    monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+
+
+def ball(folder: Path, change: Callable[[View, Path], View] = lambda view, folder: view, **options: Any) -> Path:
+    """A ball that is learned in `LOOKED` steps, its views changed."""
+    made = poses(folder, count=10, **options)
+    s = scenes.load(made)
+    scenes.save(replace(s, views=tuple(change(view, made) for view in s.views)), made)
+    return made
+
+
+def behind(view: View, folder: Path) -> View:
+    """With its near plane behind the subject."""
+    return replace(view, near=4.2)
+
+
+def inverted(view: View, folder: Path) -> View:
+    """With a mask that leaves out the subject and nothing else."""
+    mask = view.image.replace(".png", "_mask.png")
+    Image.fromarray(np.where(np.array(Image.open(folder / view.image))[..., 3] > 0, 0, 255).astype(np.uint8)).save(folder / mask)
+    return replace(view, mask=mask)
+
+
+def digest(folder: Path) -> str:
+    """Of what later stages read."""
+    outputs = TrainOutputs(folder / "out")
+    return hashlib.sha256(outputs.field.read_bytes() + outputs.choices.read_bytes()).hexdigest()
+
+
+def report(folder: Path) -> dict[str, Any]:
+    return dict(json.loads(TrainOutputs(folder / "out").report.read_text()))
+
+
+def held_out(colour: np.ndarray, counted: np.ndarray | None = None) -> HeldOutView:
+    height, width = colour.shape[:2]
+    camera = replace(balls.cameras(1)[0], width=width, height=height)
+    return HeldOutView(camera, colour.astype(np.float32), np.ones((height, width), bool) if counted is None else counted)
+
+
+def photograph(rng: np.random.Generator, side: int = 40) -> np.ndarray:
+    """Patches of colours, with fine texture."""
+    patches = np.kron(rng.random((5, 5, 3)), np.ones((side // 5, side // 5, 1)))
+    return np.asarray(0.8 * patches + 0.2 * rng.random((side, side, 3)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_plain_colour_is_progress_and_the_photograph_is(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    views = [held_out(photograph(rng)) for _ in range(3)]
+
+    def result(render: Callable[[HeldOutView], np.ndarray]) -> early_check.EarlyResult:
+        renders = iter(views)
+        found = judge(views, lambda camera: render(next(renders)), 7)
+        assert found is not None
+        return found
+
+    plain = result(lambda view: np.broadcast_to(rng.random(3), view.colour.shape))
+    assert plain.progress <= 1e-6
+    assert not plain.learning
+    assert not result(lambda view: np.zeros_like(view.colour)).learning
+    assert not result(lambda view: rng.random(view.colour.shape)).learning
+    diverged = result(lambda view: np.full_like(view.colour, np.nan))
+    assert not diverged.learning
+    assert np.isfinite(diverged.progress)
+    assert not result(lambda view: views[0].colour if view is not views[0] else views[1].colour).learning
+    good = result(lambda view: view.colour)
+    assert good.learning
+    assert good.progress > 1
+    assert (good.views, good.step) == (3, 7)
+    assert result(lambda view: 0.6 * view.colour).learning  # an exposure of its own
+    assert result(lambda view: view.colour if view is not views[0] else np.zeros_like(view.colour)).learning  # one of three has a wrong camera
+    assert result(lambda view: blurred(view.colour, early_check.BLUR * 40)).progress == pytest.approx(1, abs=0.1)
+
+
+def test_a_render_close_to_a_plain_photograph_is_no_failure() -> None:
+    view = held_out(np.full((20, 20, 3), 0.8) + 0.01 * np.random.default_rng(0).random((20, 20, 3)))
+    found = judge([view], lambda camera: np.full((20, 20, 3), 0.79), 1)
+    assert found is not None
+    assert found.learning
+    assert judge([held_out(view.colour, np.zeros((20, 20), bool))], lambda camera: view.colour, 1) is None
+
+
+def test_black_is_not_all_there_is_to_learn_of_a_small_thing_before_black() -> None:
+    rng = np.random.default_rng(0)
+    colour = np.zeros((40, 40, 3))
+    colour[15:22, 15:22] = 0.5 * rng.random((7, 7, 3))
+    found = judge([held_out(colour)], lambda camera: np.zeros((40, 40, 3)), 1)
+    assert found is not None
+    assert found.psnr > early_check.GOOD_PSNR - 3
+    assert not found.learning
+
+
+@pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0)])
+def test_an_empty_field_has_learned_nothing_however_much_of_the_picture_is_background(tmp_path: Path, background: tuple[float, float, float]) -> None:
+    folder = poses(tmp_path / "poses", side=64, background=background)
+    s = scenes.load(folder)
+    views = early_check.held_out_views(folder, s)
+    assert [view.camera.name for view in views] == [view.camera.name for view in s.views if view.split == "test"]
+    assert 0.05 < np.mean([view.counted.mean() for view in views]) < 0.5
+    found = judge(views, lambda camera: np.broadcast_to(np.array(background), (camera.height, camera.width, 3)), 1)
+    assert found is not None
+    assert not found.learning
+
+
+def test_it_is_looked_after_a_tenth_and_short_runs_are_left_alone() -> None:
+    assert [check_step(steps) for steps in (1, LOOKED, 2 * LOOKED - 1, 2 * LOOKED, 10 * LOOKED, 1000, 30000)] == [None] * 3 + [LOOKED] * 2 + [100, 3000]
+
+
+@pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0)])
+def test_a_training_that_learns_is_left_alone(tmp_path: Path, background: tuple[float, float, float]) -> None:
+    events: list[dict[str, Any]] = []
+    made = job(tmp_path, settings(**QUICK), poses=ball(tmp_path / "poses", background=background), events=events)
+    train.run(made)
+    assert [event for event in events if event["event"] == "warning"] == []
+    found = report(tmp_path)
+    assert [check["learning"] for check in found["early_check"]] == [True]
+    assert (found["early_check"][0]["step"], found["second_chances"], found["chosen"]) == (LOOKED, [], None)
+    assert not TrainOutputs(made.out).choices.exists()
+    assert training_choices.load(made.out) == TrainingChoices()
+
+
+def test_a_forward_facing_training_that_learns_is_left_alone(tmp_path: Path) -> None:
+    folder = painted_wall(tmp_path / "poses")
+    train.run(job(tmp_path, settings(**QUICK, occupancy_warmup_steps=10), poses=folder))
+    found = report(tmp_path)
+    assert [check["learning"] for check in found["early_check"]] == [True]
+    # Near planes and views are no priors of this space.
+    assert list(second_chances.candidates(scenes.load(folder), settings())) == [second_chances.AS_STATED, "exposure", "camera refinement"]
+
+
+def test_every_second_chance_of_a_contracted_scene_comes_to_a_figure(tmp_path: Path) -> None:
+    folder = ball(tmp_path / "poses", behind, photographs=True)
+    train.run(job(tmp_path, settings(**QUICK), poses=folder))
+    found = report(tmp_path)
+    assert found["early_check"][0]["learning"] is False
+    assert [trial["name"] for trial in found["second_chances"]] == list(second_chances.candidates(scenes.load(folder), settings()))
+    assert all(np.isfinite(trial["progress"]) and trial["step"] == LOOKED for trial in found["second_chances"])
+
+
+@pytest.mark.parametrize(
+    ("change", "chosen", "choices"),
+    [(behind, "near planes off", TrainingChoices(near="off")), (inverted, "masks ignored", TrainingChoices(masks=False))],
+)
+def test_what_a_prior_deletes_comes_back_without_it(tmp_path: Path, change: Callable[[View, Path], View], chosen: str, choices: TrainingChoices) -> None:
+    events: list[dict[str, Any]] = []
+    made = job(tmp_path, settings(**QUICK), poses=ball(tmp_path / "poses", change), events=events)
+    train.run(made)
+    warned = [event["early_check"] for event in events if event["event"] == "warning" and "early_check" in event]
+    assert [check["step"] for check in warned] == [LOOKED]
+    found = report(tmp_path)
+    assert found["chosen"] == chosen
+    assert made.facts["early_check"]["chosen"] == chosen
+    assert [check["learning"] for check in found["early_check"]] == [False, True]
+    assert {second_chances.AS_STATED, chosen, "camera refinement"} <= {trial["name"] for trial in found["second_chances"]}
+    assert training_choices.load(made.out) == choices
+    stated, used = scenes.load(made.inputs["poses"]), load_scene(made.inputs["poses"], made.out)
+    assert choices.scene(stated).views[0].near == used.views[0].near
+    assert [view.mask for view in used.views] == [view.mask if choices.masks else None for view in stated.views]
+
+
+def test_a_training_that_is_stopped_anywhere_ends_with_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = ball(tmp_path / "poses", behind)
+    train.run(job(tmp_path / "undisturbed", settings(**QUICK), poses=folder))
+    expected = digest(tmp_path / "undisturbed")
+    # In the training that fails, in two trials, and in the training that follows.
+    stop, count = StopAt(20, LOOKED + 10, 2 * LOOKED + 5, 2 * LOOKED + 20, 4 * LOOKED + 30), 0
+    trained: list[str] = []
+    real = second_chances._train
+    monkeypatch.setattr(second_chances, "_train", lambda *arguments: [real(*arguments), trained.append(arguments[-1])][0])
+    while True:
+        try:
+            train.run(job(tmp_path / "stopped", settings(**QUICK), poses=folder, stop=stop))
+            break
+        except Interrupted:
+            count += 1
+    assert count == len(stop.calls)
+    assert digest(tmp_path / "stopped") == expected
+    assert len(trained) == len(set(trained)) == len(report(tmp_path / "stopped")["second_chances"])  # none that was finished is done again
+    assert report(tmp_path / "stopped")["second_chances"] == report(tmp_path / "undisturbed")["second_chances"]
+
+
+def test_a_budget_of_time_is_left_for_what_is_chosen(tmp_path: Path) -> None:
+    folder = ball(tmp_path / "poses", behind)
+    made = job(tmp_path, settings(**QUICK, time_budget=6.0), poses=folder)
+    train.run(made)
+    found = report(tmp_path)
+    # Where steps are slow the budget ends before anything is looked at.
+    assert (found["chosen"], training_choices.load(made.out).near) in ((None, "stated"), ("near planes off", "off"))
+    assert found["iterations"] > 1
+
+
+def test_a_kill_just_before_the_choice_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = ball(tmp_path / "poses", behind)
+    with monkeypatch.context() as kill:
+        kill.setattr(watch, "note", lambda path, value: (_ for _ in ()).throw(KeyboardInterrupt) if path.name == watch.DECIDED else None)
+        with pytest.raises(KeyboardInterrupt):
+            train.run(job(tmp_path / "killed", settings(**QUICK), poses=folder))
+    train.run(job(tmp_path / "killed", settings(**QUICK), poses=folder))
+    train.run(job(tmp_path / "undisturbed", settings(**QUICK), poses=folder))
+    assert digest(tmp_path / "killed") == digest(tmp_path / "undisturbed")
+
+
+def test_what_nothing_rescues_goes_on_as_it_is(tmp_path: Path) -> None:
+    def noise(view: View, folder: Path) -> View:
+        rng = np.random.default_rng(len(view.image) + int(view.camera.name[1:3]))
+        Image.fromarray(np.dstack([rng.integers(0, 256, (16, 16, 3)), np.full((16, 16), 255)]).astype(np.uint8)).save(folder / view.image)
+        return view
+
+    folder = ball(tmp_path / "poses", noise)
+    made = {policy: job(tmp_path / policy, settings(**QUICK, on_failure=policy), poses=folder) for policy in ("retry", "continue", "stop")}
+    train.run(made["retry"])
+    train.run(made["continue"])
+    tables = {policy: report(tmp_path / policy) for policy in ("retry", "continue")}
+    assert [len(table["early_check"]) for table in tables.values()] == [1, 1]
+    assert [table["chosen"] for table in tables.values()] == [None, None]
+    assert len(tables["retry"]["second_chances"]) > 1
+    assert tables["continue"]["second_chances"] == []
+    assert not list(tmp_path.glob("*/out/choices.json"))
+    for _ in range(2):  # what is found is noted: the second attempt ends at once
+        with pytest.raises(StageFailed) as failed:
+            train.run(made["stop"])
+        assert failed.value.exit_code == 3
+
+
+def test_candidates_are_what_would_change_anything(tmp_path: Path) -> None:
+    photographs = scenes.load(poses(tmp_path / "photographs", photographs=True))
+    names = second_chances.candidates(photographs, settings())
+    assert list(names) == [second_chances.AS_STATED, "near planes off", "min_views off", "all of these off", "exposure", "camera refinement"]
+    assert names["all of these off"] == TrainingChoices(near="off", min_views=False)
+    stated = settings(min_views="off", exposure="on", camera_refinement="on")
+    assert list(second_chances.candidates(photographs, stated)) == [second_chances.AS_STATED, "near planes off"]
+    odd = replace(photographs, views=(*photographs.views[:-2], replace(photographs.views[-2], near=4.0), photographs.views[-1]))
+    assert second_chances.candidates(odd, settings())["near planes at most their median"].scene(odd).views[-2].near == photographs.views[-2].near
+    own = TrainingChoices(near="off", masks=False, min_views=False, exposure=True, camera_refinement=True).settings(settings())
+    assert (own.min_views, own.exposure, own.camera_refinement) == ("off", "on", "on")
+
+
+def test_a_trial_begins_with_what_is_stated_whatever_training_made_of_it(tmp_path: Path) -> None:
+    folder = ball(tmp_path / "poses", inverted)
+    views = scenes.views_of(scenes.load(folder), "train")
+    stated, changed = (pixels_of(folder, views) for _ in range(2))
+    changed.leave_out(np.arange(len(views)) == 2)
+    changed.set_cameras([views[0].camera for _ in views])
+    index = np.arange(len(stated))
+    own = second_chances._with_views(changed, views)
+    for mine, other in zip(own.rays(index), stated.rays(index), strict=True):
+        np.testing.assert_array_equal(mine, other)
+    np.testing.assert_array_equal(own.usable_at(index), stated.usable_at(index))
+    assert own.usable_count == stated.usable_count > changed.usable_count
+    unmasked = second_chances._with_views(changed, tuple(replace(view, mask=None) for view in views))
+    assert unmasked.usable_at(index).all()
+    assert not changed.usable_at(index).all()
+
+
+@pytest.mark.parametrize("spoiled", [{"format": 2}, {"choices": {"near": "nowhere"}}, {"choices": {"masks": 3}}])
+def test_choices_that_training_did_not_write_are_refused(tmp_path: Path, spoiled: dict[str, Any]) -> None:
+    path = TrainOutputs(tmp_path).choices
+    training_choices.write(TrainingChoices(near="median"), path)
+    assert training_choices.load(tmp_path) == TrainingChoices(near="median")
+    path.write_text(json.dumps(json.loads(path.read_text()) | spoiled))
+    with pytest.raises(CorruptArtifact):
+        training_choices.load(tmp_path)

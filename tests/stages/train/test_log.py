@@ -1,0 +1,46 @@
+"""How long training still takes, by a made clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from efficientnerf.training.loop import Progress
+from stages.train.log import EVERY, RECENT, TrainLog
+
+
+def shown(tmp_path: Path, first: int, steps: Iterator[float], goal: int) -> dict[int, dict[str, Any]]:
+    """What a display shows after each step of an attempt that goes on from step `first`, whose steps take these seconds."""
+    now = [100.0]
+    found: dict[int, dict[str, Any]] = {}
+    log = TrainLog(tmp_path / "log.jsonl", first, 60.0, lambda: 0.5, lambda: now[0])
+    for step, took in enumerate(steps, first + 1):
+        log.begin_step()
+        now[0] += took
+        done = Progress(step, 0.1, 100, 400, 30, 5, 20)
+        log.end_step(done)
+        found[step] = log.record(done, goal, None, last=step == goal)
+    return found
+
+
+def test_the_time_left_leaves_out_the_slow_first_step(tmp_path: Path) -> None:
+    found = shown(tmp_path, 1000, iter([3.0] + [0.05] * 60), 4000)
+    assert "left" not in found[1001]  # one step, in which kernels are loaded, says nothing: 3 s x 2999 would be 2.5 hours
+    assert found[1010]["left"] == pytest.approx(0.05 * 2990, abs=0.1)
+    assert found[1060]["left"] == pytest.approx(0.05 * 2940, abs=0.1)
+    assert found[1060]["samples_per_s"] == pytest.approx(50 / 0.05, rel=0.01)
+
+
+def test_the_time_left_follows_the_last_steps(tmp_path: Path) -> None:
+    slow, fast = [0.2] * 300, [0.05] * (RECENT * EVERY + EVERY)
+    found = shown(tmp_path, 0, iter(slow + fast), 2000)
+    assert found[300]["left"] == pytest.approx(0.2 * 1700, abs=0.1)
+    last = len(slow) + len(fast)
+    assert found[last]["left"] == pytest.approx(0.05 * (2000 - last), abs=0.1)
+
+
+def test_nothing_is_left_after_the_last_step(tmp_path: Path) -> None:
+    assert shown(tmp_path, 0, iter([0.5] * 30), 30)[30]["left"] == 0

@@ -1,0 +1,85 @@
+"""Training pixels in a file: what an array gives, and what becomes of the file."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.training.pixels import Pixels
+from stages.train.pixel_file import PixelFile
+from tests.efficientnerf import balls
+
+
+def filled(folder: Path, channels: int = 3, count: int = 1000) -> tuple[PixelFile, np.ndarray]:
+    values = np.random.default_rng(0).integers(0, 256, (count, channels), dtype=np.uint8)
+    rows = PixelFile(count, channels, folder)
+    for at in range(0, count, 300):
+        rows[at : at + 300] = values[at : at + 300]
+    return rows, values
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_rows_are_those_of_an_array(tmp_path: Path, channels: int) -> None:
+    rows, values = filled(tmp_path, channels)
+    assert (len(rows), rows.shape, rows.nbytes) == (1000, values.shape, values.nbytes)
+    at = np.random.default_rng(1).integers(1000, size=200)
+    assert np.array_equal(rows[at], values[at])
+    assert np.array_equal(rows[990:2000], values[990:2000])
+    assert rows[at[:0]].shape == (0, channels)
+
+
+@pytest.mark.parametrize("index", [[1000], [-1]])
+def test_rows_that_are_not_there_are_refused(tmp_path: Path, index: list[int]) -> None:
+    with pytest.raises(IndexError, match="of 1000"):
+        filled(tmp_path)[0][np.array(index)]
+
+
+def test_rows_of_another_shape_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="uint8"):
+        PixelFile(10, 3, tmp_path)[0:5] = np.zeros((5, 4), np.uint8)
+
+
+def test_the_file_has_no_name(tmp_path: Path) -> None:
+    rows, _ = filled(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    rows.close()
+
+
+def test_a_full_disk_shows_before_an_image_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="space"):
+        PixelFile(10, 3, tmp_path)
+
+
+def test_where_room_cannot_be_reserved_the_file_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unsupported(*_: object) -> None:
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+    monkeypatch.setattr(os, "posix_fallocate", unsupported)
+    rows, values = filled(tmp_path)
+    assert np.array_equal(rows[0:1000], values)
+
+
+def test_a_file_that_became_shorter_is_an_error(tmp_path: Path) -> None:
+    rows, _ = filled(tmp_path)
+    os.ftruncate(rows._number, 100)
+    with pytest.raises(OSError, match="training pixels"):
+        rows[np.array([900])]
+
+
+def test_training_pixels_are_the_same_in_memory_and_in_a_file(tmp_path: Path) -> None:
+    cameras = balls.cameras(3)
+    images = [balls.photograph(cameras[0]), *(balls.picture(camera) for camera in cameras[1:])]  # without alpha, and with
+    near, far = np.full(3, 1.0), np.full(3, 5.0)
+    here = Pixels(cameras, images, [None] * 3, near, far, 4)
+    there = Pixels(cameras, images, [None] * 3, near, far, 4, PixelFile(len(here), 4, tmp_path))
+    index = here.choose(500, np.random.default_rng(0))
+    for a, b in zip(here.bundle(index), there.bundle(index), strict=True):
+        assert np.array_equal(a, b)

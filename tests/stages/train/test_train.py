@@ -1,0 +1,429 @@
+"""The train stage: the same bytes whatever happened on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.rendering.colour import linear_from_srgb
+from pipeline.errors import CorruptArtifact, Interrupted, UsageError
+from pipeline.stage import Job
+from stages.artifacts import TrainOutputs
+from stages.io import refined_cameras
+from stages.io import scene as scenes
+from stages.io.capture import SparsePoints
+from stages.io.field_file import load_exposure, load_renderer
+from stages.io.png import read_png, write_png
+from stages.io.refined_cameras import load_scene
+from stages.poses.run import PosesSettings
+from stages.train import data
+from stages.train import run as train
+from stages.train.averaged import as_taken
+from stages.train.data import depth_range, pixels_of, sparse_depth_of
+from stages.train.exposure import begin_exposure
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import StopAt, job, poses
+
+QUICK = {"iterations": 13, "checkpoint_every": 4, "sample_batch_size": 1024, "occupancy_warmup_steps": 6, "preview_every": 5}
+
+REFINED = QUICK | {"camera_refinement": "on", "preview_every": "off", "iterations": 230, "sample_batch_size": 4096}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return poses(tmp_path_factory.mktemp("train") / "poses")
+
+
+@pytest.fixture(autouse=True)
+def no_curve(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Drawing the curve takes longer than this little training; one test wants it."""
+    if "curve" not in request.node.name:
+        monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+
+
+def run(made: Job) -> str:
+    """The digest of the field."""
+    train.run(made)
+    return hashlib.sha256((made.out / TrainOutputs.field).read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    return run(job(tmp_path_factory.mktemp("undisturbed"), settings(**QUICK), poses=scene))
+
+
+def checkpoints(made: Job) -> list[str]:
+    return sorted(path.name for path in made.work.glob("checkpoint_*"))
+
+
+def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    events: list[dict[str, Any]] = []
+    made = job(tmp_path, settings(**QUICK), poses=scene, events=events)
+    assert run(made) == undisturbed  # twice the same
+    assert sorted(path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()) == [
+        "curve.png", TrainOutputs.field, "log.jsonl", "previews/preview_000005.png", "previews/preview_000010.png", "report.json",
+    ]  # fmt: skip
+    lines = [json.loads(line) for line in (made.out / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [5, 10, 13]
+    assert [line["preview_psnr"] is None for line in lines] == [False, False, True]
+    assert all(line["step_seconds"] > 0 for line in lines)
+    assert all(0 < line["valid"] <= line["tried"] and 0 < line["occupied"] <= 1 for line in lines)
+    assert checkpoints(made) == ["checkpoint_00000008.safetensors", "checkpoint_00000012.safetensors"]
+    assert events[-1]["event"] == "progress"
+    assert events[-1]["done"] == events[-1]["total"] == 13
+    assert {"loss", "psnr", "preview_psnr", "preview_ssim", "samples_per_s", "occupied", "left"} <= events[-1].keys()
+    assert events[-1]["samples_per_s"] > 0
+    assert events[-1]["left"] == 0
+    assert (made.work / "curve.png").exists()  # drawn at each preview, for those who wait
+    assert np.isfinite(load_renderer(made.out).model.voxels.values.numpy()).all()
+
+
+@pytest.mark.parametrize("calls", [(1,), (7,), (2, 3, 9), (13,)])
+def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, undisturbed: str, calls: tuple[int, ...]) -> None:
+    stop = StopAt(*calls)
+    for _ in calls:
+        with pytest.raises(Interrupted):
+            run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop))
+        assert not (tmp_path / "out" / TrainOutputs.field).exists()
+        assert 1 <= len(checkpoints(job(tmp_path, None))) <= 2
+    events: list[dict[str, Any]] = []
+    assert run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop, events=events)) == undisturbed
+    assert any("training goes on from step" in event.get("text", "") for event in events)
+    lines = [json.loads(line)["step"] for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
+    assert lines == [5, 10, 13]
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "other", "flipped"])
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path: Path, undisturbed: str, damage: str) -> None:
+    from stages.io.field_file import write_tensors
+
+    with pytest.raises(Interrupted):
+        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(9)))
+    newest = sorted((tmp_path / "work").glob("checkpoint_*"))[-1]
+    assert newest.name == "checkpoint_00000009.safetensors"
+    if damage == "other":
+        write_tensors({}, {}, newest)
+    elif damage == "flipped":
+        data = bytearray(newest.read_bytes())
+        data[len(data) // 2] ^= 4
+        newest.write_bytes(bytes(data))
+    else:
+        newest.write_bytes(newest.read_bytes()[: 5000 if damage == "cut" else 0])
+    events: list[dict[str, Any]] = []
+    assert run(job(tmp_path, settings(**QUICK), poses=scene, events=events)) == undisturbed
+    assert any(event["event"] == "warning" and "checkpoint_00000009" in event["text"] for event in events)
+    assert any("goes on from step 8" in event.get("text", "") for event in events)
+
+
+def test_a_kill_leaves_rubbish_that_does_no_harm(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    with pytest.raises(Interrupted):
+        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(6)))
+    work = tmp_path / "work"
+    (work / ".checkpoint_00000007.safetensors.123.part").write_bytes(b"half of it")
+    with open(work / "log.jsonl", "a", encoding="utf-8") as log:
+        log.write('{"step": 6, "psnr": 1.0}\n{"step": 10, "ps')
+    assert run(job(tmp_path, settings(**QUICK), poses=scene)) == undisturbed
+
+
+def test_all_checkpoints_gone_means_from_the_start(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    with pytest.raises(Interrupted):
+        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(6)))
+    for path in (tmp_path / "work").glob("checkpoint_*"):
+        path.write_bytes(b"")
+    assert run(job(tmp_path, settings(**QUICK), poses=scene)) == undisturbed
+
+
+def test_other_settings_give_other_bytes(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    assert run(job(tmp_path, settings(**{**QUICK, "seed": 1}), poses=scene)) != undisturbed
+
+
+def test_photographs_with_masks(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from PIL import Image
+
+    folder = poses(tmp_path / "poses", photographs=True)
+    s = scenes.load(folder)
+    mask = np.full((16, 16), 255, np.uint8)
+    mask[:8] = 0
+    Image.fromarray(mask).save(folder / "images" / "mask.png")
+    scenes.save(replace(s, views=tuple(replace(view, mask="images/mask.png") for view in s.views)), folder)
+    few = settings(**{**QUICK, "iterations": 3})
+    train.run(job(tmp_path / "a", few, poses=folder))
+    assert load_renderer(tmp_path / "a" / "out").model.background is None
+    Image.fromarray(0 * mask).save(folder / "images" / "mask.png")
+    with pytest.raises(ValueError, match="masks leave no pixel"):
+        train.run(job(tmp_path / "b", few, poses=folder))
+
+
+def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) -> None:
+    folder = poses(tmp_path / "poses", points=True)
+    s = scenes.load(folder)
+    cameras = [view.camera for view in s.views]
+    xyz = np.array([[0.0, 0, 0], cameras[0].centre, cameras[1].centre - cameras[1].forward, [0.1, 0, 0]])
+    seen = ((0, 1, 2), (0, 1, 2), (1, 3, 4), (0, 1))
+    points = SparsePoints(xyz, np.zeros((4, 3), np.uint8), np.zeros(4), seen)
+
+    def rays(points: SparsePoints) -> tuple[list[tuple[int, int]], Any]:
+        """(point, camera) of each ray, found again from its ends."""
+        scenes.save_points(points, folder)
+        found_rays = sparse_depth_of(folder, s)
+        if found_rays is None:
+            return [], None
+        np.testing.assert_allclose(np.linalg.norm(found_rays.directions, axis=1), 1, atol=1e-6)
+        ends = found_rays.origins + found_rays.distance[:, None] * found_rays.directions
+        found = [(int(np.nanargmin(np.linalg.norm(points.xyz - end, axis=1))), int(np.argmin(np.linalg.norm(centres - origin, axis=1))))
+                 for origin, end in zip(found_rays.origins, ends, strict=True)]  # fmt: skip
+        return sorted(found), found_rays
+
+    centres = np.array([camera.centre for camera in cameras])
+    before = {(n, view) for n, views in enumerate(seen) for view in views if len(views) > 2 and (xyz[n] - centres[view]) @ cameras[view].forward > 1e-9}
+    assert {(0, 0), (0, 1), (0, 2)} <= before
+    assert not {(1, 0), (2, 1)} & before
+    half = len(before)
+    found, every = rays(points)
+    assert len(found) == 2 * half  # as many from cameras as from between them
+    real = every.origins[:half]
+    apart = np.linalg.norm(real[:, None] - centres, axis=-1)
+    assert sorted(zip([n for n, _ in sorted(before)], apart.argmin(axis=1), strict=True)) == sorted(before)
+    np.testing.assert_allclose(apart.min(axis=1), 0, atol=1e-6)
+    for (point, view), origin in zip(sorted(before), every.origins[half:], strict=True):
+        others = [centres[other] for n, other in before if n == point and other != view]
+        nearest = min(others, key=lambda other: float(np.linalg.norm(other - centres[view])), default=centres[view])
+        way, done = nearest - centres[view], origin - centres[view]
+        np.testing.assert_allclose(np.cross(way, done), 0, atol=1e-5)
+        assert -1e-6 <= way @ done <= way @ way + 1e-6
+    assert np.abs(every.origins[half:] - real).max() > 0.01
+    only = SparsePoints(np.repeat(cameras[0].centre[None], 1, axis=0), points.rgb[:1], points.error[:1], ((0, 0, 0),))
+    assert rays(only) == ([], None)
+
+
+def test_refined_cameras_are_recorded_and_used(tmp_path: Path) -> None:
+    scene = poses(tmp_path / "poses", photographs=True)
+    made = job(tmp_path / "a", settings(**REFINED), poses=scene)
+    train.run(made)
+    before, after = scenes.load(scene), load_scene(scene, made.out)
+    assert len(json.loads((made.out / TrainOutputs.cameras).read_text())["cameras"]) == 7  # of the training views alone
+    capture = after.world_from_capture.inverse()
+    for old, new in zip(before.views, after.views, strict=True):
+        moved = np.abs(new.camera.world_from_camera - old.camera.world_from_camera).max()
+        assert (0 < moved < 0.2) if old.split == "train" else (moved == 0), moved
+        np.testing.assert_allclose(capture.pose(new.camera.world_from_camera), new.source_camera.world_from_camera, atol=1e-9)
+        assert new.source_camera.params[0] / old.source_camera.params[0] == pytest.approx(new.camera.params[0] / old.camera.params[0])
+    report = json.loads((made.out / "report.json").read_text())["cameras"]
+    assert 0 < report["mean_pixels"] <= report["max_pixels"]
+    made = job(tmp_path / "off", settings(**REFINED | {"camera_refinement": "off"}), poses=scene)
+    train.run(made)
+    assert not (made.out / TrainOutputs.cameras).exists()
+    assert [view.camera.params for view in load_scene(scene, made.out).views] == [view.camera.params for view in before.views]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda d: d.update(format=2), "or the format is another one"),
+        (lambda d: d["cameras"].update({"images/none.png": next(iter(d["cameras"].values()))}), "none.png' is no such view"),
+        (lambda d: next(iter(d["cameras"].values())).update(width=9), "is no such view"),
+        (lambda d: next(iter(d["cameras"].values())).update(world_from_camera=np.eye(4)[::-1].tolist()), "not a rigid motion"),
+        (lambda d: next(iter(d["cameras"].values())).update(params=[-1.0, 8.0, 8.0]), "not positive"),
+        (lambda d: next(iter(d["cameras"].values())).update(params=[1.0]), "parameters"),
+        (lambda d: d.pop("cameras"), "missing required field"),
+    ],
+)
+def test_other_cameras_than_training_wrote_are_refused(tmp_path: Path, spoil: Callable[[dict[str, Any]], None], message: str) -> None:
+    scene = poses(tmp_path / "poses", photographs=True)
+    views = scenes.views_of(scenes.load(scene), "train")
+    path = TrainOutputs(tmp_path).cameras
+    refined_cameras.write(views, [view.camera for view in views], path)
+    document = json.loads(path.read_text())
+    load_scene(scene, tmp_path)
+    spoil(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(CorruptArtifact, match=message):
+        load_scene(scene, tmp_path)
+
+
+def test_exposures_are_saved(tmp_path: Path) -> None:
+    scene = poses(tmp_path / "poses", photographs=True)
+    made = job(tmp_path / "a", settings(exposure="on", iterations=12, preview_every="off"), poses=scene)
+    train.run(made)
+    found = load_exposure(made.out)
+    assert found is not None
+    names, learned = found
+    assert names == [view.image for view in scenes.load(scene).views]  # the test view is the last
+    gains = learned.log_gains().numpy()
+    assert gains.mean(axis=0) == pytest.approx(0, abs=1e-6)
+    assert np.abs(gains[:7]).max() > 1e-4
+    assert np.abs(gains[7]).max() < 1e-6  # held back: as exposed on average
+    report = json.loads((made.out / "report.json").read_text())
+    assert report["exposure"]["least_stops"] <= 0 <= report["exposure"]["most_stops"]
+    assert load_renderer(made.out).model.settings.exposure == "on"
+    taken, image = as_taken(made.out), np.full((16, 16, 3), 0.5, np.float32)
+    assert taken is not None
+    seen = [taken(view, image, 1) for view in scenes.load(scene).views]
+    assert np.abs(seen[0] - image).max() > 1e-5  # vignetting
+    np.testing.assert_array_equal(seen[0], seen[7])  # without the exposure of each
+    assert as_taken(tmp_path) is None
+
+
+def test_where_exposure_is_not_learned_the_bytes_are_those_without_it(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    assert run(job(tmp_path, settings(**QUICK, exposure="off"), poses=scene)) == undisturbed
+
+
+@pytest.mark.parametrize("differ", [True, False])
+def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, differ: bool) -> None:
+    """Photographs of the same points, of one brightness or of several; without points nothing is known, and before a constant background nothing is learned."""
+    scene = poses(tmp_path / "poses", photographs=True, points=True, side=32)
+    s = scenes.load(scene)
+    rng = np.random.default_rng(0)
+    for n, view in enumerate(s.views):
+        image = read_png(scene / view.image)
+        write_png(np.full_like(image, 120 if not differ else (70, 120, 180)[n % 3]) + rng.integers(0, 4, image.shape, np.uint8), scene / view.image)
+    xyz = rng.uniform(-0.2, 0.2, (60, 3))
+    scenes.save_points(SparsePoints(xyz, np.zeros((60, 3), np.uint8), np.zeros(60), ((0, 1, 2, 3, 4, 5, 6, 7),) * 60), scene)
+    used = {}
+    for choice in ("auto", "off", "on"):
+        used[choice] = begin_exposure(scene, s, pixels_of(scene, scenes.views_of(s, "train")), choice, "cpu")
+    assert (used["auto"] is not None) == differ
+    assert used["off"] is None
+    assert used["on"] is not None
+    stops = used["on"].log_gains().detach().numpy()[:, 1] / np.log(2)
+    if differ:
+        assert stops[1] - stops[0] == pytest.approx(np.log2(linear_from_srgb(121.5 / 255) / linear_from_srgb(71.5 / 255)), abs=0.1)
+    else:
+        assert np.abs(stops).max() < 0.01
+    pixels = pixels_of(scene, scenes.views_of(s, "train"))
+    assert begin_exposure(scene, replace(s, points=False), pixels, "auto", "cpu") is None
+    assert begin_exposure(scene, replace(s, background=(1.0, 1.0, 1.0)), pixels, "auto", "cpu") is None
+
+
+@pytest.mark.parametrize("planes", [{"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}])
+def test_planes_are_stated_both_and_in_order(planes: dict[str, float], scene: Path, tmp_path: Path) -> None:
+    chosen = settings(**QUICK, **planes)
+    for refused in (lambda: train.STAGE.check({"train": chosen}), lambda: train.run(job(tmp_path, chosen, poses=scene))):
+        with pytest.raises(UsageError, match=r"train\.near_plane=.*, train\.far_plane=.*: expected two numbers, the second one greater, or auto for both"):
+            refused()
+
+
+def test_planes_in_a_contracted_scene_are_refused_by_the_name_of_what_contracts_it(tmp_path: Path) -> None:
+    chosen = settings(**QUICK, near_plane=2.0, far_plane=6.0)
+    with pytest.raises(UsageError, match=r"poses\.space=contracted"):
+        train.run(job(tmp_path / "a", chosen, poses=poses(tmp_path / "poses", space="contracted")))
+    with pytest.raises(UsageError, match=r"poses\.space=contracted"):
+        train.STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
+    train.STAGE.check({"train": chosen, "poses": PosesSettings()})
+
+
+def test_planes_that_miss_the_scene_are_refused_and_those_that_cut_into_it_are_told(scene: Path) -> None:
+    """The views have 1 to 5 of the training frame before them, which is 2 to 10 in the capture's units."""
+    s = scenes.load(scene)
+    pixels = pixels_of(scene, scenes.views_of(s, "train"))
+
+    def told(near: float, far: float) -> list[str]:
+        found: list[str] = []
+        assert depth_range(s, pixels, settings(near_plane=near, far_plane=far), found.append) == (near / 2, far / 2)
+        assert (pixels.near == near / 2).all()
+        assert (pixels.far == far / 2).all()
+        return found
+
+    for near, far in ((10.0, 12.0), (0.1, 2.0)):
+        with pytest.raises(UsageError, match=rf"near_plane .* are {near:g} to {far:g} in .*, and the scene lies 2 to 10 before .* miss all of it"):
+            told(near, far)
+    assert told(2.0, 10.0) == told(0.0, 100.0) == told(2.5, 9.0) == []
+    for near, far in ((5.0, 10.0), (1.0, 6.0)):
+        assert [f"are {near:g} to {far:g} " in text and "miss a part of it" in text for text in told(near, far)] == [True]
+
+
+def test_two_training_views_are_enough_for_sparse_depth_and_none_is_told(tmp_path: Path) -> None:
+    folder = poses(tmp_path / "poses", count=3, points=True)
+    events: list[dict[str, Any]] = []
+    for tracks, some in ((((0, 1),), True), (((0,),), False)):
+        scenes.save_points(SparsePoints(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), tracks), folder)
+        assert (train.sparse_depth(job(tmp_path, None, events=events), folder, scenes.load(folder), settings()) is not None) == some
+    assert ["no sparse point lies before" in event["text"] for event in events] == [True]
+
+
+def test_of_many_observations_some_are_drawn_with_all_views_of_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = poses(tmp_path / "poses", points=True)
+    s, rng = scenes.load(folder), np.random.default_rng(0)
+    seen = tuple(tuple(sorted(rng.choice(7, rng.integers(3, 7), replace=False).tolist())) for _ in range(60))
+    scenes.save_points(SparsePoints(rng.uniform(-0.3, 0.3, (60, 3)), np.zeros((60, 3), np.uint8), np.zeros(60), seen), folder)
+    every = sparse_depth_of(folder, s)
+    assert len(every) == 2 * sum(map(len, seen))
+    monkeypatch.setattr(data, "POINTS_AT_ONCE", 40)  # the same of one point, or of a few at a time
+    again = sparse_depth_of(folder, s)
+    assert all(np.array_equal(getattr(again, name), getattr(every, name)) for name in ("origins", "directions", "distance"))
+    monkeypatch.setattr(data, "MOST_OBSERVATIONS", 100)
+    drawn = [sparse_depth_of(folder, s, seed) for seed in (0, 0, 1)]
+    assert all(2 * 90 < len(rays) <= 2 * 100 for rays in drawn)
+    assert np.array_equal(drawn[0].origins, drawn[1].origins)
+    assert not np.array_equal(drawn[0].distance[:50], drawn[2].distance[:50])
+    half = len(drawn[0]) // 2
+    known = {ray.tobytes() for ray in np.column_stack([every.origins, every.directions])[: len(every) // 2]}
+    assert {ray.tobytes() for ray in np.column_stack([drawn[0].origins, drawn[0].directions])[:half]} <= known
+
+
+@pytest.fixture
+def early_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the training views, after few steps."""
+    from efficientnerf.training.view_checks import checks
+
+    monkeypatch.setattr(checks, "LOWEST", (40, 50, 60, 70))
+
+
+SWAPPED = QUICK | {"iterations": 140, "checkpoint_every": 1000, "preview_every": "off", "sample_batch_size": 4096, "occupancy_warmup_steps": 20}
+
+
+def swapped(folder: Path) -> tuple[Path, list[str]]:
+    """A scene in which one photograph is of something else; the image of it."""
+    from stages.io.png import write_png
+
+    scene = poses(folder, count=20)
+    rng = np.random.default_rng(0)
+    picture = 255 * rng.integers(0, 2, (4, 4, 4), np.uint8).repeat(4, axis=0).repeat(4, axis=1)
+    picture[..., 3] = 255
+    write_png(picture, scene / "images" / "v05.png")
+    return scene, ["images/v05.png"]
+
+
+def test_a_view_that_shows_something_else_is_left_out_here_and_after(tmp_path: Path, early_checks: None) -> None:
+    scene, wrong = swapped(tmp_path / "poses")
+    made = job(tmp_path / "a", settings(**SWAPPED), poses=scene)
+    digest = run(made)
+    assert json.loads((made.out / TrainOutputs.cameras).read_text())["left_out"] == wrong
+    found = json.loads((made.out / "report.json").read_text())["wrong_views"]
+    assert [(each["image"], each["outcome"]) for each in found] == [("v05.png", "left out")]
+    assert len(found[0]["witnesses"]) >= 2
+    assert (made.out / TrainOutputs.wrong_views).is_file()
+    later = load_scene(scene, made.out)
+    assert [view.image for view in scenes.views_of(later, "train")] == [f"images/v{n:02}.png" for n in range(19) if n != 5]
+    for calls in ((45,), (55, 65)):
+        again, stop = tmp_path / f"stopped{calls[0]}", StopAt(*calls)
+        for _ in calls:
+            with pytest.raises(Interrupted):
+                run(job(again, settings(**SWAPPED), poses=scene, stop=stop))
+        assert run(job(again, settings(**SWAPPED), poses=scene, stop=stop)) == digest
+        assert (again / "out" / TrainOutputs.cameras).read_bytes() == (made.out / TrainOutputs.cameras).read_bytes()
+        assert (again / "out" / TrainOutputs.wrong_views).read_bytes() == (made.out / TrainOutputs.wrong_views).read_bytes()
+    off = job(tmp_path / "off", settings(**SWAPPED, wrong_views="off"), poses=scene)
+    assert run(off) != digest
+    assert not (off.out / TrainOutputs.cameras).exists()
+
+
+def test_without_wrong_views_the_checks_change_nothing(tmp_path: Path, early_checks: None) -> None:
+    scene = poses(tmp_path / "poses", count=20)
+    on, off = (job(tmp_path / choice, settings(**SWAPPED, wrong_views=choice), poses=scene) for choice in ("auto", "off"))
+    run(on)
+    run(off)
+    models = [load_renderer(each.out).model for each in (on, off)]
+    assert all(np.array_equal(a, b) for a, b in zip(*[[p.detach().numpy() for p in m.fine.parameters()] for m in models], strict=True))
+    assert not (on.out / TrainOutputs.cameras).exists()
+    assert not (on.out / TrainOutputs.wrong_views).exists()
+    assert json.loads((on.out / "report.json").read_text())["wrong_views"] == []
