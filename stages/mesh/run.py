@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Fraction, given, setting
+from efficientnerf.settings import Auto, Density, Fraction, given, setting
 from pipeline.errors import StageFailed
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
@@ -43,10 +43,10 @@ class MeshSettings:
         "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
         advanced=True,
     )
-    max_faces: Annotated[int, Meta(ge=100)] | Literal["20k", "100k", "500k"] = setting(
+    max_faces: Annotated[int, Meta(ge=100, le=10**8)] | Literal["20k", "100k", "500k"] = setting(
         200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
     )
-    density_threshold: Annotated[float, Meta(gt=0.0)] | Auto = setting(
+    density_threshold: Density | Auto = setting(
         "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
     )
     min_component: Fraction = setting(

@@ -8,7 +8,7 @@ Images are not undistorted: later stages trace the distorted rays.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from efficientnerf.geometry.cameras import resized
 from efficientnerf.settings import Auto, PositiveInt, given, setting
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 else:
     Format = Literal[importers.FORMATS]  # the names of the table of importers
 
+Coordinate = Annotated[float, Meta(ge=-1e9, le=1e9)]
+LEAST_SIDE = 1e-9  # of a crop box, in the capture's units
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
 
 
@@ -48,7 +50,7 @@ class PosesSettings:
         1024, "Longest side of the images that later stages read; larger ones are reduced.", unit="pixels"
     )
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "Axis of the capture's frame that points up; auto: estimated.")
-    crop_box: tuple[float, float, float, float, float, float] | Auto = setting(
+    crop_box: tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] | Auto = setting(
         "auto", "Crop box in the capture's frame: x y z of one corner, then of the opposite one; auto: estimated."
     )
     box_margin: Annotated[float, Meta(ge=0.0, le=2.0)] = setting(
@@ -93,7 +95,9 @@ class PosesSettings:
         "What is kept of given masks: what is not black in them (white), or what is (black); auto: white, unless black shows one compact object in nearly all.",
         advanced=True,
     )
-    test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
+    test_every: Annotated[int, Meta(ge=2, le=10**6)] = setting(
+        8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True
+    )
     llff_factor: PositiveInt | Auto = setting(
         "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
     )
@@ -203,7 +207,14 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
     return [*importers.files(source, settings), *networks]
 
 
-STAGE = Stage(name="poses", version=13, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where a crop box is stated that has no volume."""
+    box = given(settings["poses"].crop_box)
+    if box is not None and min(abs(low - high) for low, high in zip(box[:3], box[3:], strict=True)) < LEAST_SIDE:
+        raise UsageError(f"poses.crop_box={list(box)}: has no volume; expected x y z of one corner, and of the opposite one.")
+
+
+STAGE = Stage(name="poses", version=13, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files, check=check)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
