@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.stage import Stage
-from stages.memory.disk import space_needed
-from stages.memory.plan import memory_needed
+from stages.memory.forecast import memory_needed, space_needed
 
 
 @dataclass(frozen=True)

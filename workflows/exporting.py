@@ -203,8 +203,7 @@ def export_volumes(export: Export, settings: Settings) -> list[Written]:
     """The asset's voxels as volumes; what of it, the settings of the stage mesh say where --region does not."""
     from stages.formats.exporters.writing import source_frame
     from stages.framing.restriction import restricted
-    from stages.memory.need import Need, libraries, refuse_more_than
-    from stages.memory.rendering import tree_bytes
+    from stages.memory.need import Need, libraries, refuse_more_than, tree_bytes
     from workflows.cli.target import load_asset
     from workflows.destination import writing
 

@@ -39,7 +39,8 @@ def _made(export: Export, wanted: SplatsSettings, progress: Progress) -> tuple[G
     from stages.formats.exporters.writing import source_frame
     from stages.framing.restriction import restricted
     from stages.memory.need import refuse_more_than
-    from stages.splats.run import gaussians_of, needed
+    from stages.splats.memory import needed
+    from stages.splats.run import gaussians_of
     from workflows.cli.target import load_asset
 
     tree = restricted(load_asset(export.what), wanted.region, export.crop)

@@ -25,7 +25,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -39,24 +39,19 @@ from stages.evaluate.asset import EvaluatedAsset, evaluated
 from stages.evaluate.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view
 from stages.evaluate.judging import judge, training_figures
 from stages.evaluate.lpips_weights import find_weights, load_lpips
-from stages.evaluate.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
+from stages.evaluate.mesh import FIGURES, EvaluatedMesh, load_mesh
 from stages.evaluate.refinement import refinement_of
 from stages.evaluate.sparse_points import COUNTS, observed_points
 from stages.evaluate.splats import FIGURES as SPLATS_FIGURES
 from stages.evaluate.splats import EvaluatedSplats, load_splats
-from stages.evaluate.strips import STRIP_RAYS, strip_views, write_strips
+from stages.evaluate.strips import strip_views, write_strips
 from stages.evaluate.summary import in_words, quality, summary
 from stages.evaluate.trivial import BLURS
 from stages.evaluate.video import write_captured_path
-from stages.evaluate.views import constant_background, evaluation_views, evenly_spaced, stride_for
+from stages.evaluate.views import MAX_FIELD_IMAGE_SIZE, constant_background, evaluation_views, evenly_spaced, stride_for
 from stages.io.scene import View
 from stages.scratch import note, noted, once
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from stages.memory.need import Need
-
-MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
 MAX_FIELD_RAYS = 400_000  # of all of them together, then
 SHEET_ROWS = 8
 THUMBNAIL = 320  # pixels, longest side
@@ -107,6 +102,7 @@ Measured = str | float | dict[str, int | float | list[float] | None] | None  # t
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset import format
+    from stages.evaluate.memory import needed
     from stages.memory.need import refuse_what_does_not_fit
 
     inputs = inputs_of(EvaluateInputs, job.inputs)
@@ -120,20 +116,6 @@ def run(job: Job) -> None:
     refuse_what_does_not_fit(job, needed(tree, job.settings, inputs, job.device), "Lower poses.max_image_size or bake.max_mib.")
     region = read_json(inputs.mesh.report).get("region", "foreground")
     evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree), refinement_of(inputs.bake))
-
-
-def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
-    """What comparing its views with photographs takes of memory."""
-    from stages.io.scene import load
-    from stages.memory.rendering import views_needed
-
-    cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
-    scale = given(settings.field_image_scale)
-    most = max(camera.width * camera.height for camera in cameras)
-    rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
-    if settings.strips == "on":
-        rays = max(rays, min(most, STRIP_RAYS))
-    return views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, device, mesh=mesh_bytes(inputs.mesh))
 
 
 def evaluate(

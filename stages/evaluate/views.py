@@ -12,6 +12,8 @@ import numpy as np
 from efficientnerf.geometry.cameras import MODELS, Camera
 from stages.io.scene import Scene, View
 
+MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
+
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:

@@ -6,12 +6,16 @@ setting that would make it smaller. So an artifact has the same bytes whatever m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit, available_now, size_text
 from pipeline.stage import Job
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
 
 MIB = 2**20
 TERMS_SHOWN = 3
@@ -20,11 +24,22 @@ IMAGING = 130 * MIB  # numpy, OpenCV and Pillow
 RENDERING = 600 * MIB  # torch and numba beside these
 SURFACES = 200 * MIB  # SciPy, scikit-image and what decimates, beside these
 CUDA = 2048 * MIB  # what torch adds on the host for a CUDA device
+TREE = 3  # times the tree's arrays: these, and what renderers make of them
 
 
 def libraries(device: str = "cpu") -> int:
     """Bytes of a process that renders or trains, before it has read anything."""
     return RENDERING + (0 if device == "cpu" else CUDA)
+
+
+def tree_bytes(tree: NerfTree) -> int:
+    """Bytes of a tree and of what renderers make of it."""
+    from efficientnerf.asset.palettes import PaletteHarmonics
+
+    harmonics = tree.harmonics
+    colours = 16 * len(tree.density_values)  # as seen from a camera
+    stored = harmonics.base.nbytes + harmonics.codes.nbytes if isinstance(harmonics, PaletteHarmonics) else harmonics.nbytes
+    return TREE * (tree.brick_index.nbytes + tree.voxel_index.nbytes + tree.density_values.nbytes + stored) + colours
 
 
 @dataclass(frozen=True)
@@ -48,7 +63,12 @@ def has_room(job: Job, need: Need) -> bool:
     if job.memory is None:
         return True
     now = available_now()
-    return need.total <= (job.memory.bytes if now is None else min(job.memory.bytes, now))
+    return need.total <= min(job.memory.bytes, job.memory.bytes if now is None else now)
+
+
+def most_threads(job: Job, threads: int, need: Callable[[int], Need]) -> int:
+    """As many of the threads as `has_room` for what they take; one where there is room for none."""
+    return next((fewer for fewer in range(threads, 1, -1) if has_room(job, need(fewer))), 1)
 
 
 def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:

@@ -16,16 +16,14 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.mesh.check import asset_views, checked, level_of, shown_by, warning_of
-from stages.mesh.texture import facts_of, largest_photograph, refuse_normal_map_without_texture, textured, with_relief
+from stages.mesh.texture import facts_of, refuse_normal_map_without_texture, textured, with_relief
 from stages.mesh.timing import Stopwatch
 
 if TYPE_CHECKING:
     from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import NerfTree
     from efficientnerf.surface.agreement import AssetView
     from efficientnerf.surface.mesh import Mesh
     from stages.formats.exporters.writing import SourceFrame
-    from stages.memory.need import Need
 
 
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
@@ -209,14 +207,6 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
     job.say("no faces", faces=0, components=0, watertight=False)
 
 
-def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
-    """What meshing and texturing it take of memory."""
-    from stages.mesh.memory import surface_needed
-
-    texture = 0 if settings.texture == "off" else settings.texture_size
-    return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
-
-
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
@@ -225,6 +215,7 @@ def run(job: Job) -> None:
     from stages.framing.restriction import restricted
     from stages.io.png import write_png
     from stages.memory.need import refuse_what_does_not_fit
+    from stages.mesh.memory import needed
 
     outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
     refuse_normal_map_without_texture(settings)

@@ -131,7 +131,8 @@ def run(job: Job) -> None:
     from stages.figures.contact_sheet import write_contact_sheet
     from stages.framing import training_frame
     from stages.io.silhouettes import SmallPictures
-    from stages.poses.memory import refuse_large_photographs
+    from stages.memory.need import refuse_what_does_not_fit
+    from stages.poses.memory import decoding_needed
     from stages.verdict.writing import judge
 
     settings: PosesSettings = job.settings
@@ -145,7 +146,8 @@ def run(job: Job) -> None:
 
     capture = read(job, settings, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
-    refuse_large_photographs(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos])
+    sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
+    refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
     small = SmallPictures()
     capture, mask_facts = with_mask_use(job, capture, small, warn)
     capture, written = _write_images(job, capture, warn)

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.splats.build import Budget
     from efficientnerf.splats.gaussians import Gaussians
-    from stages.memory.need import Need
 
 MOST = 5_000_000  # Gaussians: beyond that no program opens them
 PASSES, FEWEST_STEPS, MOST_STEPS = 4, 300, 900  # docs/experiments/splats.md
@@ -90,24 +89,12 @@ def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
     """What Gaussians are made and fitted with, for pictures of so many pixels each."""
     from efficientnerf.splats.build import Budget
     from efficientnerf.splats.refit import PIXELS
+    from stages.splats.memory import most_gaussians
 
     steps = given(settings.iterations)
     if steps is None:
         steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, MOST_STEPS))
-    return Budget(min(settings.count, max(1, int(np.median(pixels)))) if pixels else settings.count, settings.sh_degree, steps, settings.seed)
-
-
-def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None) -> Need:
-    """What `gaussians_of` takes of memory."""
-    from stages.io.refined_cameras import load_scene
-    from stages.io.scene import views_of
-    from stages.splats.memory import splats_needed
-    from stages.splats.pictures import render_cameras
-
-    own = captured is None or settings.pictures == "asset" or settings.region == "foreground"
-    cameras = render_cameras(tree) if own or captured is None else [view.camera for view in views_of(load_scene(*captured), "train")]
-    pixels = [camera.width * camera.height for camera in cameras]
-    return splats_needed(tree, budget_of(settings, pixels).count, settings.sh_degree, sum(pixels), max(pixels, default=0))
+    return Budget(most_gaussians(settings, pixels), settings.sh_degree, steps, settings.seed)
 
 
 def preview(tree: NerfTree, gaussians: Gaussians) -> np.ndarray:
@@ -148,6 +135,7 @@ def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     from stages.framing.restriction import restricted
     from stages.io.png import write_png
     from stages.memory.need import refuse_what_does_not_fit
+    from stages.splats.memory import needed
 
     started = time.monotonic()
     tree = restricted(load(inputs_of(SplatsInputs, job.inputs).bake.asset), settings.region)

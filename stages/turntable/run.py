@@ -70,7 +70,7 @@ def run(job: Job) -> None:
     from efficientnerf.asset import format
     from stages.framing.restriction import restricted
     from stages.memory.need import refuse_what_does_not_fit
-    from stages.memory.rendering import frames_needed
+    from stages.turntable.memory import frames_needed
 
     s: TurntableSettings = job.settings
     whole = format.load(inputs_of(TurntableInputs, job.inputs).bake.asset)

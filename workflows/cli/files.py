@@ -157,7 +157,7 @@ def render(
     from stages.formats.exporters.frames import frame_background
     from stages.framing.camera_paths import PATHS
     from stages.memory.need import refuse_more_than
-    from stages.memory.rendering import frames_needed
+    from stages.turntable.memory import frames_needed
     from stages.turntable.run import TurntableSettings
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
