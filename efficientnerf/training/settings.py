@@ -74,7 +74,9 @@ class TrainSettings:
         "auto", "Where rays end along the view axis, in the capture's units (the paper: 6); N_c samples lie between near and far then; auto: the scene's.",
         advanced=True,
     )  # fmt: skip
-    pivotal_threshold: Fraction = setting(1e-4, "Weight epsilon above which a coarse sample is pivotal.", advanced=True)
+    pivotal_threshold: Annotated[float, Meta(ge=0.0, le=0.1)] = setting(
+        1e-4, "Weight epsilon above which a coarse sample is pivotal.", advanced=True
+    )
     max_pivots: Annotated[int, Meta(ge=1, le=4096)] = setting(
         8, "Most pivotal samples on a ray; those of least weight are dropped (the paper drops none).", advanced=True
     )

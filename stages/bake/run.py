@@ -72,13 +72,13 @@ class BakeSettings:
     visibility_rays: Annotated[int, Meta(ge=1000, le=10**9)] = setting(
         1_000_000, "Training pixels that the field is rendered for, to find the visible voxels.", advanced=True
     )
-    weight_threshold: Fraction = setting(
+    weight_threshold: Annotated[float, Meta(ge=0.0, le=0.5)] = setting(
         1e-3,
         "A voxel is kept where its weight in some pixel exceeds this; in forward-facing scenes those that 4 or more training images (half of fewer than 7) have"
         " in view are baked where it exceeds 30 times this.",
         advanced=True,
     )
-    max_mib: Annotated[float, Meta(ge=0.001, le=65536.0)] | Auto = setting(  # the header alone has a thousand bytes
+    max_mib: Annotated[float, Meta(ge=0.03, le=65536.0)] | Auto = setting(  # header and palette of 9 harmonics: 28 kB
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
         " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed, whose codes"

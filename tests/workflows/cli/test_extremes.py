@@ -62,7 +62,15 @@ def test_a_crop_box_without_volume_or_beyond_all_bounds_is_refused_before_the_fi
 
 @pytest.mark.parametrize(
     ("stage", "name", "value"),
-    [("train", "time_budget", 1.7e308), ("train", "time_budget", 1e-300), ("train", "max_rays_per_batch", 2**62), ("points", "num_points", 2**62)],
+    [
+        ("train", "time_budget", 1.7e308),
+        ("train", "time_budget", 1e-300),
+        ("train", "max_rays_per_batch", 2**62),
+        ("points", "num_points", 2**62),
+        ("train", "pivotal_threshold", 1.0),
+        ("bake", "weight_threshold", 1.0),
+        ("bake", "max_mib", 0.001),
+    ],
 )
 def test_what_made_a_later_stage_fail_is_refused_before_the_first(stage: str, name: str, value: float) -> None:
     assert refused(stage, name, value)
