@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from efficientnerf.asset.file.serialisation import bytes_per_voxel, most_voxels
 from efficientnerf.settings import given
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
@@ -109,6 +108,7 @@ def most_needed(
     splits   how often voxels will be split
     returns  voxels along the finest grid in question; how many are baked at most; and `needed` as a function of (voxels, stored=)
     """
+    from efficientnerf.asset.file.serialisation import most_voxels
     from stages.bake.pruning import most_children
     from stages.bake.voxels import MAX_OVERSHOOT
 
@@ -165,6 +165,8 @@ def memory_needed(known: Known) -> Need:
 
 def space_needed(known: Known) -> int:
     """The field's samples, the values of the voxels as they are baked, a checkpoint of their refinement, two while it is replaced, and the asset."""
+    from efficientnerf.asset.file.serialisation import bytes_per_voxel
+
     own, (degree, whole, mib, rays, voxels, _) = known.settings["bake"], _before(known)
     values, voxels = 4 * (1 + 3 * (degree + 1) ** 2), min(voxels, SHOWN * rays)
     checkpoints = 1 if own.refine_steps != "auto" and own.refine_steps * own.refine_rays_per_batch < SHORT else 2
