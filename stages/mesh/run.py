@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Meta
 
 from efficientnerf.settings import Auto, Density, Fraction, given, setting
-from pipeline.errors import StageFailed
+from pipeline.errors import UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
@@ -73,7 +73,7 @@ def mesh_of(
     tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
     dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Mesh:  # fmt: skip
-    """The tree's surface in the training frame; `progress` takes (done, total, text). Raises StageFailed where there is none at a density that was asked for;
+    """The tree's surface in the training frame; `progress` takes (done, total, text). Raises UsageError where there is none at a density that was stated;
     else it has no faces then, and "no_surface" among its facts says why.
 
     views   is given those of the asset that say which components it shows
@@ -108,7 +108,7 @@ def mesh_of(
         )
     except NoSurface as error:
         if threshold is not None:
-            raise StageFailed(f"mesh: {error}. {remedy('mesh', threshold)}") from error
+            raise UsageError(f"mesh: {error}. {remedy('mesh', threshold)}") from error
         mesh = nothing(str(error))
     return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"})
 

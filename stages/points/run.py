@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from msgspec import Meta
 
 from efficientnerf.settings import Auto, Density, Fraction, Seed, given, setting
-from pipeline.errors import StageFailed
+from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
@@ -45,7 +45,7 @@ class PointsSettings:
 def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None], region: Region | None = None) -> PointCloud:
     """Points on the tree's surface, clipped to a region, in the capture's frame.
 
-    Raises StageFailed where there is none; `progress` takes (done, total, text).
+    Raises StageFailed where there is none, UsageError where there is none at a density that was stated; `progress` takes (done, total, text).
     """
     from efficientnerf.surface.isosurface import NoSurface
     from efficientnerf.surface.mesh import PointCloud
@@ -72,7 +72,8 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
+        failure = StageFailed if settings.density_threshold == "auto" else UsageError
+        raise failure(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
     back = frame.world_from_capture.inverse()
     return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import StageFailed
+from pipeline.errors import UsageError
 from pipeline.stage import Job
 from stages.points import run as points
 from stages.points.run import PointsSettings
@@ -42,7 +42,7 @@ def test_the_same_seed_gives_the_same_points(bake: Path, tmp_path: Path) -> None
 
 
 def test_a_threshold_out_of_reach_names_the_remedy(bake: Path, tmp_path: Path) -> None:
-    with pytest.raises(StageFailed, match=r"Lower points.density_threshold"):
+    with pytest.raises(UsageError, match=r"Lower points.density_threshold"):
         points.run(Job(settings=PointsSettings(density_threshold=1e4), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
 
 
