@@ -11,8 +11,7 @@ from pipeline.errors import UsageError
 from pipeline.stage import Job
 from stages.points import run as points
 from stages.points.run import PointsSettings
-
-from .test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
+from tests.stages.mesh.test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 
 
 @pytest.fixture(scope="module")
