@@ -1,14 +1,12 @@
-"""Write docs/settings.md, docs/commands.md and docs/hostile.md from the code; with --check, say whether they are up to date."""
+"""Write docs/settings.md and docs/commands.md from the code; with --check, report whether they are up to date."""
 
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 
 import click
 
-from stages.artifacts import BakeOutputs
 from stages.renamed_settings import REMOVED, RENAMED
 from stages.settings import SettingInfo, describe_settings
 from workflows.asset import STAGES
@@ -16,7 +14,6 @@ from workflows.cli.main import enerf
 from workflows.cli.resolve import meaning, preset_names, read_preset, shown
 
 FOLDER = Path(__file__).parent
-sys.path.insert(0, str(FOLDER.parent))  # the tests are not installed
 NOTE = "<!-- Made from the code by `make docs`; changes belong there. -->"
 
 
@@ -110,58 +107,7 @@ def commands_page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def hostile_page() -> str:
-    from efficientnerf.asset.format import FormatError, load
-    from tests.efficientnerf.hostile import HOSTILE
-
-    lines = [
-        NOTE,
-        "# Hostile asset files",
-        "",
-        "One file for each rule of [FORMAT.md](../efficientnerf/asset/FORMAT.md), made by `tests/efficientnerf/hostile.py`, and its message. `enerf` ends with",
-        "exit code 4. Files truncated at any byte or with any bit of a tensor changed are refused too. Files mutated at random are read or refused:",
-        "[100,000 of them](../benchmarks/results/fuzz_format.json).",
-        "",
-        "| file | message |",
-        "|---|---|",
-    ]
-    with tempfile.TemporaryDirectory() as folder:
-        path = BakeOutputs(Path(folder)).asset
-        for name, (make, _) in HOSTILE.items():
-            path.write_bytes(make())
-            try:
-                load(path)
-            except FormatError as error:
-                lines.append(f"| {cell(name)} | {cell(str(error))} |")
-            else:
-                raise SystemExit(f"hostile file '{name}' was read")
-    return "\n".join(lines + hostile_inputs()) + "\n"
-
-
-def hostile_inputs() -> list[str]:
-    """The inputs of the other readers."""
-    from benchmarks.fuzz.table import READERS
-    from tests.stages.hostile import FILES, MADE, READ
-
-    lines = [
-        "",
-        "# Hostile inputs of the other readers",
-        "",
-        "Found by `make fuzz`, which changes valid files of each kind at random, and made smaller (`tests/data/hostile`), or by `tests/stages/hostile.py`.",
-        "A data set, a configuration or a camera path that is refused ends `enerf` with exit code 2, a damaged run with 4. What only saves time or is shown to",
-        "people is passed over; a photograph that cannot be read is left out, with a warning.",
-        "",
-        "| what is read | input | words of the message |",
-        "|---|---|---|",
-    ]
-    answers = [(reader, name, says) for reader, names in FILES.items() for name, says in names.items()] + [(*key, says) for key, (_, says) in MADE.items()]
-    for reader, name, says in sorted(answers):
-        words = "(passed over)" if says == READ else says.replace("|", " or ").replace(".*", " ... ").replace("\\\\", "\\")
-        lines.append(f"| {cell(READERS[reader].what)} | {cell(name)} | {cell(words)} |")
-    return lines
-
-
-PAGES = {"settings.md": settings_page, "commands.md": commands_page, "hostile.md": hostile_page}
+PAGES = {"settings.md": settings_page, "commands.md": commands_page}
 
 
 def main() -> int:

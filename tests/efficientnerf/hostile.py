@@ -1,4 +1,4 @@
-"""A hostile file for each rule of FORMAT.md, and what is said of it; `make docs` makes docs/hostile.md of the table."""
+"""A hostile file for each rule of FORMAT.md, and its message."""
 
 from __future__ import annotations
 

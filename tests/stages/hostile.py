@@ -1,4 +1,4 @@
-"""Hostile inputs of every reader but the asset's (tests/efficientnerf/hostile.py), and what is said of each; `make docs` lists them in docs/hostile.md.
+"""Hostile inputs of every reader but the asset's (tests/efficientnerf/hostile.py), and the message of each.
 
 tests/data/hostile/READER/FILE was found by `make fuzz` and made smaller; large ones are made here.
 """
