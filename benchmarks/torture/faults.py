@@ -13,8 +13,8 @@ older artifact; those before and after it are there. Then
     the next run, without faults, ends with the artifacts of an undisturbed run and an empty .work
 
 A place is a kind of operation on a path, without numbers and random parts: all previews are one place, and so are all photographs of a source. Each place
-meets an error once, at its first operation, and one that lasts, at its last. What the engine does, and what the stage poses of the other sources does,
-is met where it occurs first; their later stages do the same as those of the Blender set. The errors change from place to place, and all five meet every kind of
+meets one error: in turns at its first operation, once, and at its last, lasting. What the engine does, and what the stage poses of the other sources does, is
+met where it occurs first; their later stages do the same as those of the Blender set. The errors change from place to place, and all five meet every kind of
 operation in every stage.
 """
 
@@ -142,13 +142,13 @@ def place_of(operation: Operation, run: Path, source: Path) -> str:
 
 
 def _of_kind(source: str, stage: str, kind: str, places: Sequence[Sequence[Operation]]) -> list[Case]:
-    """Each place once and lasting; errors in turn, and all of them where there are fewer places than errors."""
+    """A case for each place; errors in turn, and all of them where there are fewer places than errors."""
     errors = OF_READING if kind == "read" else ERRORS
     cases = []
     for index in range(max(len(places), len(errors)) if places else 0):
-        place = places[index % len(places)]
-        for operation, lasting, shift in ((place[0], False, 0), (place[-1], True, 2)):
-            cases.append(Case(source, stage, operation.stage, kind, operation.number, errors[(index + shift) % len(errors)], lasting))
+        lasting, place = bool(index % 2), places[index % len(places)]
+        operation = place[-1] if lasting else place[0]
+        cases.append(Case(source, stage, operation.stage, kind, operation.number, errors[index % len(errors)], lasting))
     return cases
 
 
