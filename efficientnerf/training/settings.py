@@ -74,7 +74,7 @@ class TrainSettings:
         "auto", "Where rays end along the view axis, in the capture's units (the paper: 6); N_c samples lie between near and far then; auto: the scene's.",
         advanced=True,
     )  # fmt: skip
-    pivotal_threshold: Annotated[float, Meta(ge=0.0, le=0.1)] = setting(
+    pivotal_threshold: Annotated[float, Meta(ge=0.0, le=0.01)] = setting(
         1e-4, "Weight epsilon above which a coarse sample is pivotal.", advanced=True
     )
     max_pivots: Annotated[int, Meta(ge=1, le=4096)] = setting(
@@ -135,7 +135,7 @@ class TrainSettings:
         0.0, "Fraction of the rays of a step on which pruned samples are evaluated too (the authors' release: 0.01).", advanced=True
     )
     occupancy_warmup_steps: Count = setting(256, "First steps, in which no density voxel is pruned.", advanced=True)
-    learning_rate: NonNegative = setting(2e-2, "Learning rate of Adam after the first steps (the paper: 5e-4).", advanced=True)
+    learning_rate: Fraction = setting(2e-2, "Learning rate of Adam after the first steps (the paper: 5e-4).", advanced=True)
     lr_final_ratio: Fraction = setting(0.05, "Ratio to which the learning rate falls exponentially over lr_decay_steps.", advanced=True)
     lr_decay_steps: PositiveInt | Auto = setting(
         "auto", "Steps in which the learning rate falls to lr_final_ratio of itself (the paper: 500,000); auto: all steps.", advanced=True
