@@ -216,7 +216,7 @@ def check(settings: Mapping[str, Any]) -> None:
         raise UsageError(f"poses.crop_box={list(box)}: has no volume; expected x y z of one corner, and of the opposite one.")
 
 
-STAGE = Stage(name="poses", version=13, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files, check=check)
+STAGE = Stage(name="poses", version=14, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files, check=check)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:

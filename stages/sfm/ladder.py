@@ -24,9 +24,10 @@ from typing import Any
 
 from efficientnerf.geometry.cameras import Similarity
 from pipeline.files import remove
-from stages.sfm import lenses, mapping, matches, merging, pairs
+from stages.sfm import mapping, matches, merging, pairs
 from stages.sfm.database import FEATURES, PAIRS, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, pair_id_of
 from stages.sfm.images import Progress, SafePoint, WorkImage
+from stages.sfm.intrinsics import zoom
 from stages.sfm.learned.matches import add_matches, pairs_of
 from stages.verdict.verdict import DOUBTFUL
 
@@ -174,8 +175,8 @@ def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> Non
     """The rungs on which each photograph has a camera of its own, where there is reason to."""
     remove(place)
     best = climb.found.models[0]
-    zoomed = climb.agreement < DOUBTFUL or lenses.focal_length_spread(best) > SPREAD
-    cropped = _of_one_lens(climb.images) and lenses.principal_point_spread(best) > APART
+    zoomed = climb.agreement < DOUBTFUL or zoom.focal_length_spread(best) > SPREAD
+    cropped = _of_one_lens(climb.images) and zoom.principal_point_spread(best) > APART
     if not zoomed and not cropped:
         return
     place.mkdir()
@@ -184,7 +185,7 @@ def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> Non
     if zoomed:
         climb.tried(EACH, place, models, least=1 - LEFT * (1 - climb.agreement))
     if cropped and models and climb.found.rung != EACH:
-        models[0] = lenses.with_principal_points(models[0], quiet["safe_point"])
+        models[0] = zoom.with_principal_points(models[0], quiet["safe_point"])
         closer = models[0].compute_mean_reprojection_error() < CLOSER * best.compute_mean_reprojection_error()
         climb.tried(CROPPED, place, models, better=SAME if closer else BETTER)
 

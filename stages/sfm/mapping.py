@@ -164,7 +164,7 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
     parameters; unless the focal lengths then differ by 2 %, or fewer matches agree, which shows that the motion does not determine the intrinsics.
     Intrinsics fixed at the EXIF data stay. Of a model with MANY_OBSERVATIONS an even choice of points tells the cameras; the others follow.
     """
-    some = _thinned(model)
+    some = thinned(model, MANY_OBSERVATIONS)
     if some is None:
         return _with_adjusted_cameras(work, images, model, safe_point)
     some = _with_adjusted_cameras(work, images, some, safe_point)
@@ -179,9 +179,9 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
     return model
 
 
-def _thinned(model: Any) -> Any:
-    """A copy with an even choice of the points, of about MANY_OBSERVATIONS, and all of the photographs that have few; None where there are no more."""
-    every = -(-int(model.compute_num_observations()) // MANY_OBSERVATIONS)
+def thinned(model: Any, most: int) -> Any:
+    """A copy with an even choice of the points, of about `most` observations, and all points of the photographs that have few; None where there are no more."""
+    every = -(-int(model.compute_num_observations()) // most)
     if every < 2:
         return None
     poor = [image for image in model.images.values() if image.num_points3D <= ALL_OF]

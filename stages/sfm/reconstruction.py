@@ -9,6 +9,7 @@ import base64
 import contextlib
 import errno
 import fcntl
+import math
 import os
 import shutil
 import sqlite3
@@ -28,14 +29,16 @@ from stages.sfm import ladder, mapping, matches, process
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
 from stages.sfm.images import Callables, Masks, WorkImage, prepare_images
+from stages.sfm.intrinsics.own import with_own_intrinsics
 from stages.verdict.looks import look_at_all
 from stages.verdict.parallax import parallax
-from stages.verdict.verdict import CROPPED, LENS, MOVING, WITHOUT_TEXTURE, ZOOMED, failed
+from stages.verdict.verdict import CROPPED, LENS, MOVING, OWN_INTRINSICS, WITHOUT_TEXTURE, ZOOMED, failed
 
 WAIT = 0.05  # seconds between two looks at a lock
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
 FEW_FEATURES = 50  # of a photograph, below which nothing can be told by it
 OWN_LENSES = {ladder.EACH: ZOOMED, ladder.CROPPED: CROPPED}  # by rung
+OTHER_FOCAL = 1.2  # times a focal length: that of another lens
 MAX_NAMES = 8  # photographs that an error lists by name
 
 
@@ -170,6 +173,8 @@ def reconstruct(
         raise BadInput(_failure(folder, _paths(folder, names), work, images, found, rejected, matching))
     facts = _facts_of_matching(images, found, matching)
     model = models[0] if found.rung == ladder.CROPPED else mapping.bundle_adjusted(place, images, models[0], safe_point)
+    if found.rung not in OWN_LENSES:
+        model, facts[OWN_INTRINSICS] = with_own_intrinsics(images, model, safe_point)
     if moving := mapping.moving_shares(place, images, model, safe_point):
         facts[MOVING] = moving
     capture = _capture(folder, place, images, model, masks, rejected, facts)
@@ -353,7 +358,7 @@ def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
 
 def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:
     """What is suspicious in a model whose counts and reprojection error are fine."""
-    warnings = []
+    warnings, cameras = [], [photo.camera for photo in photos]
     seen = parallax(points, photos)
     if seen.small and seen.angle < 2.0:
         warnings.append(f"The photographs were taken from almost one place (triangulation angle {seen.angle:.1f} degrees): depth will be poor.")
@@ -362,8 +367,11 @@ def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: fl
             f"Only {agreement:.0%} of the verified matches agree with the cameras found: repeated structure may have folded the scene. "
             "Look at the cameras before training."
         )
-    lenses = {photo.camera.params: (photo.camera, prior) for photo, prior in zip(photos, priors, strict=True)}
-    for camera, prior in lenses.values():
+    lenses: dict[tuple[float | None, str, int, int, int], Camera] = {}  # one of each: with intrinsics of their own they have much the same focal length
+    for camera, prior in zip(cameras, priors, strict=True):
+        step = round(math.log(camera.intrinsics["fx"]) / math.log(OTHER_FOCAL))
+        lenses[prior, camera.model, camera.width, camera.height, step] = camera
+    for (prior, *_), camera in lenses.items():
         focal, longest = camera.intrinsics["fx"], max(camera.width, camera.height)
         if prior and mapping.contradicts_exif(focal, prior):
             warnings.append(f"{camera.name}: focal length {focal:.0f} px, but {prior:.0f} px by its EXIF data; cropped or edited photographs may explain it.")

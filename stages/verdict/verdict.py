@@ -23,9 +23,10 @@ from stages.verdict.looks import Look
 from stages.verdict.parallax import Parallax, parallax
 
 LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose photographs have focal lengths, or principal points, of their own
+OWN_INTRINSICS = "own_intrinsics"  # fact: which of them each photograph has of its own (`stages.sfm.intrinsics.own`), or None
 MOVING = "moving_parts"  # fact: name of a photograph -> share of it that moves
 # Facts of a capture that stand among the figures.
-FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, "gps", "stated_cameras", BACKGROUND)
+FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, OWN_INTRINSICS, "gps", "stated_cameras", BACKGROUND)
 NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
 FEW = 12  # views all round a subject
 FEW_POINTS = 60  # sparse points of a photograph, below which its pose is doubtful

@@ -13,8 +13,9 @@ from PIL import Image, ImageFilter
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.sfm import ladder, lenses, mapping, matches, merging, pairs, reconstruction
+from stages.sfm import ladder, mapping, matches, merging, pairs, reconstruction
 from stages.sfm.images import WorkImage
+from stages.sfm.intrinsics import zoom
 from stages.sfm.reconstruction import find_cameras
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -33,9 +34,9 @@ class Rig:
         monkeypatch.setattr(mapping, "sub_models", lambda work, images, seed, options, *a, **k: self.model(work, "begin", options))
         monkeypatch.setattr(mapping, "continued", lambda work, images, model, seed, options, *a, **k: self.model(work, "continue", options))
         monkeypatch.setattr(mapping, "match_agreement", self.agreement)
-        monkeypatch.setattr(lenses, "focal_length_spread", lambda model: self.spread)
-        monkeypatch.setattr(lenses, "principal_point_spread", lambda model: self.apart)
-        monkeypatch.setattr(lenses, "with_principal_points", lambda model, safe_point: self.model(Path("own_cameras"), "adjust", None)[0])
+        monkeypatch.setattr(zoom, "focal_length_spread", lambda model: self.spread)
+        monkeypatch.setattr(zoom, "principal_point_spread", lambda model: self.apart)
+        monkeypatch.setattr(zoom, "with_principal_points", lambda model, safe_point: self.model(Path("own_cameras"), "adjust", None)[0])
         monkeypatch.setattr(ladder, "match", lambda *a, **k: None)
         monkeypatch.setattr(ladder, "copy_database", lambda *a: None)
         monkeypatch.setattr(ladder, "copy_with_own_cameras", lambda *a: None)

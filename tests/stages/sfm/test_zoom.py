@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.sfm import ladder, lenses, mapping
+from stages.sfm import ladder, mapping
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, copy_with_own_cameras, database_path
 from stages.sfm.images import WorkImage
+from stages.sfm.intrinsics import zoom
 from stages.verdict.verdict import DOUBTFUL
 from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, cameras, matched, off, registered
 
@@ -53,10 +54,10 @@ def test_two_zooms_are_told_where_the_matches_agree_with_one(tmp_path: Path) -> 
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
     assert mapping.match_agreement(tmp_path, images, shared) > DOUBTFUL
     assert off(shared, taken) > 0.05
-    assert lenses.focal_length_spread(shared) > ladder.SPREAD
+    assert zoom.focal_length_spread(shared) > ladder.SPREAD
     found = found_for(tmp_path, images)
     assert found.rung == ladder.EACH
-    assert lenses.focal_length_spread(found.models[0]) < 1.01
+    assert zoom.focal_length_spread(found.models[0]) < 1.01
     assert off(found.models[0], taken) < 0.01
 
 
@@ -65,7 +66,7 @@ def test_photographs_that_were_cropped_get_their_principal_points_and_one_lens(t
     taken = cameras(cut=cut)
     images = matched(tmp_path, taken)
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    assert lenses.principal_point_spread(shared) > ladder.APART
+    assert zoom.principal_point_spread(shared) > ladder.APART
     found = found_for(tmp_path, images)
     assert found.rung == ladder.CROPPED
     model = found.models[0]
@@ -74,7 +75,7 @@ def test_photographs_that_were_cropped_get_their_principal_points_and_one_lens(t
     assert lens[0, 0] == pytest.approx(400.0, rel=0.08)
     true = np.array([camera.params[1:3] for camera in taken])
     assert (lens[:, 1:3] - true).std() < 0.4 * true.std()
-    assert lenses.principal_point_spread(model) < ladder.APART / 2
+    assert zoom.principal_point_spread(model) < ladder.APART / 2
     assert off(model, taken) < 0.5 * off(shared, taken) < 0.005
     assert numbers(found_for(tmp_path, images)) == numbers(found)
 
@@ -83,8 +84,8 @@ def test_the_spread_of_principal_points_does_not_depend_on_where_all_of_them_are
     """All cropped alike: one principal point, off the middle."""
     images = matched(tmp_path, cameras(cut=((20, -12),) * COUNT))
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    assert lenses.principal_point_spread(shared) < ladder.APART
-    assert lenses.focal_length_spread(shared) < ladder.SPREAD
+    assert zoom.principal_point_spread(shared) < ladder.APART
+    assert zoom.focal_length_spread(shared) < ladder.SPREAD
 
 
 def test_one_zoom_is_not_looked_at_again(tmp_path: Path) -> None:

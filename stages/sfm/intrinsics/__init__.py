@@ -1,0 +1,1 @@
+"""Photographs whose intrinsics differ although one camera took them: zoomed, cropped, focused nearer, stabilised."""

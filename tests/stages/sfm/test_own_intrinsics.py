@@ -1,0 +1,79 @@
+"""Intrinsics of each photograph's own: found where they differ, and left alone where they do not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.poses import aligned_errors
+from stages.sfm.colmap import import_pycolmap
+from stages.sfm.images import WorkImage
+from stages.sfm.intrinsics import own as own_intrinsics
+from stages.sfm.intrinsics.own import FOCAL_LENGTH, PRINCIPAL_POINT, with_own_intrinsics
+
+FOCAL, MIDDLE = 1280.0, np.array([512.0, 384.0])
+
+
+def made_model(factors: np.ndarray, shifts: np.ndarray, *, noise: float = 0.3) -> tuple[Any, list[WorkImage], np.ndarray]:
+    """Cameras round 500 points, of focal lengths that differ by factors (C,), and principal points by shifts (C, 2) pixels; and the true centres."""
+    pycolmap = import_pycolmap()
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, len(factors), 500
+    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [FOCAL, *MIDDLE, 0.0]
+    model = pycolmap.synthesize_dataset(options)
+    rng = np.random.default_rng(0)
+    for image_id, factor, shift in zip(sorted(model.reg_image_ids()), factors, shifts, strict=True):
+        for point in model.images[image_id].points2D:
+            point.xy = (point.xy - MIDDLE) * factor + MIDDLE + shift + rng.normal(0, noise, 2)
+    model.update_point_3d_errors()
+    images = [WorkImage(image.name, image.name, 1024, 768, 1024, 768, None, "") for image in model.images.values()]
+    return model, images, np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
+
+
+def centres_of(model: Any) -> np.ndarray:
+    return np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
+
+
+def test_one_lens_stays_one() -> None:
+    model, images, _ = made_model(np.ones(12), np.zeros((12, 2)))
+    assert with_own_intrinsics(images, model, lambda: None) == (model, None)
+
+
+def test_focus_breathing_is_found() -> None:
+    factors = np.random.default_rng(1).uniform(0.97, 1.03, 12)
+    model, images, centres = made_model(factors, np.zeros((12, 2)))
+    own, which = with_own_intrinsics(images, model, lambda: None)
+    assert which == FOCAL_LENGTH
+    found = np.array([own.cameras[own.images[i].camera_id].mean_focal_length() for i in sorted(own.reg_image_ids())])
+    assert found / found.mean() == pytest.approx(factors / factors.mean(), rel=2e-3)
+    assert own.num_points3D() == model.num_points3D()
+    assert own.compute_mean_reprojection_error() < 0.5
+    assert np.sqrt((aligned_errors(centres_of(own), centres) ** 2).mean()) < 0.01
+
+
+def test_principal_points_are_found_where_they_matter() -> None:
+    """A small shift is as good as a rotation: it is not worth the accuracy of the centres."""
+    shifts = np.random.default_rng(2).normal(0, 1, (12, 2))
+    model, images, _ = made_model(np.ones(12), 3 * shifts)
+    assert with_own_intrinsics(images, model, lambda: None)[1] is None
+    model, images, _ = made_model(np.ones(12), 40 * shifts)
+    shared = model.compute_mean_reprojection_error()
+    own, which = with_own_intrinsics(images, model, lambda: None)
+    assert which == PRINCIPAL_POINT
+    assert own.compute_mean_reprojection_error() < min(0.5, 0.9 * shared)
+
+
+def test_a_photograph_with_few_observations_has_the_intrinsics_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    factors = np.random.default_rng(1).uniform(0.97, 1.03, 12)
+    model, images, _ = made_model(factors, np.zeros((12, 2)))
+    first = min(model.reg_image_ids())
+    for point_id in sorted(model.point3D_ids())[own_intrinsics.FEW - 10 :]:
+        for element in list(model.points3D[point_id].track.elements):
+            if element.image_id == first:
+                model.delete_observation(first, element.point2D_idx)
+    own, which = with_own_intrinsics(images, model, lambda: None)
+    assert which == FOCAL_LENGTH
+    assert own.cameras[own.images[first].camera_id].mean_focal_length() == FOCAL
