@@ -72,7 +72,7 @@ class BakeSettings:
     visibility_rays: Annotated[int, Meta(ge=1000, le=10**9)] = setting(
         1_000_000, "Training pixels that the field is rendered for, to find the visible voxels.", advanced=True
     )
-    weight_threshold: Annotated[float, Meta(ge=0.0, le=0.5)] = setting(
+    weight_threshold: Annotated[float, Meta(ge=0.0, le=0.1)] = setting(
         1e-3,
         "A voxel is kept where its weight in some pixel exceeds this; in forward-facing scenes those that 4 or more training images (half of fewer than 7) have"
         " in view are baked where it exceeds 30 times this.",

@@ -48,7 +48,7 @@ from stages.evaluate.strips import strip_views, write_strips
 from stages.evaluate.summary import in_words, quality, summary
 from stages.evaluate.trivial import BLURS
 from stages.evaluate.video import write_captured_path
-from stages.evaluate.views import MAX_FIELD_IMAGE_SIZE, constant_background, evaluation_views, evenly_spaced, stride_for
+from stages.evaluate.views import MAX_FIELD_IMAGE_SIZE, bounded_stride, constant_background, evaluation_views, evenly_spaced, stride_for
 from stages.io.scene import View
 from stages.scratch import note, noted, once
 
@@ -179,7 +179,7 @@ def evaluate(
 def _field_stride(views: Sequence[View], scale: float | None) -> int:
     """The stride of the pixels that the field renders; None: as is affordable."""
     if scale is not None:
-        return max(1, math.ceil(1.0 / scale - 1e-6))
+        return bounded_stride(views, max(1, math.ceil(1.0 / scale - 1e-6)))
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     return max(math.ceil(longest / MAX_FIELD_IMAGE_SIZE), stride_for(views, MAX_FIELD_RAYS))
 

@@ -17,7 +17,7 @@ from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import Interrupted
 from stages.evaluate.splats import EvaluatedSplats
-from stages.evaluate.views import evenly_spaced, stride_for, subsample, subsample_camera, upsample
+from stages.evaluate.views import bounded_stride, evenly_spaced, stride_for, subsample, subsample_camera, upsample
 from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
@@ -247,6 +247,7 @@ def test_stride_for_bounds_the_pixels() -> None:
     assert stride_for([view] * 4, 10_000) == 2
     assert stride_for([view] * 4, 9_999) == 3
     assert stride_for([], 1) == 1
+    assert stride_for([view], 1) == bounded_stride([view], 10**6) == min(view.camera.width, view.camera.height), "each view keeps a pixel"
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3, 4])
