@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -50,14 +48,6 @@ def test_voxels_that_are_not_chosen_have_no_children() -> None:
     assert len(fine.density_values) == 8 * keep.sum()
 
 
-def test_nearest_lookup_takes_the_values_of_the_parents() -> None:
-    tree = random_tree(6, lookup="nearest")
-    fine = split_tree(tree, np.ones(len(tree.density_values), bool))
-
-    at = centres(fine)
-    np.testing.assert_array_equal(fine.density_values, density_at(tree, at))
-
-
 def test_renders_of_a_uniform_tree_stay() -> None:
     tree = uniform_tree()
     fine = split_tree(tree, np.ones(len(tree.density_values), bool))
@@ -82,12 +72,3 @@ def test_the_state_begins_anew_and_keeps_its_step() -> None:
     assert not found.square_density.any()
     assert not found.square_sh.any()
     assert found.tree.voxel == tree.voxel / 2
-
-
-def test_region_and_environment_stay() -> None:
-    tree = random_cascades(3)
-    fine = split_tree(replace(tree, metadata={"a": 1}), np.arange(len(tree.density_values)) % 2 == 0)
-
-    assert fine.environment is tree.environment
-    assert len(fine.outer) == len(tree.outer)
-    assert fine.metadata == {"a": 1}

@@ -16,7 +16,7 @@ from efficientnerf.structures.dense import DenseVoxels
 from efficientnerf.structures.hashing import HashMap
 from efficientnerf.structures.octree import Octree
 from efficientnerf.structures.synthetic import clustered, random_points, ray_points, scattered, shuffled
-from efficientnerf.structures.voxels import Voxels, pack_values, unpack_values, voxels_from_values
+from efficientnerf.structures.voxels import Voxels, voxels_from_values
 
 KERNELS = (DenseVoxels, HashMap, Octree, BrickTree, FullBricks)
 TORCH = (torch_structures.DenseVoxels, torch_structures.HashMap, torch_structures.Octree, torch_structures.BrickTree, torch_structures.FullBricks)
@@ -91,25 +91,7 @@ def test_structures_agree_on_cuda(structure: type) -> None:
     np.testing.assert_array_equal(query_in_torch(structure, voxels, points, "cuda")[0], query(DenseVoxels, voxels, points)[0])
 
 
-def test_more_points_than_one_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch_structures, "CHUNK", 1000)
-    voxels, points = clustered(32, 0.2, 0), random_points(32, 2500, 0)
-    np.testing.assert_array_equal(query_in_torch(torch_structures.BrickTree, voxels, points)[0], query(DenseVoxels, voxels, points)[0])
-
-
-def test_a_hash_map_stays_half_empty_and_an_octree_shares_its_rows() -> None:
-    voxels = clustered(64, 0.2, 0)
-    table = HashMap.cache(voxels).table
-    assert np.count_nonzero(table[::2] != np.uint64(0xFFFFFFFFFFFFFFFF)) == len(voxels.packed)
-    assert len(table) // 2 >= 2 * len(voxels.packed)
-    tree = Octree.cache(voxels)
-    assert len(tree.child) == len(tree.data)
-    np.testing.assert_array_equal(np.sort(tree.data[tree.data != 0]), np.sort(voxels.packed))
-    inner = np.flatnonzero(tree.child)
-    np.testing.assert_array_equal(np.sort(inner // 8 + tree.child[inner]), np.arange(1, len(tree.child) // 8))  # each node has one parent
-
-
-def test_a_tree_of_bricks_takes_less_than_a_quarter_of_dense_voxels_at_a_fifth() -> None:
+def test_a_tree_of_bricks_takes_a_quarter_of_dense_voxels_at_a_fifth() -> None:
     for voxels in (clustered(128, 0.2, 0), scattered(128, 0.2, 0)):
         tree = BrickTree.cache(voxels)
         assert len(tree.values) == len(voxels.packed)
@@ -129,12 +111,6 @@ def test_shares_are_exact_and_repeat(make, share: float) -> None:  # type: ignor
     np.testing.assert_array_equal(voxels.packed, again.packed)
 
 
-def test_clusters_leave_most_bricks_empty_and_scattering_does_not() -> None:
-    full, none = (len(np.unique(make(64, 0.2, 0).coordinates // 4, axis=0)) / 16**3 for make in (clustered, scattered))
-    assert full < 0.4
-    assert none > 0.99
-
-
 def test_rays_run_through_the_grid_one_voxel_at_a_time() -> None:
     points = ray_points(50, 30_000, 0)
     assert len(points) >= 30_000
@@ -142,11 +118,6 @@ def test_rays_run_through_the_grid_one_voxel_at_a_time() -> None:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert np.median(steps) == pytest.approx(1, abs=1e-3)
     assert (steps > 2).mean() < 0.1  # where the next ray begins
-
-
-def test_words_carry_the_values() -> None:
-    values = np.array([[1, -2, 0.5, 1e-3], [0, 0, 0, 6e-8]], np.float16)
-    np.testing.assert_array_equal(unpack_values(pack_values(values)), values)
 
 
 @pytest.mark.parametrize(

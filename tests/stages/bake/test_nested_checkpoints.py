@@ -48,7 +48,6 @@ def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None
     point = Point(state, SCHEDULE, int(pruned), Pruned(0.25, 0.125, 7) if pruned else None)
     checkpoint.save(job(tmp_path), point)
     found = checkpoint.restored(job(tmp_path), tree, SCHEDULE, cells=5)
-    assert found is not None
     again = found.state
     assert (again.step, found.phase, found.pruned) == (state.step, point.phase, point.pruned)
     for name in STATE:

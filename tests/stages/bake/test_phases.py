@@ -158,7 +158,6 @@ def test_a_checkpoint_gives_the_state_of_any_phase_back(tree: Callable[[], NerfT
     point = Point(some_state(baked, phase), TWELVE, phase, Pruned(0.5, 0.25, 3) if phase else None, 20.0, 10.0)
     checkpoint.save(made, point)
     found = checkpoint.restored(made, baked, TWELVE, cells=5)
-    assert found is not None
     assert (found.state.step, found.phase, found.pruned, found.seconds, found.began) == (point.state.step, phase, point.pruned, 20.0, 10.0)
     for name in STATE:
         np.testing.assert_array_equal(getattr(found.state, name), getattr(point.state, name))

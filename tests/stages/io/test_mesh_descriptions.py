@@ -21,8 +21,7 @@ import trimesh
 from efficientnerf.surface.mesh import PointCloud
 from pipeline.errors import BadInput
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
-from stages.io.meshes.description import SUFFIXES, describe_mesh
-from stages.io.meshes.glb import FACE, FACES
+from stages.io.meshes.description import describe_mesh
 from tests.stages.io.meshes import Y_DOWN, block
 from workflows.inspection.describe import MESHES
 
@@ -54,10 +53,6 @@ def box_glb(**nodes: Any) -> tuple[dict[str, Any], bytes]:
 def described(path: Path, data: bytes) -> dict[str, Any]:
     path.write_bytes(data)
     return describe_mesh(path)
-
-
-def test_all_that_is_written_can_be_described() -> None:
-    assert set(SUFFIXES) == set(MESHES)
 
 
 @pytest.mark.parametrize("suffix", sorted(MESHES))
@@ -262,13 +257,6 @@ def test_an_obj_of_many_blocks_takes_time_by_its_size(tmp_path: Path) -> None:
     began = time.process_time()
     assert described(tmp_path / "a.obj", data)["faces"] == 20_000
     assert time.process_time() - began < 5.0
-
-
-def test_more_faces_than_bytes_are_refused(tmp_path: Path) -> None:
-    data = large("strip of bytes")
-    assert FACES + len(data) // FACE < 4_000_000
-    with pytest.raises(BadInput, match="faces"):
-        described(tmp_path / "a.glb", data)
 
 
 @pytest.mark.parametrize("suffix", sorted(MESHES))
