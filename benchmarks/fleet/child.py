@@ -15,7 +15,7 @@ from pipeline.files import write_atomically
 from pipeline.links import WORK
 from pipeline.run import NAME, Run
 from pipeline.stage import Job, Stage, settings_dict
-from workflows.asset import Workflow
+from workflows.workflow import Workflow
 
 CHILD = "benchmarks.fleet.child"
 JOURNAL = "journal"  # in a run: a line for each step that was done, each stage that was begun or ended

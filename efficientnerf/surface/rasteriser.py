@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from efficientnerf.backends.numba.mesh.rasterise import rasterise, row_spans
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project, rays
 
@@ -36,8 +37,6 @@ class MeshImage:
 def mesh_image(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> MeshImage:
     """What of a mesh each pixel's centre meets first, from either side. Edges are straight between the distorted places of their ends; faces that reach behind
     the camera, or beyond what its lens shows, are left out."""
-    from efficientnerf.backends.numba.mesh.rasterise import rasterise, row_spans
-
     pixels, depth = project(camera, vertices)
     near = np.zeros((camera.height, camera.width), np.float32)
     shown = np.full((camera.height, camera.width), -1, np.int32)

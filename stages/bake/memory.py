@@ -4,24 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+
+from efficientnerf.asset.bake import grid_of
+from efficientnerf.asset.file.serialisation import bytes_per_voxel, most_voxels
+from efficientnerf.asset.refinement import schedule
+from efficientnerf.asset.refinement.error_map import MAX_CELLS
+from efficientnerf.asset.refinement.fit import PATCH_SIDE
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import PixelRows
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
 from stages.artifacts import BakeInputs
+from stages.bake.plan import Plan
+from stages.bake.pruning import most_children
+from stages.bake.resolution import MAX_CASCADES, size_limits
+from stages.bake.resolution import MAX_CELLS as MAX_COARSE_CELLS
+from stages.bake.settings import BakeSettings
+from stages.bake.voxels import MAX_OVERSHOOT, finest_choice
+from stages.bake.whole_scene import grids_of
 from stages.cores import count_cores
+from stages.evaluate.views import constant_background
+from stages.io.field_file import load_renderer
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import Scene, View, views_of
 from stages.memory.forecast import Known
 from stages.memory.need import MIB, Need, has_room, libraries, refuse_what_does_not_fit
 from stages.train.data import channels_of, count_pixels
 from stages.train.memory import DENSITY_VOXEL, PIXELS, parameters, pixels_needed, place_pixels
 from stages.train.pixel_file import PixelFile
-
-if TYPE_CHECKING:
-    from efficientnerf.training.pixels import PixelRows
-    from stages.bake.plan import Plan
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene, View
 
 COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement
 PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, those in the order of the file or decoded, two in the refinement
@@ -50,8 +63,6 @@ def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick
 
 def free_on_device(device: str) -> int:
     """Bytes available on a CUDA device: free ones, and those that this process has reserved but not allocated."""
-    import torch
-
     return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
@@ -67,9 +78,6 @@ def needed(
     stored    whether the pixels are in a file
     whole     whether a whole scene is baked
     """
-    from efficientnerf.asset.refinement.error_map import MAX_CELLS
-    from efficientnerf.asset.refinement.fit import PATCH_SIDE
-
     pixels, harmonics = pixels_needed(views, channels, stored=stored), (m.fine.degree + 1) ** 2
     rays = min(settings.visibility_rays, count_pixels(tuple(views)))
     return Need({
@@ -108,10 +116,6 @@ def most_needed(
     splits   how often voxels will be split
     returns  voxels along the finest grid in question; how many are baked at most; and `needed` as a function of (voxels, stored=)
     """
-    from efficientnerf.asset.file.serialisation import most_voxels
-    from stages.bake.pruning import most_children
-    from stages.bake.voxels import MAX_OVERSHOOT
-
     finest, cells = _finest_cells(settings, m, s, whole=whole)
     room = most_voxels(int(mib * MIB), settings.layout, m.fine.degree, (1, 1, 1), settings.brick_size)
 
@@ -124,19 +128,14 @@ def most_needed(
 
 def _finest_cells(settings: BakeSettings, m: Any, s: Scene, *, whole: bool) -> tuple[int, int]:
     """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
-    from efficientnerf.asset.bake import grid_of
-    from stages.bake.resolution import MAX_CASCADES, MAX_CELLS
-    from stages.bake.voxels import finest_choice
-    from stages.bake.whole_scene import grids_of
-
     bounds, discretise = m.space.bounds, given(m.settings.discretise)
-    finest = finest_choice(settings, m, s).resolution
+    finest = finest_choice(settings, m.settings, s).resolution
     if not whole:
         return finest, math.prod(grid_of(bounds, finest, settings.brick_size)[0])
     count = given(settings.cascades) or MAX_CASCADES
     cells = sum(math.prod(shape) for shape, _, _ in grids_of(bounds, finest, settings.brick_size, count, None))
     stated = given(settings.resolution) or given(settings.max_resolution) or discretise
-    return finest, cells if stated else min(cells, 2 * MAX_CELLS)  # coarse cells are more by those that make grids fit each other
+    return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
 def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
@@ -145,8 +144,6 @@ def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any
     pixels        as they were placed
     splits, room  how often voxels will be split, and how many there is room for then
     """
-    from stages.bake.pruning import most_children
-
     whole, voxels = plan.samples is not None, plan.voxels
     if splits:
         voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
@@ -165,8 +162,6 @@ def memory_needed(known: Known) -> Need:
 
 def space_needed(known: Known) -> int:
     """The field's samples, the values of the voxels as they are baked, a checkpoint of their refinement, two while it is replaced, and the asset."""
-    from efficientnerf.asset.file.serialisation import bytes_per_voxel
-
     own, (degree, whole, mib, rays, voxels, _) = known.settings["bake"], _before(known)
     values, voxels = 4 * (1 + 3 * (degree + 1) ** 2), min(voxels, SHOWN * rays)
     checkpoints = 1 if own.refine_steps != "auto" and own.refine_steps * own.refine_rays_per_batch < SHORT else 2
@@ -176,13 +171,6 @@ def space_needed(known: Known) -> int:
 
 def _before(known: Known) -> tuple[int, bool, float, int, int, Need]:
     """(degree of the harmonics, whether a whole scene is baked, MiB of the asset, visibility rays, voxels, what these take of memory), each at most."""
-    from efficientnerf.asset.refinement import schedule
-    from stages.bake.resolution import size_limits
-    from stages.evaluate.views import constant_background
-    from stages.io.field_file import load_renderer
-    from stages.io.refined_cameras import load_scene
-    from stages.io.scene import views_of
-
     own, inputs = known.settings["bake"], known.inputs(BakeInputs)
     m, s = load_renderer(inputs.train.folder).model, load_scene(inputs.poses.folder, inputs.train.folder)
     views, whole = views_of(s, "train"), constant_background(s) is None

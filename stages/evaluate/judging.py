@@ -17,6 +17,7 @@ from stages.evaluate.sparse_points import ReliablePoints
 from stages.evaluate.summary import means
 from stages.evaluate.trivial import equivalent_blur
 from stages.evaluate.views import constant_background, evenly_spaced, ground_truth
+from stages.io.png import write_png
 from stages.io.scene import Scene, View, views_of
 from stages.train.averaged import Taken
 from stages.verdict.result import ResultVerdict, camera_verdict_of, verdict_on_result
@@ -72,8 +73,6 @@ def _read(job: Job) -> Any:
 
 def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints, metrics: Mapping[str, Any], job: Job) -> None:
     """Of the view whose points agree least with the asset's depth."""
-    from stages.io.png import write_png
-
     counts = [found["sparse_points"] for found in metrics["views"]]
     shares = [1.0 if not found["points"] else 1 - (found["nearer"] + found["farther"]) / found["points"] for found in counts]
     view = views[shares.index(min(shares))]

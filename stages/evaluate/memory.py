@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.settings import given
 from efficientnerf.surface.shading import AT_ONCE
 from stages.artifacts import EvaluateInputs
 from stages.evaluate.mesh import mesh_bytes
+from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, EvaluateSettings
 from stages.evaluate.strips import STRIP_RAYS
-from stages.evaluate.views import MAX_FIELD_IMAGE_SIZE, evaluation_views
+from stages.evaluate.views import evaluation_views
 from stages.io.scene import load
 from stages.memory.forecast import Known
-from stages.memory.need import MIB, Need, libraries, tree_bytes
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from stages.evaluate.run import EvaluateSettings
+from stages.memory.need import MIB, Need, libraries
+from stages.memory.tree import asset_of, tree_bytes
 
 # Bytes of a pixel: of a test view with its photograph, renders, errors and windows of SSIM; of a view in which the mesh is drawn. Of a sample of those that are
 # drawn at a time.
@@ -48,7 +46,7 @@ def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, d
 
 def memory_needed(known: Known) -> Need:
     """`needed` for the whole asset."""
-    return needed(known.asset(), known.settings["evaluate"], known.inputs(EvaluateInputs), known.device)
+    return needed(asset_of(known), known.settings["evaluate"], known.inputs(EvaluateInputs), known.device)
 
 
 def space_needed(known: Known) -> int:

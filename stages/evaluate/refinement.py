@@ -6,13 +6,12 @@ import json
 
 from pipeline.files import read_json
 from stages.artifacts import BakeOutputs
+from stages.bake.refine.refinement import usual_steps
+from stages.bake.settings import BakeSettings
 
 
 def refinement_of(bake: BakeOutputs) -> dict[str, int]:
     """Steps that were taken, and those that are usual for so many voxels and rays a step."""
-    from stages.bake.refine.refinement import usual_steps
-    from stages.bake.run import BakeSettings
-
     report = read_json(bake.report)
     last = json.loads(bake.log.read_text(encoding="utf-8").splitlines()[-1])
     rays = last["rays"] or BakeSettings().refine_rays_per_batch  # 0: there was no step

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from efficientnerf.geometry.cameras import MODELS, Camera
-from stages.io.scene import Scene, View
-
-MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
+from efficientnerf.model import UNSEEN
+from stages.io.scene import Scene, View, read_image, read_mask, views_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +35,6 @@ class GroundTruth:
 
 def evaluation_views(scene: Scene) -> tuple[tuple[View, ...], str]:
     """The views to report on and their split: test, else val, else train. Raises ValueError where the scene has no views."""
-    from stages.io.scene import views_of
-
     for split in ("test", "val", "train"):
         views = views_of(scene, split)
         if views:
@@ -67,8 +65,6 @@ def ground_truth(folder: Path, view: View, background: tuple[float, float, float
 
     background  what images with alpha are composited on; None: alpha below one half masks
     """
-    from stages.io.scene import read_image, read_mask
-
     pixels = subsample(read_image(folder, view), stride).astype(np.float32) / 255.0
     mask = read_mask(folder, view)
     mask = None if mask is None else subsample(mask, stride)
@@ -104,8 +100,6 @@ def subsample(values: np.ndarray, stride: int) -> np.ndarray:
 
 def upsample(values: np.ndarray, stride: int, width: int, height: int) -> np.ndarray:
     """The inverse of `subsample`: bilinear, clamped at the border; (H', W', ...) -> (height, width, ...)."""
-    import cv2
-
     values = np.ascontiguousarray(values, np.float32)
     if stride == 1:
         return values
@@ -116,6 +110,4 @@ def upsample(values: np.ndarray, stride: int, width: int, height: int) -> np.nda
 
 def constant_background(scene: Scene) -> tuple[float, float, float] | None:
     """The colour behind the asset in bounded and forward-facing scenes; None in unbounded ones."""
-    from efficientnerf.model import UNSEEN
-
     return scene.background if scene.background is not None or scene.forward is None else (UNSEEN, UNSEEN, UNSEEN)

@@ -15,13 +15,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
-from stages.artifacts import BakeOutputs, PosesOutputs, inputs_of, needs_of
+from stages.artifacts import PosesOutputs, inputs_of, needs_of
 from stages.memory.need import MIB, Need
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 T = TypeVar("T")
 
@@ -47,12 +44,6 @@ class Known:
     def inputs(self, kind: type[T]) -> T:
         """The inputs of a stage."""
         return inputs_of(kind, {name: self.run / name for name in needs_of(kind)})
-
-    def asset(self) -> NerfTree:
-        """The asset without what is in it: its arrays take no memory."""
-        from efficientnerf.asset.format import outline
-
-        return outline(BakeOutputs.of_run(self.run).asset)
 
     def pictures(self) -> int:
         """Bytes of previews and figures as large as a working image."""

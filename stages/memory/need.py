@@ -8,14 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit, available_now, size_text
 from pipeline.stage import Job
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 MIB = 2**20
 TERMS_SHOWN = 3
@@ -24,22 +20,11 @@ IMAGING = 130 * MIB  # numpy, OpenCV and Pillow
 RENDERING = 600 * MIB  # torch and numba beside these
 SURFACES = 200 * MIB  # SciPy, scikit-image and what decimates, beside these
 CUDA = 2048 * MIB  # what torch adds on the host for a CUDA device
-TREE = 3  # times the tree's arrays: these, and what renderers make of them
 
 
 def libraries(device: str = "cpu") -> int:
     """Bytes of a process that renders or trains, before it has read anything."""
     return RENDERING + (0 if device == "cpu" else CUDA)
-
-
-def tree_bytes(tree: NerfTree) -> int:
-    """Bytes of a tree and of what renderers make of it."""
-    from efficientnerf.asset.palettes import PaletteHarmonics
-
-    harmonics = tree.harmonics
-    colours = 16 * len(tree.density_values)  # as seen from a camera
-    stored = harmonics.base.nbytes + harmonics.codes.nbytes if isinstance(harmonics, PaletteHarmonics) else harmonics.nbytes
-    return TREE * (tree.brick_index.nbytes + tree.voxel_index.nbytes + tree.density_values.nbytes + stored) + colours
 
 
 @dataclass(frozen=True)

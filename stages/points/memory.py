@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from stages.memory.forecast import Known
 from stages.memory.need import Need
+from stages.memory.tree import asset_of
 from stages.mesh.memory import surface_needed
 
 WRITTEN = 30  # bytes of a point
@@ -11,7 +12,7 @@ WRITTEN = 30  # bytes of a point
 
 def memory_needed(known: Known) -> Need:
     """What the stage points takes for the whole asset."""
-    return surface_needed(known.asset(), known.settings["points"].num_points)
+    return surface_needed(asset_of(known), known.settings["points"].num_points)
 
 
 def space_needed(known: Known) -> int:

@@ -12,10 +12,20 @@ from efficientnerf.settings import given
 from pipeline.errors import PipelineError
 from pipeline.stage import Job
 from stages.cores import count_cores
+from stages.formats.importers import detect
+from stages.formats.importers.source import IMAGE_SUFFIXES
 from stages.io.capture import FOREGROUND
 from stages.io.photo import working_size
+from stages.io.pictures import UnreadableImage, read_header
 from stages.memory.forecast import Known, files_below, sizes_below
 from stages.memory.need import IMAGING, MIB, Need, most_threads, refuse_what_does_not_fit
+from stages.sfm.ladder import features_for
+from stages.sfm.learned.matches import AT_ONCE
+from stages.sfm.learned.networks import LONGEST
+from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
+from stages.sfm.pairs import BLOCK_SIZE
+from stages.video.panorama import VIEWS
+from stages.video.reading import UnreadableVideo, opened
 
 # Bytes. Of a pixel of the photograph that is decoded, turned, reduced and written; of a pixel of a photograph in which features are detected, on a thread
 # of its own (SIFT's first octave), four times as many where that is twice as large; of an image's descriptors while they are matched.
@@ -47,11 +57,6 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     features  of a photograph, at most
     networks  whether photographs without a camera are matched by networks
     """
-    from stages.sfm.learned.matches import AT_ONCE
-    from stages.sfm.learned.networks import LONGEST
-    from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
-    from stages.sfm.pairs import BLOCK_SIZE
-
     reduced = {working_size(*size, max_side) for size in sizes}
     most = max((width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced), default=0)
     decoded = decoding_needed(sizes).terms
@@ -84,10 +89,6 @@ def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, f
 
 def memory_needed(known: Known) -> Need:
     """As if no cameras were known: of a set with cameras less is taken."""
-    from stages.masking.first_training import FIRST, RAYS, SIDE
-    from stages.sfm.ladder import features_for
-    from stages.train.memory import first_training_needed
-
     own, (pictures, sizes) = known.settings["poses"], _pictures(known.sources)
     films = [] if pictures else _films(known.sources)
     count = len(pictures) or own.frames
@@ -95,15 +96,15 @@ def memory_needed(known: Known) -> Need:
     features = given(own.max_features) or features_for(count)
     needs = [features_needed([largest] * count, own.feature_image_size, features, count_cores(), networks=own.features_model != "off"), video_needed(films)]
     if own.mask_from == FOREGROUND:
+        from stages.masking.first_training import FIRST, RAYS, SIDE  # without it the stage needs no torch
+        from stages.train.memory import first_training_needed
+
         needs.append(first_training_needed(count, SIDE, FIRST, RAYS))
     return max(needs, key=lambda need: need.total)
 
 
 def space_needed(known: Known) -> int:
     """Working images, and what structure from motion reads: copies of photographs, or the frames of videos. Videos count where there are no images."""
-    from stages.sfm.ladder import features_for
-    from stages.video.panorama import VIEWS
-
     own, (pictures, sizes) = known.settings["poses"], _pictures(known.sources)
     count = (len(pictures) or own.frames) * (VIEWS if own.lens == "equirectangular" else 1)
     found = _cameras_are_found(own, known.sources)
@@ -118,9 +119,6 @@ def space_needed(known: Known) -> int:
 
 def _pictures(sources: Sequence[Path]) -> tuple[list[Path], list[tuple[int, int]]]:
     """All photographs below the sources, and the sizes of some of them."""
-    from stages.formats.importers.source import IMAGE_SUFFIXES
-    from stages.io.pictures import UnreadableImage, read_header
-
     pictures = [path for source in sources for path in files_below(source) if path.suffix.lower() in IMAGE_SUFFIXES]
     sizes = []
     for path in pictures[:: -(-len(pictures) // HEADERS) or 1]:
@@ -131,8 +129,6 @@ def _pictures(sources: Sequence[Path]) -> tuple[list[Path], list[tuple[int, int]
 
 def _films(sources: Sequence[Path]) -> list[tuple[int, int]]:
     """The sizes of all videos below the sources."""
-    from stages.video.reading import UnreadableVideo, opened
-
     sizes = []
     for path in (path for source in sources for path in files_below(source)):
         with contextlib.suppress(UnreadableVideo), opened(path) as video:
@@ -142,8 +138,6 @@ def _films(sources: Sequence[Path]) -> list[tuple[int, int]]:
 
 def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
     """Whether structure from motion has to find them, as far as can be told before."""
-    from stages.formats.importers import detect
-
     if own.format != "auto" or len(sources) != 1:
         return own.format in ("auto", "photographs")
     with contextlib.suppress(PipelineError, OSError):  # the stage says so

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.tree import NerfTree
 from stages.artifacts import SplatsInputs
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import views_of
 from stages.memory.forecast import Known
-from stages.memory.need import MIB, Need, libraries, tree_bytes
+from stages.memory.need import MIB, Need, libraries
+from stages.memory.tree import asset_of, tree_bytes
 from stages.splats.pictures import render_cameras
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from stages.splats.run import SplatsSettings
+from stages.splats.settings import SplatsSettings
 
 # Bytes. Of a parameter: value, gradient, two moments, and one more while Gaussians are merged and written; of a stored voxel while they are merged; of a
 # pixel of a picture: its colours and mask; of a pixel of the one that is drawn: colours, transmittance, gradients and the Gaussians that cover its tile.
@@ -62,7 +60,7 @@ def memory_needed(known: Known) -> Need:
     if known.settings["splats"].make == "off":
         return Need({"libraries": libraries()})
     inputs = known.inputs(SplatsInputs)
-    return needed(known.asset(), known.settings["splats"], (inputs.poses.folder, inputs.train.folder))
+    return needed(asset_of(known), known.settings["splats"], (inputs.poses.folder, inputs.train.folder))
 
 
 def space_needed(known: Known) -> int:
@@ -70,5 +68,5 @@ def space_needed(known: Known) -> int:
     own, inputs = known.settings["splats"], known.inputs(SplatsInputs)
     if own.make == "off":
         return 0
-    count = most_gaussians(own, pixels_of(known.asset(), own, (inputs.poses.folder, inputs.train.folder)))
+    count = most_gaussians(own, pixels_of(asset_of(known), own, (inputs.poses.folder, inputs.train.folder)))
     return SHEET + (WRITTEN_FLOAT * (3 + parameters_of(own)) + SPZ) * count  # with a normal

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from efficientnerf.fields.hash import FEATURES, grids, level_sizes
 from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.spaces import Space, space_from
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE, PixelRows
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs, TrainInputs
-from stages.io.scene import View
+from stages.io.field_file import space_of
+from stages.io.scene import View, load, views_of
 from stages.memory.forecast import Known
 from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
 from stages.train.data import MOST_OBSERVATIONS, channels_of, count_pixels
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.pixels import PixelRows
+from stages.train.hash_resolution import with_auto_sizes
+from stages.train.pixel_file import PixelFile
 
 PIXELS = "training pixels"
 # Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes;
@@ -39,8 +42,6 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
 
     stored  whether the pixels are in a file
     """
-    from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE
-
     cameras = [view.camera for view in views]
     total = count_pixels(tuple(views))
     lenses = {(camera.width, camera.height, camera.model, camera.params) for camera in cameras}
@@ -58,8 +59,6 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
 
 def parameters(settings: TrainSettings) -> int:
     """Parameters of both fields, about."""
-    from efficientnerf.fields.hash import FEATURES, grids, level_sizes
-
     hidden = settings.num_layers * settings.hidden_dim**2 + settings.coarse_num_layers * settings.coarse_hidden_dim**2
     if settings.field != "hash":
         return hidden
@@ -112,8 +111,6 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
     remedy  as for `refuse_what_does_not_fit`
     stored  whether in a file
     """
-    from stages.train.pixel_file import PixelFile
-
     refuse_what_does_not_fit(job, need, remedy)
     if not stored:
         return None
@@ -159,10 +156,6 @@ def space_needed(known: Known) -> int:
 
 def _before(known: Known) -> tuple[tuple[View, ...], TrainSettings, Space]:
     """Views that are trained on, settings without "auto" as for `needed`, and the field's space."""
-    from stages.io.field_file import space_of
-    from stages.io.scene import load, views_of
-    from stages.train.hash_resolution import with_auto_sizes
-
     s = load(known.inputs(TrainInputs).poses.folder)
     views = views_of(s, "train")
     return views, with_auto_sizes(known.settings["train"], s, count_pixels(views)), space_of(s)
@@ -178,10 +171,6 @@ def first_training_needed(count: int, side: int, settings: TrainSettings, rays: 
     settings  without "auto" where `stages.train.hash_resolution` has numbers
     rays      in which the subject is looked for
     """
-    import numpy as np
-
-    from efficientnerf.geometry.spaces import space_from
-
     space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=True)
     camera = Camera("", side, side, "SIMPLE_PINHOLE", (side, side / 2, side / 2), np.eye(4))
     view = View("", None, "train", camera, camera, 0.1, 1.0)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from efficientnerf.asset.tree import NerfTree
 from stages.memory.forecast import Known
-from stages.memory.need import MIB, Need, libraries, tree_bytes
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from stages.memory.need import MIB, Need, libraries
+from stages.memory.tree import asset_of, tree_bytes
 
 FRAME = 116  # bytes of a pixel of a frame with all its channels while it is written as EXR
 BAND = 160 * MIB  # rays at a time where each is rendered on its own
@@ -28,7 +25,7 @@ def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
 def memory_needed(known: Known) -> Need:
     """What the stage turntable takes for the whole asset."""
     own = known.settings["turntable"]
-    return frames_needed(known.asset(), own.width * own.height, known.device)
+    return frames_needed(asset_of(known), own.width * own.height, known.device)
 
 
 def space_needed(known: Known) -> int:

@@ -14,8 +14,7 @@ import numpy as np
 from efficientnerf.asset.cascades import cascade_grids
 from efficientnerf.asset.file.container import DTYPES
 from efficientnerf.asset.format import LAYOUTS, serialize
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, Region
 from tests.efficientnerf.trees import LOW, random_cascades, random_tree
 
 SIMILARITY = {"scale": 0.5, "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "translation": [1, 2, 3]}

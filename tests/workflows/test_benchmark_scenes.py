@@ -13,7 +13,8 @@ from benchmarks.scenes.rendering import nearest
 from efficientnerf.geometry.cameras import rays
 from pipeline.stage import Job
 from stages.io import scene
-from stages.poses.run import PosesSettings, run
+from stages.poses.run import run
+from stages.poses.settings import PosesSettings
 
 COUNTS = {"train": 6, "val": 2, "test": 3}
 

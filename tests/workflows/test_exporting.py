@@ -24,8 +24,8 @@ from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
 from stages.mesh.files import read_mesh
-from stages.mesh.run import MeshSettings
-from stages.points.run import PointsSettings
+from stages.mesh.settings import MeshSettings
+from stages.points.settings import PointsSettings
 from tests.stages.io.meshes import block
 from workflows import exporting
 from workflows.cli.resolve import Settings, table_of
@@ -51,7 +51,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for file in (outputs.ply, outputs.glb, outputs.obj):
         MESH_EXPORTERS[file.suffix](mesh, file, source_frame(METADATA))
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(MADE))))
-    monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: fresh)
+    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
     monkeypatch.setattr(exporting, "_meshed", lambda export, tree, border, frame, wanted, progress: pytest.fail(f"made again, with {wanted}"))
     return path
 
@@ -99,7 +99,7 @@ def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dic
 def test_a_normal_map_is_left_out_where_it_is_not_asked_for(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = replace(MADE, normal_map=True)
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(made))))
-    monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: fresh)
+    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
     outputs = MeshOutputs.of_run(run)
     mesh = read_mesh(outputs)
     assert mesh.texture is not None

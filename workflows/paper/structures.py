@@ -13,14 +13,22 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import torch
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.structures import torch_structures
+from efficientnerf.structures.bits import fill, gather
+from efficientnerf.structures.bricks import BrickTree, FullBricks
+from efficientnerf.structures.dense import DenseVoxels
+from efficientnerf.structures.hashing import HashMap
+from efficientnerf.structures.octree import Octree
+from efficientnerf.structures.synthetic import clustered, random_points, ray_points, scattered, shuffled
+from efficientnerf.structures.voxels import Voxels
+from pipeline.errors import StageFailed
 from workflows.paper.result import PAPER, Repetitions, Request, Result
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from efficientnerf.structures.voxels import Voxels
 
 NAMES = {
     "DenseVoxels": "dense voxels",
@@ -53,8 +61,6 @@ class Case:
         return f"{self.side}³, {self.share:.0%} {how}{', listed at random' if self.shuffled else ''}"
 
     def voxels(self) -> Voxels:
-        from efficientnerf.structures.synthetic import clustered, scattered, shuffled
-
         made = (scattered if self.scattered else clustered)(self.side, self.share, SEED)
         return shuffled(made, SEED) if self.shuffled else made
 
@@ -92,8 +98,6 @@ def structures(request: Request) -> Result:
 
 def _measure(case: Case, points: int, backend: Backend, timings: Repetitions) -> tuple[list[dict[str, Any]], str]:
     """All structures in turn, repetition by repetition: a row for each, and a note on the voxels."""
-    from efficientnerf.structures.synthetic import random_points, ray_points
-
     voxels = case.voxels()
     sets = {"random": random_points(case.side, points, SEED), "rays": ray_points(case.side, points, SEED)}
     cache, query, wait = backend.prepare(voxels, sets)
@@ -147,14 +151,6 @@ def _row(case: Case, name: str, size: Mapping[str, int], middle: Mapping[tuple[s
 
 
 def _in_numba() -> Backend:
-    import numpy as np
-
-    from efficientnerf.structures.bricks import BrickTree, FullBricks
-    from efficientnerf.structures.dense import DenseVoxels
-    from efficientnerf.structures.hashing import HashMap
-    from efficientnerf.structures.octree import Octree
-    from efficientnerf.structures.synthetic import scattered
-
     kinds: dict[str, Any] = {kind.__name__: kind for kind in (DenseVoxels, HashMap, Octree, FullBricks, BrickTree)}
     for kind in kinds.values():  # compiles
         kind.cache(scattered(16, 0.2, SEED)).query(np.zeros((1, 3), np.float32), np.empty(1, np.uint64), np.empty(1, bool))
@@ -172,12 +168,6 @@ def _in_numba() -> Backend:
 
 
 def _in_torch(device: str) -> Backend:
-    import numpy as np
-    import torch
-
-    from efficientnerf.structures import torch_structures
-    from pipeline.errors import StageFailed
-
     def prepare(voxels: Voxels, sets: Mapping[str, np.ndarray]) -> tuple[Callable[[str], Any], Callable[[Any, str], None], Callable[[], None]]:
         coordinates, packed = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.packed.view(np.int64)).to(device)
         points = {what: torch.from_numpy(array).to(device) for what, array in sets.items()}
@@ -194,8 +184,6 @@ def _in_torch(device: str) -> Backend:
 
 
 def _brick_share(voxels: Voxels) -> float:
-    import numpy as np
-
     side = -(-voxels.side // 4)
     occupied = np.zeros((side, side, side), bool)
     occupied[tuple((voxels.coordinates >> 2).T)] = True
@@ -239,11 +227,6 @@ class _OtherLoad:
 
 def _machine(load: _OtherLoad) -> str:
     """Threads, caches, and memory bandwidth: random reads and sequential writes."""
-    import numpy as np
-
-    from efficientnerf.backends.numba.runtime import numba
-    from efficientnerf.structures.bits import fill, gather
-
     table = np.empty(1 << 27, np.uint64)
     where = np.random.default_rng(SEED).integers(0, len(table), 1 << 21, np.uint64)
     out = np.empty(len(where), np.uint64)

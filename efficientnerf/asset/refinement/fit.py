@@ -13,6 +13,7 @@ PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from types import ModuleType
 
 import numpy as np
 
@@ -24,6 +25,12 @@ from efficientnerf.asset.tree import NerfTree
 
 PATCH_SIDE = 4  # docs/experiments/tree-training-kernels.md
 WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measured the rays leave records
+
+
+def _device() -> ModuleType:
+    from efficientnerf.asset.refinement import device  # its kernels need Triton, which is there on CUDA alone
+
+    return device
 
 
 def optimise(
@@ -41,9 +48,7 @@ def optimise(
     rule                     what is minimised besides
     """
     if targets.on_device:
-        from efficientnerf.asset.refinement import device
-
-        yield from device.optimise(
+        yield from _device().optimise(
             state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
             patch_side=patch_side, rule=rule,
         )  # fmt: skip
@@ -59,9 +64,7 @@ def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
     bundles = (targets.draw(min(ERROR_RAYS, count - begin), rng, constant_background=True) for begin in range(0, count, ERROR_RAYS))
     if targets.on_device:
-        from efficientnerf.asset.refinement import device
-
-        return device.total_loss(tree, targets, bundles) / (3 * count)
+        return float(_device().total_loss(tree, targets, bundles)) / (3 * count)
     return host.total_loss(tree, bundles) / (3 * count)
 
 
@@ -75,9 +78,7 @@ def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progres
     chosen = np.sort(targets.host_pixels.choose(count, rng))
     bundles = _reported((targets.of(chosen[begin : begin + WEIGHT_RAYS]) for begin in range(0, count, WEIGHT_RAYS)), count, progress)
     if targets.on_device:
-        from efficientnerf.asset.refinement import device
-
-        return device.max_weights(tree, targets, bundles)
+        return _device().max_weights(tree, targets, bundles)
     return host.max_weights(tree, bundles)
 
 

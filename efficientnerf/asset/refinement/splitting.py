@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascade_tree, cascades_of, nested, voxel_cascades, voxels_around
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, nested, voxel_cascades, voxel_coordinates, voxels_around
 from efficientnerf.asset.refinement.state import RefinementState
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 
 _CORNERS = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
 PARENTS_PER_PIECE = 2**16

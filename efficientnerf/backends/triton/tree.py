@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,15 +19,13 @@ import triton
 from torch import Tensor
 
 from efficientnerf.asset.cascades import brick_ranges, cascades_of
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.leaps import leaps
 from efficientnerf.backends.transfer import constant, to_device
 from efficientnerf.backends.triton.launch import INTERPRETED
 from efficientnerf.backends.triton.tree_rendering import render
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 TILE = (32, 16) if INTERPRETED else (8, 4)  # pixels of a program
 BRICKS_PER_BLOCK = 2**14

@@ -12,21 +12,22 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
+from efficientnerf.asset.cascades import cascades_of, nested, subset, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.refinement.schedule import RefinementSchedule, count_splits, recorded_schedule
+from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from pipeline.files import atomic, exists, remove
 from pipeline.stage import Job
 from stages.bake.pruning import Pruned
 from stages.scratch import opened, unusable
 from stages.train.budget import schedule_state
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.refinement.state import RefinementState
-    from efficientnerf.asset.tree import NerfTree
 
 CHECKPOINT = "refinement.safetensors"
 
@@ -69,12 +70,6 @@ class Point:
 
 def save(job: Job, point: Point) -> None:
     """Replace the checkpoint."""
-    from safetensors.numpy import save_file
-
-    from efficientnerf.asset.cascades import voxel_cascades
-    from efficientnerf.asset.refinement.state import STATE
-    from efficientnerf.asset.tree import voxel_coordinates
-
     state = point.state
     state.fetch()
     tensors = {name: np.ascontiguousarray(getattr(state, name)) for name in STATE}
@@ -112,8 +107,6 @@ def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | N
     hold    of a phase whose number of steps follows from the time that they take; None: all of them are stated
     cells   of the error map
     """
-    from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
-
     path = job.work / CHECKPOINT
     if not exists(path):
         return None
@@ -136,8 +129,6 @@ def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | N
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """The tensors of a checkpoint; ValueError or OSError where it is not as it was written."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with opened(path), safe_open(str(path), framework="np") as file:
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
@@ -161,8 +152,6 @@ def _errors(found: Mapping[str, np.ndarray], step: int, cells: int) -> np.ndarra
 
 def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.ndarray) -> NerfTree:
     """The tree with the voxels `kept`, places of its own, alone, and their values."""
-    from efficientnerf.asset.cascades import subset
-
     keep = np.zeros(len(tree.density_values), bool)
     keep[kept] = True
     structure = subset(replace(tree, harmonics=tree.sh[:, :0]), keep)  # harmonics are most of the memory: none are copied
@@ -171,9 +160,6 @@ def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.n
 
 def _split_tree(tree: NerfTree, splits: int, found: Mapping[str, np.ndarray], density: np.ndarray, sh: np.ndarray) -> NerfTree:
     """A tree with the checkpoint's voxels on the grids of `tree`, which were split so often. ValueError where they are not in the order of a tree."""
-    from efficientnerf.asset.cascades import cascades_of, nested
-    from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
-
     at, of, finer = found["coordinates"], _cascades(found), 2**splits
     trees = []
     for n, cascade in enumerate(cascades_of(tree)):
@@ -242,9 +228,6 @@ def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) ->
 
 def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.ndarray:
     """Which voxels of the tree lie at coordinates (n, 3) of their cascades (n,); ValueError where one of them is not stored."""
-    from efficientnerf.asset.cascades import cascades_of, voxel_cascades
-    from efficientnerf.asset.tree import voxel_coordinates
-
     sizes = np.asarray([cascade.shape for cascade in cascades_of(tree)], np.int64) * tree.brick
     if (cascades >= len(sizes)).any() or (coordinates < 0).any() or (coordinates >= sizes[cascades]).any():
         raise ValueError("voxels outside of the grid")
@@ -266,7 +249,4 @@ def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.
 
 def ancestors(baked: NerfTree, tree: NerfTree, splits: int) -> np.ndarray:
     """(n,) the voxel of a baked tree that each voxel of `tree`, which was split so often, was or lies in."""
-    from efficientnerf.asset.cascades import voxel_cascades
-    from efficientnerf.asset.tree import voxel_coordinates
-
     return places(baked, voxel_coordinates(tree) >> splits, voxel_cascades(tree))

@@ -10,35 +10,42 @@ With bake.time_budget the number of steps of a phase follows from the time that 
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascades_of
+from efficientnerf.asset.field_samples import FieldSamples
+from efficientnerf.asset.refinement import fit, splitting
+from efficientnerf.asset.refinement.error_map import count_cells
+from efficientnerf.asset.refinement.rule import Rule
 from efficientnerf.asset.refinement.schedule import Phase, RefinementSchedule, count_splits, stated_schedule
+from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
+from efficientnerf.asset.refinement.targets import Targets
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import given
+from efficientnerf.training.patches import PatchGrid
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs
 from stages.bake import pruning
 from stages.bake.holes import find_holes
+from stages.bake.memory import free_on_device, needed_on_device
 from stages.bake.pruning import Pruned, most_children
 from stages.bake.refine import checkpoint
 from stages.bake.refine.checkpoint import Point
 from stages.bake.refine.log import RefinementLog
 from stages.bake.refine.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, packing_seconds, timed_schedule
+from stages.bake.settings import BakeSettings
 from stages.cores import count_cores
+from stages.io.scene import Scene
 from stages.train.budget import Budget
 from stages.train.log import draw_curve, psnr_of
 from stages.train.previews import Previews
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.field_samples import FieldSamples
-    from efficientnerf.asset.refinement.targets import Targets
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene
 
 CHECKPOINT_SECONDS = 30.0
 ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
@@ -117,9 +124,6 @@ class Refinement:
 
     def _take_steps(self) -> None:
         """Take the steps that are left of the phase, with checkpoints on the way and where it is stopped."""
-        from efficientnerf.asset.refinement import fit
-        from efficientnerf.asset.refinement.rule import Rule
-
         settings, point, state, job = self.job.settings, self.point, self.point.state, self.job
         begin, number = point.schedule.begin(point.phase), point.phase
         spent = point.seconds - point.began
@@ -172,8 +176,6 @@ class Refinement:
 
     def _prune(self, *, split: bool) -> None:
         """Drop voxels that do not show, and split the others."""
-        from efficientnerf.asset.refinement import splitting
-
         point, splits = self.point, count_splits(self.point.schedule.phases[: self.point.phase])
         baked = None if self.baked is None else self.baked.density_values[checkpoint.ancestors(self.baked, point.state.tree, splits)]
         most = most_children(self.room(splits + 1)) // 8 if split else self.room(splits)
@@ -190,10 +192,6 @@ def refined(
 
     samples  of the field, for whole scenes: what was dropped wrongly is restored by them
     """
-    from efficientnerf.asset.refinement import fit
-    from efficientnerf.asset.refinement.error_map import count_cells
-    from efficientnerf.training.patches import PatchGrid
-
     settings = job.settings
     splits = count_splits(phases)
     most = min(len(tree.density_values) * 4**splits, room(splits))
@@ -243,8 +241,6 @@ def _unrefined(taken: int, usual: int) -> str:
 
 def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, *, timed: bool, capped: bool) -> Point:
     """Where an earlier attempt stopped, or else the beginning."""
-    from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
-
     found = checkpoint.restored(job, tree, schedule, HOLD if timed else None, cells=cells)
     if found is None:
         return Point(initial_state(tree, MAX_INITIAL_THICKNESS if capped else math.inf), schedule)
@@ -254,16 +250,12 @@ def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwat
 
 def _without_harmonics(tree: NerfTree, *, capped: bool) -> NerfTree:
     """The tree with the densities that its refinement begins with, and without colours."""
-    from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
-
     bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
     return initial_state(bare, MAX_INITIAL_THICKNESS if capped else math.inf).tree
 
 
 def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
     """Renders of the tree as it is at the time."""
-    from efficientnerf.asset.rendering import render
-
     def seen(camera: Camera) -> np.ndarray:
         tree = replace(point.state.tree)  # what a renderer makes of values is kept with a tree, and these change
         return render(tree, camera, background=targets.background, normals=False).colour
@@ -273,8 +265,6 @@ def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
 
 def _publish(job: Job, log: RefinementLog) -> None:
     """The log, its curve and the previews."""
-    import shutil
-
     outputs = BakeOutputs(job.out)
     log.flush()
     shutil.copyfile(log.path, outputs.log)
@@ -295,9 +285,6 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets, splits: int = 
 
     splits, room  how often its voxels will be split, and how many there is room for then
     """
-    from efficientnerf.asset.cascades import cascades_of
-    from stages.bake.memory import free_on_device, needed_on_device
-
     cells = sum(cascade.brick_index.size for cascade in cascades_of(tree)) * 8**splits
     voxels = len(tree.density_values)
     if splits and room is not None:

@@ -14,10 +14,11 @@ from typing import Any
 
 from pipeline.errors import BadInput
 from pipeline.text import printable
+from stages.formats.importers.photographs import photographs
 from stages.formats.importers.source import ImportSettings, Source
 from stages.io.capture import Capture
 from stages.io.pictures import NOT_THE_FILES_FAULT
-from stages.video.reading import KNOWN, SUFFIXES
+from stages.video import KNOWN, SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -122,8 +123,6 @@ def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str
         raise BadInput(f"{folder}: a file; expected a folder of photographs or of a posed data set, or a video ({KNOWN}). Name the folder that holds it.")
     found = [name for name, importer in IMPORTERS.items() if importer.recognises(folder, allow_outside)]
     if not found:
-        from stages.formats.importers.photographs import photographs
-
         with one_line_errors(folder):
             photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
         found.append("photographs")

@@ -17,10 +17,10 @@ from efficientnerf.asset.cascades import (
     nested,
     subset,
     voxel_cascades,
+    voxel_coordinates,
     voxel_sides,
 )
 from efficientnerf.asset.rendering import render_reference
-from efficientnerf.asset.tree import voxel_coordinates
 from tests.efficientnerf.trees import random_cascades, rays_at, uniform_tree
 
 

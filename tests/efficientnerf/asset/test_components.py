@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
+from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.components import foreground_bricks, small_components
-from efficientnerf.asset.region import Region, foreground
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.region import foreground
+from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 
 SHAPE = (12, 12, 12)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.bake import chosen_voxels, spread_pixels, voxel_values
-from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, point_cascades, voxel_cascades, voxels_around
+from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, point_cascades, voxel_cascades, voxel_coordinates, voxels_around
 from efficientnerf.asset.components import unsupported_components
 from efficientnerf.asset.field_samples import (
     FieldSamples,
@@ -20,7 +20,7 @@ from efficientnerf.asset.field_samples import (
     surface_points,
 )
 from efficientnerf.asset.rendering import render_rays
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.model import Model
 from efficientnerf.rendering import environment
 from efficientnerf.training.pixels import Pixels

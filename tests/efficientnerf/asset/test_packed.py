@@ -122,8 +122,8 @@ def test_frequencies_have_the_sum_of_a_table_and_leave_out_nothing(counts: list[
 @pytest.mark.parametrize("each", [1, 7, 1000])
 def test_neighbours_are_those_one_step_back(each: int) -> None:
     """By a dense grid: across bricks, but not across slices or the edge of the grid."""
+    from efficientnerf.asset.cascades import voxel_coordinates
     from efficientnerf.asset.file.packed import _bricks_before, padded
-    from efficientnerf.asset.tree import voxel_coordinates
 
     tree = random_tree(2, brick=3)
     stored = tree.voxel_index >= 0

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import subset
+from efficientnerf.asset.cascades import subset, voxel_coordinates
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.host import in_voxels
@@ -17,7 +17,7 @@ from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.contributions import max_contributions
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid

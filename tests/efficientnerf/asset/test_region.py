@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascade_tree, cascades_of, check_cascades, voxel_cascades
-from efficientnerf.asset.region import Region, cropped, foreground, inside_distance, inside_share, voxel_centres
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, check_cascades, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.region import cropped, foreground, inside_distance, inside_share, voxel_centres
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.geometry.ndc import Ndc
 from tests.efficientnerf.trees import random_cascades, random_tree

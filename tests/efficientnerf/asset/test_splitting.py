@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascade_sides, cascades_of, voxel_cascades
+from efficientnerf.asset.cascades import cascade_sides, cascades_of, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.refinement.splitting import split, split_tree
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.rendering import render_rays
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
 

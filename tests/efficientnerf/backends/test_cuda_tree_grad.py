@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
+from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.refinement.error_map import ErrorMap
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.geometry.cameras import Camera

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.cascades import voxel_cascades, voxel_sides
+from efficientnerf.asset.cascades import voxel_cascades, voxel_coordinates, voxel_sides
 from efficientnerf.asset.refinement.state import RefinementState, initial_state
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import steps as host
 from efficientnerf.backends.numba.tree_training.cells import cells_of

@@ -8,8 +8,8 @@ import numba
 import numpy as np
 import pytest
 
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.queries import density_block
-from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcount, sigmoid, split16, trilinear4, unpack4
 from efficientnerf.backends.numba.tree import march
 from efficientnerf.backends.numba.tree.leaps import octant_leaps

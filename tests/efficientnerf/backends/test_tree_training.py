@@ -10,10 +10,10 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
+from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_coordinates, voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import initial_state
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels

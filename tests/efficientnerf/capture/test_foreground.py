@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region, inside_distance
+from efficientnerf.asset.region import inside_distance
+from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_foreground
 from efficientnerf.geometry.cameras import Camera, rays
 

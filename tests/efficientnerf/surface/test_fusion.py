@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.backends.numba.mesh.fusion import CONFIDENCE, FILLED, NEAREST, A, B, W, fit_planes, fuse
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.queries import density_at, distance_back

@@ -16,10 +16,11 @@ import torch
 
 from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.file import serialisation
 from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
 from efficientnerf.asset.rendering import render
-from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.rendering.compositing import activate
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.executors.memory import Limit
@@ -28,9 +29,8 @@ from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import memory, resolution
 from stages.bake import run as bake
 from stages.bake.refine import checkpoint, refinement
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.evaluate.views import ground_truth
-from stages.figures import plots
 from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from stages.train import run as train
@@ -54,7 +54,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baking, "POINTS_PER_BLOCK", 8192)
     monkeypatch.setattr(baking, "RAYS_PER_BLOCK", 512)
-    monkeypatch.setattr(plots, "curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:

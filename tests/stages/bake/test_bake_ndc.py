@@ -16,7 +16,7 @@ from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.pruning import NDC_RAYS_PER_VOXEL
 from stages.bake.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, budget_of, finest_resolution, ndc_pixel
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.io.field_file import load_renderer
 from stages.io.scene import load
 from stages.train import run as train

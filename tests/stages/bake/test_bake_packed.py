@@ -15,7 +15,7 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from stages.bake import economy
 from stages.bake.refine.timing import REFIT_STEPS
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from tests.efficientnerf.balls import BOUNDS, pixels
 
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import field_samples, format
-from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades
+from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.refinement import schedule
 from efficientnerf.asset.refinement.schedule import Phase
 from efficientnerf.asset.rendering import render
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training.exposure.model import exposure_of
@@ -27,9 +27,8 @@ from stages.artifacts import BakeOutputs, TrainOutputs
 from stages.bake import holes, pruning, resolution, whole_scene
 from stages.bake import run as bake
 from stages.bake.resolution import MAX_CELLS, MAX_MIB, budget_of, finest_of_cascades
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.framing.view_coverage import close_to_path
-from stages.io import field_file
 from stages.io.png import read_png, write_png
 from stages.io.scene import Scene, View, load, save
 from stages.train import averaged
@@ -57,7 +56,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(autouse=True)
 def field_in_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(field_file, "load_renderer", lambda folder, device="cpu": FieldRenderer(surroundings(), 0.2, 60.0))
+    monkeypatch.setattr("stages.bake.run.load_renderer", lambda folder, device="cpu": FieldRenderer(surroundings(), 0.2, 60.0))
     monkeypatch.setattr(field_samples, "RAYS_PER_BLOCK", 2048)
 
 
@@ -76,7 +75,7 @@ def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactor
     """The folder of a bake, and how often it could have been stopped."""
     folder, never = tmp_path_factory.mktemp("undisturbed"), StopAt()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(field_file, "load_renderer", lambda folder, device="cpu": FieldRenderer(surroundings(), 0.2, 60.0))
+        patch.setattr("stages.bake.run.load_renderer", lambda folder, device="cpu": FieldRenderer(surroundings(), 0.2, 60.0))
         patch.setattr(field_samples, "RAYS_PER_BLOCK", 2048)
         bake.run(job(folder, QUICK, stop=never, **inputs))
     return folder, never.count
@@ -106,7 +105,7 @@ def test_a_view_that_was_held_back_is_shown_whole_by_the_asset_alone(inputs: dic
 def test_a_size_that_the_environment_map_fills_is_refused_early(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(field_samples, "field_samples", lambda *_: pytest.fail("the field was rendered"))
+    monkeypatch.setattr("stages.bake.whole_scene.field_samples", lambda *_: pytest.fail("the field was rendered"))
     for changes, lower in (({"resolution": "auto"}, "lower "), ({}, r"lower bake\.resolution or ")):
         with pytest.raises(UsageError, match=rf"max_mib=5.*1024 rows.*{lower}bake\.environment_size"):
             baked(tmp_path, inputs, max_mib=5.0, environment_size=1024, **changes)

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.bake import Visibility, chosen_voxels, grid_of
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.refinement.state import initial_state
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import NdcSpace
 from pipeline.stage import Job
 from stages.bake import pruning
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.bake.voxels import FEW_VIEWS_RATIO, WELL_SEEN_VIEWS, by_views, seen_by_few
 from stages.framing.scene_bounds import in_view
 from stages.framing.view_coverage import count_views, shows

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import subset, voxel_cascades
+from efficientnerf.asset.cascades import subset, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state, subset_state
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import format
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.refinement import fit, schedule, splitting
 from efficientnerf.asset.refinement.schedule import Phase, stated_schedule
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs
 from stages.bake import pruning
@@ -24,8 +25,7 @@ from stages.bake import run as bake
 from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint, refinement
 from stages.bake.refine.checkpoint import Point
-from stages.bake.run import BakeSettings
-from stages.figures import plots
+from stages.bake.settings import BakeSettings
 from stages.train import run as train
 from tests.efficientnerf.balls import settings
 from tests.efficientnerf.trees import random_cascades, random_tree
@@ -51,7 +51,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(autouse=True)
 def split_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schedule, "PHASES", PHASES)
-    monkeypatch.setattr(plots, "curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:

@@ -22,8 +22,7 @@ from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.refine import refinement, timing
 from stages.bake.resolution import MAX_MIB, timed_budget
-from stages.bake.run import BakeSettings
-from stages.figures import plots
+from stages.bake.settings import BakeSettings
 from stages.train import run as train
 from stages.train.log import read_lines
 from tests.efficientnerf.balls import settings
@@ -61,7 +60,7 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         monkeypatch.setattr(module, "clock", lambda: time[0])
     monkeypatch.setattr(fit, "optimise", timed)
     monkeypatch.setattr(fit, "max_weights", weighed)
-    monkeypatch.setattr(plots, "curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
     return time
 
 

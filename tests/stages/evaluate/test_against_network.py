@@ -12,7 +12,6 @@ import pytest
 from efficientnerf.evaluation.metrics import psnr, ssim
 from stages.evaluate.views import ground_truth, subsample
 from stages.io.scene import View, load
-from stages.train import averaged
 from tests.fakes import WHITE, BallField, BallTree
 from tests.stages.evaluate.balls import TREE, figures_of, job_in, make_scene, measure, problems_of, settings
 
@@ -51,7 +50,7 @@ def test_renders_are_compared_as_the_camera_shows_them(tmp_path: Path, monkeypat
         return image * (1 - 0.5 * rows / view.camera.height).astype(np.float32)
 
     poses = make_scene(tmp_path / "poses", "t")
-    monkeypatch.setattr(averaged, "as_taken", lambda trained: darker_below)
+    monkeypatch.setattr("stages.evaluate.run.as_taken", lambda trained: darker_below)
     job = job_in(tmp_path, poses, settings(field_image_scale=0.34))
     measure(TREE, lambda: BallField(TREE, background=WHITE), job)
     found, view = figures_of(job), load(poses).views[0]

@@ -10,8 +10,8 @@ import torch
 
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
-from stages.evaluate.comparison import AGAINST_NETWORK, GAP, lpips_metrics
-from stages.evaluate.lpips_weights import BACKBONES, load_lpips
+from stages.evaluate.comparison import AGAINST_NETWORK, GAP, load_lpips, lpips_metrics
+from stages.evaluate.lpips_weights import BACKBONES
 from stages.evaluate.mesh import FIGURES
 from stages.evaluate.summary import summary
 from stages.evaluate.views import GroundTruth

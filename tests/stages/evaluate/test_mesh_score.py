@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import region
-from efficientnerf.asset.region import Region
 from efficientnerf.asset.rendering import Rendering
+from efficientnerf.asset.tree import Region
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.surface.mesh import Texture
 from stages.evaluate.mesh import EvaluatedMesh, evaluated_mesh, mesh_image

@@ -22,7 +22,7 @@ from stages.formats.importers.description import describe_source
 from stages.formats.importers.source import walk
 from stages.io import pictures, scene
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 from tests.stages.captures import Settings
 

@@ -12,9 +12,8 @@ import av
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region
 from efficientnerf.asset.rendering import MOST_PIXELS
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput
 from stages.figures.frames import RenderOptions, render_path

@@ -268,7 +268,7 @@ DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 def real(name: str, form: str) -> Capture:
     from stages.formats.importers import IMPORTERS
-    from stages.poses.run import PosesSettings
+    from stages.poses.settings import PosesSettings
 
     if not (DATA / name).is_dir():
         pytest.skip(f"shared/data/{name} is not there")

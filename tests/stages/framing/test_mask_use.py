@@ -19,7 +19,7 @@ from stages.io import scene, working_images
 from stages.io.capture import Capture, Photo, Silhouettes
 from stages.io.scene import Scene
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH
 
@@ -264,7 +264,7 @@ def test_features_outside_of_silhouettes(
 ) -> None:
     """They count where the background moves with the object, and not where the silhouettes contradict what they tell, nor for other masks."""
     find = Found(*right)
-    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find)
+    monkeypatch.setattr("stages.masking.photographs.find_cameras", find)
     made, said, _ = run(photographs_with(tmp_path / "source", draw, turned=turned), tmp_path)
     assert find.asked == asked
     if draw is off_centre:

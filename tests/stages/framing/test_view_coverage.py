@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from efficientnerf.asset import format
-from efficientnerf.asset.cascades import cascades_of, voxel_cascades
-from efficientnerf.asset.tree import voxel_coordinates
+from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates
 from efficientnerf.geometry.cameras import Camera, project, rays
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays

@@ -114,7 +114,7 @@ def test_a_small_file_takes_no_memory_for_the_tables_that_it_states(tmp_path: Pa
     def refuse(*_: Any) -> None:
         raise AssertionError("a model of three gigabytes was made")
 
-    monkeypatch.setattr("efficientnerf.model.model", refuse)
+    monkeypatch.setattr("stages.io.field_file.model", refuse)
     stated = dataclasses.asdict(TrainSettings(field="hash", num_levels=24, log2_hashmap_size=24, finest_resolution=8192))
     about = {"settings": stated, "bounds": [[-1, -1, -1], [1, 1, 1]], "contracted": False, "near": 1.0, "far": 5.0, "background": None}
     side = stated["occupancy_resolution"] if isinstance(stated["occupancy_resolution"], int) else 128

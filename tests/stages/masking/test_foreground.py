@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region
+from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import Foreground
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import BadInput
 from pipeline.stage import Job
-from stages.framing import mask_use
 from stages.io import scene
 from stages.masking import foreground
 from stages.masking.foreground import cleaned
 from stages.masking.subject import Subject, may_show, subject_of
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 
 RADIUS = 0.6
@@ -157,7 +156,7 @@ def test_masks_are_made_once_and_the_same_bytes_come_of_them_again(source: Path,
 def test_a_photograph_whose_silhouette_does_not_fit_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = captures.cameras(12)
     seen(monkeypatch, ball_pictures(made))
-    monkeypatch.setattr(mask_use, "hull_overlaps", lambda capture, pictures: np.array([0.95] * 5 + [0.6] + [0.95] * 6))
+    monkeypatch.setattr("stages.masking.foreground.hull_overlaps", lambda capture, pictures: np.array([0.95] * 5 + [0.6] + [0.95] * 6))
     events: list[dict[str, Any]] = []
     job = Job(
         settings=PosesSettings(mask_from="foreground"), out=tmp_path / "poses", work=tmp_path / "work", source=captures.nerfstudio(tmp_path / "source", made),

@@ -19,7 +19,7 @@ from stages.io.capture import Capture, Photo
 from stages.io.photo import read_mask_file, read_photo
 from stages.masking import photographs
 from stages.masking.polarity import kept_white
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 
 W, H = 96, 72

@@ -13,7 +13,7 @@ from pipeline.errors import BadInput, UsageError
 from stages.io.png import read_png, write_png
 from stages.masking.made import masks_by_network
 from stages.masking.photographs import mask_choice
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 
 onnx = pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")

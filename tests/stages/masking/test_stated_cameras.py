@@ -16,7 +16,7 @@ from stages.formats.importers.photographs import photographs
 from stages.formats.importers.source import Source
 from stages.io.capture import Capture
 from stages.masking.photographs import _in_known_frame
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures, exports
 
 AWAY = Similarity(0.2, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([4.0, 1, -3]))

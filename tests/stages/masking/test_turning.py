@@ -17,7 +17,8 @@ from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo
 from stages.io.png import write_png
 from stages.masking.photographs import _of_turning_subject, mask_choice
 from stages.masking.turning import border_stands_still, masks_of_turning_subject
-from stages.poses.run import PosesSettings, read
+from stages.poses.run import read
+from stages.poses.settings import PosesSettings
 from stages.verdict.verdict import verdict_on
 from tests.stages import turntables
 
@@ -100,7 +101,7 @@ def test_few_photographs_by_the_subject_alone_leave_no_others_out(
 ) -> None:
     """Photographs with a camera, share of the matches that agree, and the angle between the first and the last camera's view."""
     paths = {f"{n:02d}.png": tmp_path / f"{n:02d}.png" for n in range(20)}
-    monkeypatch.setattr("stages.masking.turning.masks_of_turning_subject", lambda *_, **__: paths)
+    monkeypatch.setattr("stages.masking.photographs.masks_of_turning_subject", lambda *_, **__: paths)
     searched = []
 
     def find(name: str, masks: Mapping[str, Path | None]) -> Capture:

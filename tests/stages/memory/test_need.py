@@ -14,23 +14,23 @@ from pipeline.errors import UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, TrainOutputs
-from stages.bake import run as bake
-from stages.bake.run import BakeSettings
-from stages.evaluate import run as evaluate
-from stages.evaluate.run import EvaluateSettings
+from stages.bake import settings as bake
+from stages.bake.settings import BakeSettings
+from stages.evaluate import settings as evaluate
+from stages.evaluate.settings import EvaluateSettings
 from stages.memory.need import Need, refuse_what_does_not_fit
-from stages.mesh import run as mesh
-from stages.mesh.run import MeshSettings
-from stages.points import run as points
-from stages.points.run import PointsSettings
+from stages.mesh import settings as mesh
+from stages.mesh.settings import MeshSettings
+from stages.points import settings as points
+from stages.points.settings import PointsSettings
 from stages.poses.memory import feature_threads, features_needed
-from stages.poses.run import PosesSettings
 from stages.poses.run import run as run_poses
-from stages.splats import run as splats
-from stages.splats.run import SplatsSettings
-from stages.train import run as train
-from stages.turntable import run as turntable
-from stages.turntable.run import TurntableSettings
+from stages.poses.settings import PosesSettings
+from stages.splats import settings as splats
+from stages.splats.settings import SplatsSettings
+from stages.train import settings as train
+from stages.turntable import settings as turntable
+from stages.turntable.settings import TurntableSettings
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
 
@@ -43,9 +43,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A ball, trained and baked."""
     folder = tmp_path_factory.mktemp("memory")
     scene = poses(folder / "poses")
-    train.run(job(folder / "train", settings(**QUICK), poses=scene))
+    train.STAGE.run(job(folder / "train", settings(**QUICK), poses=scene))
     inputs = {"poses": scene, "train": folder / "train/out"}
-    bake.run(job(folder / "bake", BakeSettings(resolution=16, samples_per_voxel=1, refine_steps=1, weight_threshold=0.0), **inputs))
+    bake.STAGE.run(job(folder / "bake", BakeSettings(resolution=16, samples_per_voxel=1, refine_steps=1, weight_threshold=0.0), **inputs))
     return {**inputs, "bake": folder / "bake/out", "mesh": folder / "none", "splats": folder / "none"}  # refused before a mesh is looked at
 
 
@@ -69,10 +69,10 @@ def test_a_need_that_fits_is_recorded_and_one_that_does_not_is_refused(tmp_path:
 
 def test_training_pixels_that_do_not_fit_go_to_a_file(made: dict[str, Path], tmp_path: Path) -> None:
     first = job(tmp_path / "first", settings(**QUICK), poses=made["poses"])
-    train.run(first)
+    train.STAGE.run(first)
     events: list[dict[str, Any]] = []
     short = limited(job(tmp_path / "short", settings(**QUICK), poses=made["poses"]), first.facts["memory"]["needed"] - 1, events)
-    train.run(short)
+    train.STAGE.run(short)
     assert sum("kept in a file" in event.get("text", "") for event in events) == 1
     assert short.facts["memory"]["needed"] < first.facts["memory"]["needed"]
     digests = [hashlib.sha256((each.out / TrainOutputs.field).read_bytes()).hexdigest() for each in (first, short)]
@@ -89,7 +89,7 @@ def test_training_pixels_that_do_not_fit_go_to_a_file(made: dict[str, Path], tmp
 def test_training_that_does_not_fit_is_refused_before_it_begins(made: dict[str, Path], tmp_path: Path, change: dict[str, Any], remedy: str) -> None:
     large = limited(job(tmp_path, settings(**{**QUICK, **change}), poses=made["poses"]), 2 * GIB)
     with pytest.raises(UsageError) as caught:
-        train.run(large)
+        train.STAGE.run(large)
     assert remedy in str(caught.value)
     assert not list(large.out.iterdir())
 
@@ -109,7 +109,7 @@ def test_later_stages_are_refused_before_they_begin(made: dict[str, Path], tmp_p
     inputs = {need: made[need] for need in stage.STAGE.needs}
     short = limited(job(tmp_path, wanted, **inputs), 2**28 if small else 2 * GIB)
     with pytest.raises(UsageError) as caught:
-        stage.run(short)
+        stage.STAGE.run(short)
     assert remedy in str(caught.value)
     assert not list(short.out.iterdir())
 
@@ -117,7 +117,7 @@ def test_later_stages_are_refused_before_they_begin(made: dict[str, Path], tmp_p
 def test_a_bake_is_refused_where_not_even_its_images_fit(made: dict[str, Path], tmp_path: Path) -> None:
     short = limited(job(tmp_path, BakeSettings(resolution=16), poses=made["poses"], train=made["train"]), 2**28)
     with pytest.raises(UsageError, match=r"bake\.visibility_rays"):
-        bake.run(short)
+        bake.STAGE.run(short)
     assert not (short.out / BakeOutputs.asset).exists()
     assert not list(short.work.iterdir())
 

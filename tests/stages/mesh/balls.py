@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.asset import format
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.asset.tree import Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Similarity
 
 # The capture lies on its side (y down), is four times as large as the training frame and somewhere else.

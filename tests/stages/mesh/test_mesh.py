@@ -22,7 +22,7 @@ from stages.io.png import write_png
 from stages.io.scene import Orbit, Scene, View, load, save
 from stages.mesh import run as stage
 from stages.mesh.files import read_mesh
-from stages.mesh.run import MeshSettings
+from stages.mesh.settings import STAGE, MeshSettings
 from stages.mesh.texture import textured
 from tests.stages.mesh.balls import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 
@@ -110,7 +110,7 @@ def test_the_same_asset_gives_the_same_bytes(ball: Path, photographed: Path, tmp
     for name in ("a", "b"):
         stage.run(Job(settings=MeshSettings(max_faces=1000), inputs=inputs(ball, photographed), out=tmp_path / name, work=tmp_path / "work"))
     for file in (tmp_path / "a").iterdir():
-        assert file.name in stage.STAGE.volatile or file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
+        assert file.name in STAGE.volatile or file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
 
 
 def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, photographed: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.stage import Job
 from stages.points import run as points
-from stages.points.run import PointsSettings
+from stages.points.settings import PointsSettings
 from tests.stages.mesh.balls import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 
 

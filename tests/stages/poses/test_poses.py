@@ -18,7 +18,8 @@ from stages.io import scene
 from stages.io.capture import Capture, Photo
 from stages.io.scene import Scene
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings, assign_splits
+from stages.poses.run import assign_splits
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS
 
@@ -225,7 +226,7 @@ def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest
         options["warn"]("one was not registered")
         return Capture(kind="photographs", photos=found, background=None, rejected=(("img_5.png", "overlaps no other"),), warnings=("one was not registered",))
 
-    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find_cameras)
+    monkeypatch.setattr("stages.masking.photographs.find_cameras", find_cameras)
     whole, warnings = run(source, tmp_path / "a", max_features=1000, matching="sequential", feature_image_size=800, seed=3)
     assert (asked["features"], asked["matching"], asked["max_side"], asked["seed"]) == (1000, "sequential", 800, 3)
     assert [*asked["names"]] == [camera.name for camera in made]

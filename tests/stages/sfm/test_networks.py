@@ -14,7 +14,7 @@ from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.masking.photographs import cameras_of_photographs
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.sfm import ladder, matches
 from stages.sfm.database import FEATURES, forget
 from stages.sfm.learned.matches import NEIGHBOURS, pairs_of

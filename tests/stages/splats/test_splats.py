@@ -25,7 +25,8 @@ from stages.io.png import read_png
 from stages.io.scene import load as load_scene
 from stages.splats import run as splats
 from stages.splats.pictures import LONGER_SIDE, photographs, render_cameras, renders
-from stages.splats.run import SplatsSettings, budget_of, gaussians_of
+from stages.splats.run import budget_of, gaussians_of
+from stages.splats.settings import SplatsSettings
 from stages.train import averaged
 from tests.efficientnerf.balls import BOUNDS, CENTRE, RADIUS, cameras, picture
 from tests.stages.balls import ORBIT, SIMILARITY, poses

@@ -46,8 +46,8 @@ def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
             yield done
 
     monkeypatch.setattr(train, "clock", lambda: now[0])
-    monkeypatch.setattr(loop, "train", timed)
-    monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.checks.wrong_views.train", timed)
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def report(made: Job) -> dict[str, Any]:

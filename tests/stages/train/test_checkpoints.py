@@ -28,7 +28,7 @@ Tensors, About = dict[str, torch.Tensor], dict[str, Any]
 
 @pytest.fixture(autouse=True)
 def no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
     folder = tmp_path_factory.mktemp("stopped")
     scene = poses(folder / "poses")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+        patch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
         whole = run(folder / "whole", scene)[0]
         with pytest.raises(Interrupted):
             train.run(job(folder / "cut", settings(**QUICK), poses=scene, stop=StopAt(6)))

@@ -37,7 +37,7 @@ QUICK = {"iterations": STEPS, "checkpoint_every": 15}
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(early_check, "MIN_STEP", LOOKED)
     monkeypatch.setattr(second_chances, "SMALL", settings(iterations=LOOKED))
-    monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def ball(folder: Path, change: Callable[[View, Path], View] = lambda view, folder: view, **options: Any) -> Path:

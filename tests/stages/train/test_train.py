@@ -22,7 +22,7 @@ from stages.io.capture import SparsePoints
 from stages.io.field_file import load_exposure, load_renderer
 from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.train import data
 from stages.train import run as train
 from stages.train.averaged import as_taken
@@ -45,7 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_curve(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Drawing the curve takes longer than this little training; one test wants it."""
     if "curve" not in request.node.name:
-        monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+        monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:

@@ -18,7 +18,8 @@ from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages.framing.camera_paths import turntable_cameras
 from stages.io.png import read_png
-from stages.turntable.run import STAGE, TurntableSettings, render_turntable
+from stages.turntable.run import render_turntable
+from stages.turntable.settings import STAGE, TurntableSettings
 from tests.fakes import BallTree
 from tests.stages.spoilers import SPOILERS
 
@@ -106,8 +107,7 @@ def test_the_stage_reads_an_asset_file(tmp_path: Path) -> None:
 
 
 def test_the_foreground_is_shown_unless_all_is_asked_for_and_framed_in_both(tmp_path: Path) -> None:
-    from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import tree_from_voxels
+    from efficientnerf.asset.tree import Region, tree_from_voxels
 
     indices = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), -1).reshape(-1, 3)
     tree = tree_from_voxels((4, 4, 4), 0.125, np.full(3, -1.0), indices, np.full(len(indices), 400.0), np.zeros((len(indices), 1, 3)))

@@ -12,7 +12,7 @@ from PIL import Image
 from pipeline.errors import BadInput
 from stages.formats.importers import IMPORTERS
 from stages.io.photo import read_photo
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.sfm import matches
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, open_database

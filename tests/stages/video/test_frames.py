@@ -17,7 +17,7 @@ from pipeline.stage import Job
 from stages.formats.importers import candidates, files
 from stages.io.material import find_material, photographs_of, with_frames
 from stages.io.photo import read_photo
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.sfm.images import prepare_images
 from stages.video.frames import Chosen, Reader, frames_of, look
 from stages.video.reading import opened

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from tests.workflows.toys import TOYS
-from workflows.asset import Workflow
 from workflows.cli.main import main
+from workflows.workflow import Workflow
 
 
 def attach(number: int, how: str, kept: BinaryIO) -> None:

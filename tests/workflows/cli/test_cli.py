@@ -14,7 +14,6 @@ import pytest
 
 from pipeline.run import Run
 from tests.workflows.command import Enerf, Result
-from workflows.report import summary
 from workflows.report.documents import ResultVerdict
 
 
@@ -247,9 +246,9 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path, number: i
 
 def test_a_second_ctrl_c_at_the_end_prints_no_traceback(tmp_path: Path) -> None:
     program = (
-        "import atexit, os, signal, sys, time; from workflows.cli import main, state\n"
+        "import atexit, os, signal, sys, time; from workflows.cli import main, status\n"
         "def interrupted(*_, **__): raise KeyboardInterrupt\n"
-        "state.status.callback = interrupted\n"
+        "status.status.callback = interrupted\n"
         "atexit.register(lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(5)))\n"
         f"sys.argv[1:] = ['status', {str(tmp_path)!r}]; sys.exit(main.main())"
     )
@@ -265,7 +264,7 @@ def test_a_second_ctrl_c_at_the_end_prints_no_traceback(tmp_path: Path) -> None:
 def test_a_bad_result_is_an_exit_code_where_it_is_asked_for(
     enerf: Enerf, toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grade: str | None, fail_on: str | None, code: int
 ) -> None:
-    monkeypatch.setattr(summary, "graded", lambda run, outcomes: None if grade is None else ResultVerdict(grade, f"Result: {grade}."))
+    monkeypatch.setattr("workflows.cli.run.graded", lambda run, outcomes: None if grade is None else ResultVerdict(grade, f"Result: {grade}."))
     found = enerf("run", toys, "--out", tmp_path / "run", "--json", *([] if fail_on is None else ["--fail-on", fail_on]))
     assert (found.code, found.objects[-1]["exit_code"], found.objects[-1]["ok"]) == (code, code, code == 0)
     assert (tmp_path / "run/points/points.ply").is_file()

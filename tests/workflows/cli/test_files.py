@@ -16,21 +16,20 @@ from PIL import Image
 
 from efficientnerf.asset import format, region
 from efficientnerf.asset.cascades import cascade_grids, nested
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
 from stages.formats.exporters.splats.ply import read_splats
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
-from stages.mesh.run import MeshSettings
-from stages.turntable.run import TurntableSettings
+from stages.mesh.settings import MeshSettings
+from stages.turntable.settings import TurntableSettings
 from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
 from workflows.cli.files import EXR, REGIONS, TEXTURES
-from workflows.cli.main import enerf as enerf_commands
+from workflows.cli.main import COMMANDS
 from workflows.exporting import faces_from_text
 
 Enerf = Callable[..., Result]
@@ -108,7 +107,7 @@ def test_the_list_names_every_format(enerf: Enerf) -> None:
     others = {".json", ".html", ".png", ".exr", ".mp4", ".nerftree"}
     assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *SPLAT_EXPORTERS, *VOLUME_EXPORTERS, *others}
     assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
-    assert all(row["command"].split()[1] in enerf_commands.commands for row in rows)
+    assert all(row["command"].split()[1] in COMMANDS for row in rows)
     listed = enerf("export", "--list").out
     assert all(row["command"] in listed for row in rows)
     assert all(listed.count(f"pip install 'efficientnerf[{extra}]'") == 2 for extra in ("usd", "las"))

@@ -15,8 +15,9 @@ from pipeline.errors import UsageError
 from pipeline.executors.dask import DaskWorkers
 from pipeline.fleet.state import check_scenes
 from workflows.asset import WORKFLOW
-from workflows.cli.main import enerf
 from workflows.cli.resolve import read_toml
+from workflows.cli.run import run as run_command
+from workflows.fleet.command import fleet
 from workflows.fleet.manifest import read_manifest
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -49,7 +50,7 @@ def test_scripts_are_shell_and_their_options_exist(name: str) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     (call,) = re.findall(r"^(?:exec )?enerf fleet (.*)$", (EXAMPLES / name).read_text(encoding="utf-8"), re.MULTILINE)
     words = shlex.split(call)
-    run = enerf.commands["fleet"].commands["run"]  # type: ignore[attr-defined]
+    run = fleet.commands["run"]
     options = {option for parameter in run.params for option in parameter.opts}
     assert {word for word in words if word.startswith("--")} <= options
     for word in words:
@@ -98,5 +99,5 @@ def test_snakemake_finds_the_jobs(tmp_path: Path) -> None:
         "../still_life --out runs/still-life --preset preview --seed 0 --budget 4m --quiet",
         "../still_life --out runs/still-life-small --preset preview --seed 0 --budget 2m --set bake.max_mib=8 --quiet",
     ]
-    options = {option for parameter in enerf.commands["run"].params for option in parameter.opts}
+    options = {option for parameter in run_command.params for option in parameter.opts}
     assert set(re.findall(r"--[a-z-]+", " ".join(calls))) <= options

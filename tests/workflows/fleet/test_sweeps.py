@@ -13,9 +13,10 @@ from pipeline.fleet.state import MOST_SCENES, Scene, check_scenes
 from pipeline.runner import run_stages, verify
 from pipeline.sharing import take_over
 from tests.workflows.toys import TOYS
-from workflows.asset import STAGES, WORKFLOW, Workflow
+from workflows.asset import STAGES, WORKFLOW
 from workflows.cli.request import Options, plan_run
 from workflows.fleet.sweeps import Sweep, read_sweeps, shared, split_values, swept, unswept
+from workflows.workflow import Workflow
 
 CHAIR, TABLE = Scene("chair", ("/chair",)), Scene("table", ("/table",))
 

@@ -12,7 +12,6 @@ import pytest
 from efficientnerf.asset.format import save
 from pipeline.run import Run
 from stages.io.pictures import opened
-from stages.viewer import page as viewer_page
 from stages.viewer.captured import PHOTOGRAPHS, SIDE, captured_views, photograph
 from tests.efficientnerf.trees import random_tree
 from tests.stages.balls import poses
@@ -62,7 +61,7 @@ def test_there_is_no_page_of_no_asset_a_damaged_one_or_one_too_large(run: Run, m
     asset = run.path / "bake/asset.nerftree"
     assert write_run_viewer(run) is not None
     with monkeypatch.context() as patch:
-        patch.setattr(viewer_page, "LARGEST", 100)
+        patch.setattr("workflows.report.viewer.LARGEST", 100)
         assert write_run_viewer(run, anew=True) is None
     assert not (run.path / "viewer.html").exists()
     assert write_run_viewer(run) is not None

@@ -16,7 +16,8 @@ from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs
-from stages.viewer.page import policy_hash, script_text
+from stages.viewer.html import policy_hash
+from stages.viewer.page import script_text
 from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
 from workflows.asset import STAGES
 from workflows.cli.main import main

@@ -149,7 +149,7 @@ def test_a_run_is_served_until_a_signal(enerf: Enerf, run: Path, opened: list[st
         yield asked
 
     monkeypatch.setattr(serving, "stopping", stopping)
-    monkeypatch.setattr("workflows.cli.output.write_json", lambda value, **_: urls.append(value["url"]) if "url" in value else None)
+    monkeypatch.setattr("workflows.cli.assets.write_json", lambda value, **_: urls.append(value["url"]) if "url" in value else None)
     assert enerf("view", run, "--serve", 0, "--json", *more).code == 0
     assert b"/live.js" in answers[""]
     assert json.loads(answers["status.json"])["name"] == "run"

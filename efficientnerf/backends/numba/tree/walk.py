@@ -8,16 +8,14 @@ Coordinates of rays are in voxels of the tree's own grid, cascade 0. N stored vo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.leaps import leaps
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 
 class TreeGrid(NamedTuple):

@@ -9,6 +9,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
 from efficientnerf.backends.numba.simd import float32x4, float32x16, float32x32, multiply_add
@@ -20,8 +21,6 @@ _I16, _I32, _I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
 
 def _converts() -> bool:
     """Whether code is compiled for a processor that has half floats."""
-    from numba.core.registry import cpu_target
-
     triple, _, features = cpu_target.target_context.codegen().magic_tuple()
     return triple.startswith(("aarch64", "arm64")) or "+f16c" in features.split(",")
 

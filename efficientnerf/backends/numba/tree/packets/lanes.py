@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
-from efficientnerf.backends.numba.simd import broadcast_like, float32x16, float32x32, splat, store
+from efficientnerf.backends.numba.simd import _constant, _exp2, broadcast_like, float32x16, float32x32, splat, store
 
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 
@@ -356,8 +356,6 @@ def _broadcast_like(value, other):  # type: ignore[no-untyped-def]
 @intrinsic
 def exp2_neg_lanes(typing_context: Any, value: Any) -> Any:
     """2^-x of float32 x >= 0: `simd.exp2_neg4`."""
-    from efficientnerf.backends.numba.simd import _constant, _exp2
-
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bound = _constant(_vector(value), 126)
         return _exp2(builder, builder.select(builder.fcmp_ordered(">", args[0], bound), bound, args[0]), 127)

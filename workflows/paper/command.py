@@ -6,10 +6,15 @@ from pathlib import Path
 
 import click
 
+from workflows.cli.device import resolve_device
 from workflows.cli.options import common_options, device_option, folder_type, json_option, quiet_option
+from workflows.cli.output import closing, write_json
+from workflows.cli.progress import display
+from workflows.destination import check_folder
+from workflows.paper.document import Request, make
 
 
-@click.command(short_help="Reproduce a table of the paper, with its figures beside ours.")
+@click.command()
 @click.argument("table", metavar="TABLE")
 @click.option("--data", type=folder_type, metavar="DIR", help="A data set, or a folder of data sets (table 7 needs none).")
 @click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder of the table and its runs, which are resumed.")
@@ -23,12 +28,6 @@ def paper(table: str, data: Path | None, out: Path, scale: float, device: str | 
     """Reproduce TABLE of the paper: 1 shares of samples, 2 quality and speed, 3 N1 to N4, 4 sizes of the networks, 5 modules one by one, 6 sampling
     strategies, 7 NerfTree against other structures. Writes DIR/table_N.md, .json and, where something is trained, .png.
     """
-    from workflows.cli.device import resolve_device
-    from workflows.cli.output import closing, write_json
-    from workflows.cli.progress import display
-    from workflows.destination import check_folder
-    from workflows.paper.document import Request, make
-
     check_folder(out)
     with display(as_json=as_json, quiet=quiet) as show:
         say = lambda text: show({"event": "message", "text": text})  # noqa: E731
