@@ -23,7 +23,7 @@ ALLOWED = {
     "stages": {"stages", "pipeline", "efficientnerf"},
     "workflows": set(OURS),
 }
-KERNELS = ("efficientnerf/backends/numba", "efficientnerf/backends/triton", "efficientnerf/structures")  # compiled code, and what launches it
+KERNELS = ("efficientnerf/backends/numba", "efficientnerf/backends/triton", "workflows/paper/structures")  # compiled code, and what launches it
 MODULES_A_FOLDER, LINES, ARGUMENTS = 15, 60, 12
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
 DOOR = (

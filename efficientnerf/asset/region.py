@@ -15,8 +15,6 @@ from efficientnerf.asset.cascades import brick_ranges, cascades_of, subset, voxe
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Similarity
 
-REGIONS = ("foreground", "all")
-
 
 def inside_distance(region: Region, points: np.ndarray) -> np.ndarray:
     """(N,) how far points (N, 3) of the tree's frame lie inside of the region's sides; negative outside."""

@@ -52,7 +52,7 @@ def captured_path(poses: Sequence[np.ndarray], frames: int) -> list[np.ndarray]:
         return [_poses(rows[:1], given)[0]] * frames
     ends = rows[-1] * _sign(rows[0], rows[-1])
     closed = len(rows) > 3 and bool(np.linalg.norm(ends - rows[0]) <= CLOSES * steps.mean())
-    keys = _thinned(_smoothed(rows, closed), closed)
+    keys = _thinned(_smoothed(rows, closed))
     curve = _spline(keys, closed)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], frames + 1)[:-1] if closed else np.linspace(0.0, along[-1], frames)
@@ -160,7 +160,7 @@ def _smoothed(rows: np.ndarray, closed: bool) -> np.ndarray:
     return out
 
 
-def _thinned(rows: np.ndarray, closed: bool) -> np.ndarray:
+def _thinned(rows: np.ndarray) -> np.ndarray:
     """MAX_KEYS of the rows at most, at even distances along the way."""
     if len(rows) <= MAX_KEYS:
         return rows

@@ -151,7 +151,7 @@ def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """
     for _ in range(8):
         distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-        faces = faces[distinct & ~_folded(faces, len(vertices))]
+        faces = faces[distinct & ~_folded(faces)]
         corners = vertices[faces]  # (F, 3, 3)
         length = np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=2)  # (F, 3) of the edge from each corner to the next
         flat = np.linalg.norm(face_vectors(vertices, faces), axis=1) <= 1e-10 * length.max(1) ** 2
@@ -170,7 +170,7 @@ def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return compact(vertices, faces)
 
 
-def _folded(faces: np.ndarray, count: int) -> np.ndarray:
+def _folded(faces: np.ndarray) -> np.ndarray:
     """(F,) faces that cancel with another face on the same three vertices, in pairs."""
     ordered = np.sort(faces, 1)
     _, group = np.unique(ordered, axis=0, return_inverse=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.mesh.rasterise import rasterise, row_spans
 from efficientnerf.backends.pieces import pieces
-from efficientnerf.geometry.cameras import Camera, project, rays
+from efficientnerf.geometry.cameras import Camera, project
 
 BANDS = 16  # of rows, that threads share
 FIRST = 4096  # faces in the first piece
@@ -47,11 +47,3 @@ def mesh_image(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> MeshI
         rasterise(pixels, depth, faces, rows, part.start, part.stop, min(BANDS, camera.height), near, shown)
     with np.errstate(divide="ignore"):
         return MeshImage(shown, np.where(shown >= 0, np.float32(1) / near, np.float32(np.inf)).astype(np.float32))
-
-
-def shown_points(image: MeshImage, camera: Camera) -> np.ndarray:
-    """(M, 3) float64 world points of the pixels that show a face, row by row."""
-    hit = image.covered
-    y, x = np.nonzero(hit)
-    origins, directions = rays(camera, np.stack([x, y], -1) + 0.5)
-    return np.asarray(origins + (image.depth[hit] / (directions @ camera.forward))[:, None] * directions)

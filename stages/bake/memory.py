@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 
 from efficientnerf.asset.bake import grid_of
 from efficientnerf.asset.file.serialisation import bytes_per_voxel, most_voxels
-from efficientnerf.asset.refinement import schedule
 from efficientnerf.asset.refinement.error_map import MAX_CELLS
 from efficientnerf.asset.refinement.fit import PATCH_SIDE
+from efficientnerf.model import Model
 from efficientnerf.settings import given
-from efficientnerf.training.pixels import PixelRows
+from efficientnerf.training.pixels import PixelRows, Pixels
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
 from stages.artifacts import BakeInputs
 from stages.bake.plan import Plan
-from stages.bake.pruning import most_children
 from stages.bake.resolution import MAX_CASCADES, size_limits
 from stages.bake.resolution import MAX_CELLS as MAX_COARSE_CELLS
 from stages.bake.settings import BakeSettings
@@ -67,7 +65,7 @@ def free_on_device(device: str) -> int:
 
 
 def needed(
-    settings: BakeSettings, m: Any, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, whole: bool, device: str
+    settings: BakeSettings, m: Model, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, whole: bool, device: str
 ) -> Need:
     """What baking a model takes.
 
@@ -91,13 +89,13 @@ def needed(
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     settings, channels = job.settings, channels_of(job.inputs["poses"], views)
-    finest, voxels, at_most = most_needed(settings, m, s, views, channels, mib, splits, whole, job.device)
+    finest, voxels, at_most = most_needed(settings, m, s, views, channels, mib, whole, job.device)
     stored = not has_room(job, at_most(voxels, stored=False))
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
@@ -108,12 +106,11 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: fl
 
 
 def most_needed(
-    settings: BakeSettings, m: Any, s: Scene, views: Sequence[View], channels: int, mib: float, splits: int, whole: bool, device: str
+    settings: BakeSettings, m: Model, s: Scene, views: Sequence[View], channels: int, mib: float, whole: bool, device: str
 ) -> tuple[int, int, Callable[..., Need]]:
     """What baking a model takes at most, before its voxels are counted.
 
     mib      that the asset may have
-    splits   how often voxels will be split
     returns  voxels along the finest grid in question; how many are baked at most; and `needed` as a function of (voxels, stored=)
     """
     finest, cells = _finest_cells(settings, m, s, whole=whole)
@@ -123,10 +120,10 @@ def most_needed(
         bricks = min(cells, voxels // 8)
         return needed(settings, m, views, channels, voxels=voxels, cells=cells, bricks=bricks, stored=stored, whole=whole, device=device)
 
-    return finest, min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3), at_most
+    return finest, min(MAX_OVERSHOOT * room, cells * settings.brick_size**3), at_most
 
 
-def _finest_cells(settings: BakeSettings, m: Any, s: Scene, *, whole: bool) -> tuple[int, int]:
+def _finest_cells(settings: BakeSettings, m: Model, s: Scene, *, whole: bool) -> tuple[int, int]:
     """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
     bounds, discretise = m.space.bounds, given(m.settings.discretise)
     finest = finest_choice(settings, m.settings, s).resolution
@@ -138,16 +135,13 @@ def _finest_cells(settings: BakeSettings, m: Any, s: Scene, *, whole: bool) -> t
     return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
-def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
+def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: Pixels, plan: Plan, mib: float) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
-    pixels        as they were placed
-    splits, room  how often voxels will be split, and how many there is room for then
+    pixels  as they were placed
     """
     whole, voxels = plan.samples is not None, plan.voxels
-    if splits:
-        voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
-    grid = {"voxels": voxels, "cells": plan.cells * 8**splits, "bricks": -(-plan.bricks * voxels // max(plan.voxels, 1))}
+    grid = {"voxels": voxels, "cells": plan.cells, "bricks": plan.bricks}
     stored = isinstance(pixels.images, PixelFile)
     need = needed(job.settings, m, views, pixels.images.shape[1], **grid, stored=stored, whole=whole, device=job.device)
     harmonics = (m.fine.degree + 1) ** 2
@@ -175,6 +169,5 @@ def _before(known: Known) -> tuple[int, bool, float, int, int, Need]:
     m, s = load_renderer(inputs.train.folder).model, load_scene(inputs.poses.folder, inputs.train.folder)
     views, whole = views_of(s, "train"), constant_background(s) is None
     mib = size_limits(own, s, known.device, count_cores(), whole=whole, discretise=given(m.settings.discretise))[1]
-    splits = schedule.count_splits(schedule.PHASES)
-    _, voxels, at_most = most_needed(own, m, s, views, channels_of(inputs.poses.folder, views), mib, splits, whole, known.device)
+    _, voxels, at_most = most_needed(own, m, s, views, channels_of(inputs.poses.folder, views), mib, whole, known.device)
     return m.fine.degree, whole, mib, min(own.visibility_rays, count_pixels(views)), voxels, at_most(voxels, stored=False)

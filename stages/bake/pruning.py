@@ -26,12 +26,6 @@ from stages.io.scene import Scene
 # Training rays per voxel that are rendered to see which voxels show, at least bake.visibility_rays; in normalised device coordinates, where no ray
 # misses and each meets many voxels, fewer. docs/experiments/refinement.md
 RAYS_PER_VOXEL, NDC_RAYS_PER_VOXEL = 1.0, 0.25
-CHILDREN_OVERSHOOT = 3.0  # voxels after a split over those that the asset has room for, at most: few of them show
-
-
-def most_children(room: int) -> int:
-    """Voxels after a split, at most, where there is room for so many in the asset."""
-    return max(8, int(CHILDREN_OVERSHOOT * room))
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,6 @@ class Choice:
     why: str
 
 
-def baked_resolution(resolution: int, splits: int) -> int:
-    """Voxels along the longest side of what is baked, which are split so often to have the asset's resolution."""
-    return -(-resolution // 2**splits)
-
-
 def finest_resolution(s: Scene, most: int | None) -> Choice:
     """Voxels along the longest side of the box, so that a voxel covers half a pixel at the box's centre, for the median camera; at most `most` of them, or
     MAX_RESOLUTION where it is None.

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from efficientnerf.asset import format
 from efficientnerf.asset.bake import grid_of
 from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.asset.components import foreground_bricks
-from efficientnerf.asset.refinement import schedule
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.model import Model
 from efficientnerf.settings import given
@@ -38,7 +36,7 @@ from stages.bake.metadata import metadata_of, sources_of
 from stages.bake.plan import Plan
 from stages.bake.refine.refinement import refined
 from stages.bake.refine.timing import Stopwatch
-from stages.bake.resolution import baked_resolution, size_limits
+from stages.bake.resolution import size_limits
 from stages.bake.settings import BakeSettings, refuse_nerf
 from stages.bake.values import baked_tree
 from stages.bake.voxels import choose_voxels, voxel_space, with_min_views
@@ -69,17 +67,15 @@ def run(job: Job) -> None:
     whole = constant_background(s) is None
     mib, views = _size_limit(job, s, whole=whole, discretise=given(m.settings.discretise)), scene.views_of(s, "train")
     most = given(settings.max_mib) or mib  # of the file
-    phases = schedule.PHASES
-    splits = schedule.count_splits(phases)
-    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole), job.inputs["train"])
-    plan = _plan(job, m, s, pixels, mib, splits, whole=whole)
-    room = partial(_room, settings, m, plan, mib)
+    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, whole=whole), job.inputs["train"])
+    plan = _plan(job, m, s, pixels, mib, whole=whole)
+    capacity = room_of(settings, m, plan.grids, mib, environment=whole)
     _check(job, m, plan)
-    refuse_more_than_fits(job, m, views, pixels, plan, mib, splits, room)
+    refuse_more_than_fits(job, m, views, pixels, plan, mib)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
     targets = _targets(s, pixels, plan)
-    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, phases, room, stopwatch, plan.samples)
+    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, capacity, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
     metrics = {"training_psnr": report["psnr_after"]}
@@ -115,22 +111,14 @@ def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> f
     return timed
 
 
-def _room(settings: BakeSettings, m: Model, plan: Plan, mib: float, splits: int) -> int:
-    """How many voxels the asset holds on the plan's grids once they were split so often."""
-    finer = 2**splits
-    grids = [((x * finer, y * finer, z * finer), voxel / finer, low) for (x, y, z), voxel, low in plan.grids]
-    return room_of(settings, m, grids, mib, environment=plan.samples is not None)
-
-
-def _plan(job: Job, m: Model, s: Scene, pixels: Pixels, mib: float, splits: int, *, whole: bool) -> Plan:
-    """The voxels to bake, which will be split so often: cascades of a whole scene, or else one grid of what lies in the field's box."""
+def _plan(job: Job, m: Model, s: Scene, pixels: Pixels, mib: float, *, whole: bool) -> Plan:
+    """The voxels to bake: cascades of a whole scene, or else one grid of what lies in the field's box."""
     space = voxel_space(job, m)
     if whole:
-        return choose_scene_voxels(job, m, s, pixels, space, mib, splits)
-    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib, splits)
-    resolution = baked_resolution(choice.resolution, splits)
-    indices = with_min_views(m, s, indices, resolution)
-    shape, voxel = grid_of(space.bounds, resolution, job.settings.brick_size)
+        return choose_scene_voxels(job, m, s, pixels, space, mib)
+    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib)
+    indices = with_min_views(m, s, indices, choice.resolution)
+    shape, voxel = grid_of(space.bounds, choice.resolution, job.settings.brick_size)
     return Plan(choice, space, [(shape, voxel, np.asarray(space.bounds[0], np.float64))], [indices], len(visibility.cells))
 
 

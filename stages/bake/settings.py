@@ -77,7 +77,8 @@ class BakeSettings:
     seed: Seed = setting(0, "Seed of the jitter and of the rays of the refinement.", advanced=True)
     refine_steps: Count | Auto = setting(
         "auto",
-        "Steps in which the baked values are refined on the training images; auto: 15 rays for each voxel, 6 in unbounded scenes; at least 320 steps.",
+        "Steps in which the baked values are refined on the training images; auto: 15 rays for each voxel, in unbounded scenes one for each pixel,"
+        " from 6 to 15 for each voxel; at least 320 steps.",
         advanced=True,
     )
     time_budget: Seconds | Off = setting(
@@ -116,7 +117,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=20,
+    version=21,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=ByName("stages.bake.run:run"),

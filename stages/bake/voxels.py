@@ -19,7 +19,7 @@ from efficientnerf.settings import given
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job
-from stages.bake.resolution import MIN_RESOLUTION, Choice, affordable_resolution, baked_resolution, finest_resolution, refuse_without_room
+from stages.bake.resolution import MIN_RESOLUTION, Choice, affordable_resolution, finest_resolution, refuse_without_room
 from stages.bake.scratch import read_arrays, write_arrays
 from stages.bake.settings import BakeSettings
 from stages.framing.view_coverage import count_views, has_min_views, kept_pixels
@@ -54,8 +54,8 @@ def voxel_space(job: Job, m: Model) -> Space:
     return space if depth == 1 else space.with_voxel_depth(depth)
 
 
-def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
-    """The asset's resolution; the visibility of the voxels to bake, which will be split so often to have it, and their coordinates (N, 3)."""
+def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float) -> tuple[Choice, Visibility, np.ndarray]:
+    """The asset's resolution; the visibility of the voxels to bake, and their coordinates (N, 3)."""
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick_size
 
@@ -68,7 +68,7 @@ def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mi
     least = finest.resolution if fixed else MIN_RESOLUTION
     refuse_without_room(settings, mib, least, room(least), environment=False)
     if fixed:
-        shape, voxel = bake.grid_of(bounds, baked_resolution(choice.resolution, splits), brick)
+        shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         visibility = by_views(job, s, visibility, shape, voxel, space)
         return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
@@ -91,11 +91,10 @@ def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mi
         return last
 
     choice = affordable_resolution(finest, lambda at: len(at_resolution(at)[2]), lambda at: int(OVERSHOOT * room(at)))
-    baked = baked_resolution(choice.resolution, splits)
-    _, coarse, indices = at_resolution(baked)
+    _, coarse, indices = at_resolution(choice.resolution)
     most = MAX_OVERSHOOT * room(choice.resolution)
     if len(indices) > most:
-        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, baked, brick)[0], most)
+        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, choice.resolution, brick)[0], most)
     return choice, coarse, indices
 
 

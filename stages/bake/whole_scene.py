@@ -46,7 +46,6 @@ from stages.bake.resolution import (
     MIN_RESOLUTION,
     Choice,
     affordable_resolution,
-    baked_resolution,
     finest_of_cascades,
     refuse_without_room,
 )
@@ -76,8 +75,8 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
     return [np.stack([low, low + np.asarray(shape) * brick * voxel]) for shape, voxel, low in grids]
 
 
-def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> Plan:
-    """The cascades, their voxels, which will be split so often, the region and the environment."""
+def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float) -> Plan:
+    """The cascades, their voxels, the region and the environment."""
     settings: BakeSettings = job.settings
     stated, discretise = given(settings.resolution), given(m.settings.discretise)
     fixed = stated or discretise
@@ -115,7 +114,7 @@ def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Spa
     else:
         finest = finest_of_cascades(s, bounds, count, settings.brick_size, given(settings.max_resolution))
         choice = affordable_resolution(finest, lambda at: sum(map(len, at_resolution(at)[3])), lambda at: int(OVERSHOOT * room(at)))
-    _, grids, seen, indices = at_resolution(baked_resolution(choice.resolution, splits))
+    _, grids, seen, indices = at_resolution(choice.resolution)
     indices = heaviest_of(job, seen, grids, indices, MAX_OVERSHOOT * room(choice.resolution))
     indices = [keep_clear(job, m, s, part, grid) for part, grid in zip(indices, grids, strict=True)]
     mean = pixels.images[samples.pixel[:: max(1, len(samples.pixel) // 4096)]][:, :3].mean(axis=0) / 255.0

@@ -99,20 +99,3 @@ def _check(outputs: Sequence[Path], camera: Camera, value: list[str], names: Col
 def encode_frames(frames: Sequence[Path], path: Path, options: RenderOptions, each: Callable[[], None] | None = None) -> None:
     """Encode PNGs as an MP4."""
     write_mp4((over_background(read_png(frame), NAMED["white"]) for frame in frames), path, fps=options.fps, crf=options.crf, each=each)
-
-
-def render_path(
-    tree: NerfTree,
-    cameras: Sequence[Camera],
-    out_dir: Path,
-    options: RenderOptions,
-    progress: Progress | None = None,
-    draw: Callable[..., Rendering] | None = None,
-) -> list[Path]:
-    """Render a path to a folder: PNG frames, EXR and video by the options; returns the files. Frames of the same names are overwritten."""
-    written = render_frames(tree, cameras, out_dir, options, progress, draw=draw)
-    if options.video is not None:
-        video = out_dir / options.video
-        encode_frames([path for path in written if path.suffix == ".png"], video, options)
-        written.append(video)
-    return written

@@ -89,7 +89,7 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, small: SmallPict
     return MaskUse(Silhouettes(use["alpha"], use["masks"]), reasons, tuple(dict.fromkeys(doubtful)))
 
 
-def without_silhouette(photos: Sequence[Photo], silhouettes: Silhouettes, renders: bool) -> list[str]:
+def without_silhouette(photos: Sequence[Photo], silhouettes: Silhouettes) -> list[str]:
     """Names of the photos of which nothing says what is background, in a capture whose others do. Raises BadInput where too few are left."""
     have = [(silhouettes.masks and photo.mask is not None) or (silhouettes.alpha and _has_alpha(photo)) for photo in photos]
     if not silhouettes or all(have) or not any(have):

@@ -30,7 +30,6 @@ from pipeline.text import printable
 from stages.artifacts import TrainOutputs
 from stages.io.json_file import shown
 from stages.io.scene import Scene
-from stages.renamed_settings import updated
 from stages.scratch import opened
 
 FORMAT = 1
@@ -159,7 +158,7 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
         about = msgspec.convert(found, _About)
         ndc = None if about.ndc is None else Ndc.from_json(about.ndc)
         space = space_from(np.asarray(about.bounds, np.float64), contracted=about.contracted, ndc=ndc)
-        settings = settings_from(TrainSettings, updated("train", TrainSettings, about.settings))
+        settings = settings_from(TrainSettings, about.settings)
         _check_sizes(tensors, settings, space)
         m = model(space, settings, about.background, device, (about.near, about.far))
         restore(m, tensors)

@@ -161,7 +161,7 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
         job.say(sentence)
     for sentence in doubts(use):
         warn(sentence)
-    names = set(without_silhouette(capture.photos, use.silhouettes, renders))
+    names = set(without_silhouette(capture.photos, use.silhouettes))
     if names:
         warn(f"{len(names)} of {len(capture.photos)} images have no silhouette, and the others do: {abbreviated(sorted(names))}. They are left out.")
     kept = [index for index, photo in enumerate(capture.photos) if photo.camera.name not in names]

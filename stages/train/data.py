@@ -27,7 +27,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their whole parts, f
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
 
 
-def with_camera_refinement(settings: TrainSettings, s: Scene) -> TrainSettings:
+def with_camera_refinement(settings: TrainSettings) -> TrainSettings:
     """The settings with "on" or "off" for `camera_refinement`."""  # docs/experiments/photographs.md
     choice = "off" if settings.camera_refinement == "auto" else settings.camera_refinement
     return replace(settings, camera_refinement=choice)

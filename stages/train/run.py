@@ -64,7 +64,7 @@ def trained(job: Job) -> bool:
     folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
     s = (watch := Watch(job, scene.load(folder), folder)).scene
     views = scene.views_of(s, "train")
-    settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views)), s), field_file.space_of(s)
+    settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views))), field_file.space_of(s)
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views, rows_for_training(job, folder, views, settings, space))
     near, far = depth_range(s, pixels, settings, job.warn)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from efficientnerf.geometry.cameras import Camera, project, rays, resized
 from stages.io.refined_cameras import LEFT_OUT, load_scene
-from stages.io.scene import Scene, View, read_image
+from stages.io.scene import View, read_image
 
 CAMERAS = 240  # at most: more frusta hide one another
 PHOTOGRAPHS = 32  # at most: a second's work, a megabyte
@@ -30,7 +30,7 @@ def captured_views(poses: Path, train: Path, background: tuple[float, float, flo
     views = [known[n] for n in _spread(len(known), CAMERAS)]
     behind = background or scene.background or (1.0, 1.0, 1.0)
     shown = [views[n] for n in _spread(len(views), PHOTOGRAPHS)]
-    return [_pinhole(view.camera) for view in views], {view.camera.name: photograph(scene, poses, view, behind) for view in shown}
+    return [_pinhole(view.camera) for view in views], {view.camera.name: photograph(poses, view, behind) for view in shown}
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -44,7 +44,7 @@ def _pinhole(camera: Camera) -> Camera:
     return replace(camera, model="PINHOLE", params=tuple(float(lens[key]) for key in ("fx", "fy", "cx", "cy")))
 
 
-def photograph(scene: Scene, folder: Path, view: View, background: tuple[float, float, float]) -> bytes:
+def photograph(folder: Path, view: View, background: tuple[float, float, float]) -> bytes:
     """JPEG of a view, small, as its camera without distortion takes it; black where that sees past the image's border."""
     pixels = read_image(folder, view)
     size = min(1.0, SIDE / max(view.camera.width, view.camera.height))

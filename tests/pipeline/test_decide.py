@@ -7,11 +7,16 @@ from pathlib import Path
 import pytest
 
 from pipeline import artifact
-from pipeline.decide import decide, survey, why_run
+from pipeline.decide import decide, survey
 from pipeline.errors import BadInput, UnknownSetting
 from pipeline.run import Run
 from pipeline.runner import run_stages
+from pipeline.stage import Stage
 from tests.pipeline.toy import COUNT, DOUBLE, LIST, REPORT, STAGES, make_run, set_one
+
+
+def why_run(stage: Stage, run: Run) -> str | None:
+    return decide(stage, run).reason
 
 
 def tree(folder: Path) -> dict[str, tuple[int, int]]:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks.minutes import read_rows
 from benchmarks.peers import __main__ as peers
@@ -65,19 +61,3 @@ def test_a_peer_that_is_a_tenth_off_has_twenty_decibels(scene: Path, tmp_path: P
     with pytest.raises(SystemExit, match="exit code 3"):
         peers.main([*call, "--again"])
     assert read_rows(tmp_path / "out/peers.json") == rows
-
-
-def test_the_truth_is_on_white_in_the_middle_of_each_stride(scene: Path, tmp_path: Path) -> None:
-    folder = peers.as_blender(scene, tmp_path / "data")
-    whole, some = peers.truth_of(folder, 1), peers.truth_of(folder, 4)
-    assert len(whole) == COUNTS["test"]
-    for all_of_it, part in zip(whole, some, strict=True):
-        np.testing.assert_array_equal(part, all_of_it[1::4, 1::4])
-    names = [frame["file_path"] for frame in json.loads((folder / "transforms_test.json").read_text())["frames"]]
-    with Image.open(folder / f"{names[0]}.png") as image:
-        clear = np.asarray(image)[..., 3] == 0
-    assert clear.any()
-    assert (whole[0][clear] == 1).all()
-    assert peers.quality(np.stack(whole), whole, True) == {"psnr": math.inf, "views": 2, "ssim": pytest.approx(1.0)}
-    with pytest.raises(SystemExit, match="1 views were rendered, 2 are there"):
-        peers.quality(np.stack(whole[:1]), whole, True)

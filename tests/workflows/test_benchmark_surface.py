@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import trimesh
 from benchmarks.scenes.catalogue import look_at
 from benchmarks.scenes.shapes import Box, Capsule, Disc, Ground, Material, Shape, Sphere
 from benchmarks.scenes.triangles import mesh_of, triangles
-from benchmarks.surface import Surface, aligned, distances, footprint, image_scores, own_figures, scores
+from benchmarks.surface import Surface, aligned, distances, footprint, image_scores, scores
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
@@ -56,16 +55,6 @@ def test_distances_are_from_the_surface_not_from_its_samples() -> None:
     away, face = distances(points, ball(0.5), 4000)
     np.testing.assert_allclose(away, np.abs(np.linalg.norm(points, axis=1) - 0.5), atol=2e-3)
     assert face.max() < len(ball(0.5).faces)
-
-
-def test_a_run_s_own_figures_are_those_of_its_reports(tmp_path: Path) -> None:
-    assert own_figures(tmp_path) == {}
-    metrics = {"asset": {"psnr": 30.0, "ssim": 0.9}, "mesh": {"psnr": 28.0, "psnr_vertex_colours": 27.0}}
-    for name, document in (("mesh/report.json", {"silhouette_iou": 0.98, "area": 1.0}), ("evaluate/metrics.json", metrics)):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_text(json.dumps(document))
-    held_back = {"asset_psnr": 30.0, "psnr": 28.0, "psnr_vertex_colours": 27.0}
-    assert own_figures(tmp_path) == {"asset": {"silhouette_iou": 0.98}, "held_back": held_back}
 
 
 @pytest.mark.parametrize(

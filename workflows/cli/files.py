@@ -37,7 +37,7 @@ from workflows.inspection.describe import describe, in_words
 from workflows.loading import load_asset
 
 TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
-REGIONS = ("foreground", "all")  # efficientnerf.asset.region.REGIONS, which a test compares; that import is heavy
+REGIONS = ("foreground", "all")
 EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
 Crop = tuple[float, float, float, float, float, float] | None
 

@@ -19,7 +19,7 @@ from stages.video import KNOWN, SUFFIXES
 from workflows.budget import share_budget
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, Table, read_config, read_preset, seconds_of, table_of
-from workflows.cli.target import check_names, open_run, resume_command
+from workflows.cli.target import open_run, resume_command
 from workflows.workflow import Workflow
 
 # Bytes of a process beside what stages say: docs/experiments/memory.md
@@ -113,7 +113,6 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     if preset is not None:
         settings.put_table(read_preset(preset, workflow.presets).table, f"preset {preset}")
     elif standing is not None:
-        check_names(standing)
         dropped = settings.put_recorded(standing.settings)
         if dropped:
             warnings.append(f"settings that this version does not have are left out: {listed(dropped)}")

@@ -11,7 +11,7 @@ from pipeline.text import printable
 from workflows.cli.options import common_options, folder_type, json_option, workflow
 from workflows.cli.output import listing, write_json
 from workflows.cli.progress import duration, size
-from workflows.cli.target import check_names, open_run
+from workflows.cli.target import open_run
 from workflows.inspection.status import run_status
 
 
@@ -25,7 +25,6 @@ def status(run_folder: Path, as_json: bool) -> None:
     A file of unchanged size and modification time counts as unchanged; 'enerf verify' hashes it.
     """
     run = open_run(run_folder)
-    check_names(run)
     found = run_status(run, survey(workflow().stages, run))
     if as_json:
         write_json(found, indent=1)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from pipeline.errors import BadInput, UnknownSetting
+from pipeline.errors import BadInput
 from pipeline.links import refuse_links
 from pipeline.run import NAME, Run
 from stages.artifacts import BakeOutputs
-from stages.renamed_settings import moved_in
 from workflows.cli.options import workflow
 
 ASSET = BakeOutputs.asset  # the file's name
@@ -37,16 +36,6 @@ def _stage_names() -> frozenset[str]:
 
 def is_run(path: Path) -> bool:
     return (path / NAME).is_file()
-
-
-def check_names(run: Run) -> None:
-    """UnknownSetting, with the command to run, where a run recorded settings under names from before release 0.1."""
-    found = moved_in(run.settings)
-    if not found:
-        return
-    rest = f" {len(found) - 1} more have other names now." if len(found) > 1 else ""
-    again = f"{resume_command(run.path)} --preset {run.preset or 'preview'}"
-    raise UnknownSetting(f"{run.path / NAME}: made before release 0.1: {found[0]}{rest} To make its stages again with the settings of today: {again}")
 
 
 def asset_of(path: Path) -> Path:

@@ -8,7 +8,7 @@ import click
 
 from workflows.cli.options import common_options, folder_type, json_option, workflow
 from workflows.cli.output import closing, write_json
-from workflows.cli.target import check_names, open_run
+from workflows.cli.target import open_run
 from workflows.report.page import write_report
 from workflows.report.viewer import write_run_viewer
 
@@ -21,7 +21,6 @@ def report(run_folder: Path, as_json: bool) -> None:
     """Write RUN/report.html: files, renders, metrics and settings of RUN; and RUN/viewer.html, which shows its asset in a browser. 'enerf run' writes
     both when it is done."""
     run = open_run(run_folder)
-    check_names(run)
     viewer = write_run_viewer(run, anew=True)
     path = write_report(run, workflow().stages)
     if as_json:

@@ -12,7 +12,7 @@ from efficientnerf.backends.pieces import pieces
 from efficientnerf.surface.mesh import face_areas
 from efficientnerf.surface.texturing.charts import Charts, charts_of
 
-SMALLEST, LARGEST = 16, 8192  # texels along a side
+SMALLEST = 16  # texels along a side
 FILLED = 0.7  # share of a square that packed charts fill, about
 STEP = 0.97  # of the scale, until charts fit
 ENOUGH = 0.8  # of the scale that is wanted, or that the charts' area alone allows

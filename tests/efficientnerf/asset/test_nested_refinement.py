@@ -14,7 +14,6 @@ import torch
 from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, subset, voxel_cascades
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.host import in_voxels
-from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import initial_state, subset_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import ray_parts, render_reference, tree_density
@@ -125,7 +124,7 @@ def fog(environment_map: bool = False) -> NerfTree:
     return replace(tree, harmonics=sh)
 
 
-TOLD: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": exponential_fall(0.1, 60), "seed": 1}
+TOLD: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / 60), "seed": 1}
 
 
 def test_nested_fog_becomes_the_ball_of_the_pictures() -> None:

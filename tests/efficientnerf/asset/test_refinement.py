@@ -13,7 +13,6 @@ from efficientnerf.asset.cascades import subset, voxel_coordinates
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.host import in_voxels
-from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
@@ -72,7 +71,7 @@ def test_records_grow_until_all_samples_fit() -> None:
 
 def fitted(tree: NerfTree, targets: Targets, steps: int, **more: Any) -> tuple[NerfTree, list[float]]:
     o = initial_state(tree)
-    told = {"until": steps, "rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": exponential_fall(0.1, steps), "seed": 1, **more}
+    told = {"until": steps, "rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / steps), "seed": 1, **more}
     errors = list(optimise(o, targets, **told))
     return o.result(), errors
 
@@ -141,7 +140,7 @@ def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     whole, _ = fitted(ball_tree(), targets, 12)
     again = initial_state(ball_tree())
-    told: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": exponential_fall(0.1, 12), "seed": 1}
+    told: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / 12), "seed": 1}
     list(optimise(again, targets, until=5, **told))
     threads = numba.get_num_threads()
     try:

@@ -13,7 +13,6 @@ from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades, 
 from efficientnerf.asset.refinement.error_map import ErrorMap
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
-from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
@@ -125,7 +124,8 @@ def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 16, s
     o = initial_state(tree)
     errors: list[float] = []
     for end in until:
-        errors += optimise(o, targets, until=end, rays=rays, density_lr=0.3, sh_lr=0.05, fall=exponential_fall(0.1, steps), seed=1, view_dependent_lr_ratio=0.5,
+        errors += optimise(o, targets, until=end, rays=rays, density_lr=0.3, sh_lr=0.05, fall=lambda step: 0.1 ** (step / steps),
+                           seed=1, view_dependent_lr_ratio=0.5,
                            rule=rule)  # fmt: skip
         o.fetch()
     return o, errors

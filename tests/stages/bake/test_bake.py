@@ -18,7 +18,7 @@ from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format
 from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.file import serialisation
-from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
+from efficientnerf.asset.refinement.schedule import stated_schedule
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.rendering.compositing import activate
@@ -26,7 +26,7 @@ from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
-from stages.bake import memory, resolution
+from stages.bake import memory, resolution, whole_scene
 from stages.bake import run as bake
 from stages.bake.refine import checkpoint, refinement
 from stages.bake.settings import BakeSettings
@@ -38,7 +38,7 @@ from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
 from tests.stages.spoilers import SPOILERS
 
-TWELVE = stated_schedule(PHASES, 12)
+TWELVE = stated_schedule(12)
 QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512, lr_final_ratio=0.3)
 
 
@@ -272,7 +272,8 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
     monkeypatch.setattr(resolution, "VOXEL_PIXELS", 0.2)
     sizes = {}
     for room in (10**7, 20_000):
-        monkeypatch.setattr(serialisation, "most_voxels", lambda *asked, room=room, **beside: room)
+        for module in (serialisation, whole_scene):
+            monkeypatch.setattr(module, "most_voxels", lambda *asked, room=room, **beside: room)
         made = job(tmp_path / str(room), fitted, **inputs)
         run(made)
         report = json.loads((made.out / "report.json").read_text())
@@ -285,12 +286,12 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
 
 def test_steps_of_the_fit_follow_the_voxels_or_what_was_asked_for() -> None:
     chosen = BakeSettings(refine_rays_per_batch=1000)
-    assert [refinement.refinement_steps(chosen, voxels, whole=False) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
-    assert [refinement.refinement_steps(chosen, voxels, whole=True) for voxels in (1, 10**6)] == [320, 6000]
+    assert [refinement.refinement_steps(chosen, voxels, None) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
+    assert [refinement.refinement_steps(chosen, 10**6, pixels) for pixels in (10**5, 10**7, 10**9)] == [6000, 10000, 15000]
     asked = dataclasses.replace(chosen, refine_steps=7)
-    assert {refinement.refinement_steps(asked, 10**7, whole=cut_out) for cut_out in (True, False)} == {7}
+    assert {refinement.refinement_steps(asked, 10**7, pixels) for pixels in (None, 10**9)} == {7}
     for steps in (0, 7):  # a time budget takes the place of any number, of none too: what is thick is learned then as ever
-        assert refinement.refinement_steps(dataclasses.replace(asked, refine_steps=steps, time_budget=40.0), 10**6, whole=False) == 15000
+        assert refinement.refinement_steps(dataclasses.replace(asked, refine_steps=steps, time_budget=40.0), 10**6, None) == 15000
 
 
 @pytest.mark.parametrize(("layout", "most"), [("compact", 1), ("sparse", 1), ("compact", 64)])

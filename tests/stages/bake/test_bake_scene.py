@@ -14,8 +14,6 @@ import pytest
 
 from efficientnerf.asset import field_samples, format
 from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades, voxel_coordinates
-from efficientnerf.asset.refinement import schedule
-from efficientnerf.asset.refinement.schedule import Phase
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
@@ -190,17 +188,6 @@ def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_
     assert found["restored"] < 0.2 * found["pruned"]
     assert 0 < found["voxels_restored"] <= dropped[0]
     assert any("holes" in event.get("text", "") and "restored" in event["text"] for event in events)
-
-
-def test_all_cascades_of_a_scene_are_split(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: tuple[Path, int]) -> None:
-    phases = (Phase("coarse", 0.5, "split"), Phase("fine", 0.25, "prune"), Phase("last", 0.25))
-    monkeypatch.setattr(schedule, "PHASES", phases)
-    tree, report = baked(tmp_path, inputs)
-    whole = format.load(undisturbed[0] / "out" / BakeOutputs.asset)
-    assert tree.voxel == pytest.approx(whole.voxel)
-    assert len(tree.outer) == len(whole.outer)
-    assert min(np.bincount(voxel_cascades(tree))) > 0
-    assert report["optimisation"]["holes"]["refined"] < 0.02
 
 
 def test_rays_that_end_in_holes_are_those_without_their_voxels(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.cascades import subset, voxel_cascades, voxel_coordinates
-from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
+from efficientnerf.asset.refinement.schedule import stated_schedule
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state, subset_state
 from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
@@ -19,7 +19,7 @@ from stages.bake.refine import checkpoint
 from stages.bake.refine.checkpoint import Point
 from tests.efficientnerf.trees import random_cascades
 
-SCHEDULE = stated_schedule(PHASES, 12)
+SCHEDULE = stated_schedule(12)
 
 
 def job(folder: Path) -> Job:

@@ -82,7 +82,7 @@ def assert_same(one: NerfTree, other: NerfTree) -> None:
 def repeated(folder: Path, inputs: dict[str, Path], schedule: list[dict[str, Any]]) -> NerfTree:
     """The asset of a recorded schedule."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refinement, "stated_schedule", lambda phases, steps: recorded_schedule(phases, schedule))
+        patch.setattr(refinement, "stated_schedule", lambda steps: recorded_schedule(schedule))
         made = job(folder, replace(QUICK, time_budget="off"), **inputs)
         bake.run(made)
     assert fitted(made)["schedule"] == schedule

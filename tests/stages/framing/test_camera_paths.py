@@ -16,7 +16,7 @@ from efficientnerf.asset.rendering import MOST_PIXELS
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput
-from stages.figures.frames import RenderOptions, render_path
+from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
 from stages.framing.captured import captured_metadata, captured_of
 from stages.io.camera_path import read_camera_path
@@ -169,14 +169,15 @@ def test_a_path_is_drawn(tmp_path: Path) -> None:
     tree = BallTree(similarity=SIMILARITY)
     cameras = read_camera_path(path_file(tmp_path), SIMILARITY, width=40).cameras
     steps: list[tuple[int, int]] = []
-    options = RenderOptions(background="transparent", exr="all", video="path.mp4", fps=24)
-    written = render_path(tree, cameras, tmp_path / "out", options, lambda done, total: steps.append((done, total)), BallTree.render)
-    names = ["frame_0000.png", "frame_0000.exr", "frame_0001.png", "frame_0001.exr", "path.mp4"]
+    options = RenderOptions(background="transparent", exr="all", fps=24)
+    written = render_frames(tree, cameras, tmp_path / "out", options, lambda done, total: steps.append((done, total)), draw=BallTree.render)
+    names = ["frame_0000.png", "frame_0000.exr", "frame_0001.png", "frame_0001.exr"]
     assert [path.name for path in written] == names
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(names)
     assert steps == [(0, 2), (1, 2), (2, 2)]
     assert read_png(written[0]).shape == (32, 40, 4)
-    with av.open(str(written[-1])) as container:
+    encode_frames([path for path in written if path.suffix == ".png"], tmp_path / "path.mp4", options)
+    with av.open(str(tmp_path / "path.mp4")) as container:
         first = next(container.decode(video=0)).to_ndarray(format="rgb24")
     assert first[:4, :4].min() > 250, "what is transparent lies on white in the video"
 

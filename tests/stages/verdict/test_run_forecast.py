@@ -30,19 +30,19 @@ def test_each_stage_after_the_cameras_is_forecast() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "more"),
+    ("stages", "more"),
     [
-        ("train", {"train__iterations": 2 * DEFAULTS["train"].iterations}),
-        ("bake", {"whole": False}),
-        ("mesh", {"views": 300}),
-        ("evaluate", {"megapixels": 600.0}),
-        ("turntable", {"turntable__frames": 4 * DEFAULTS["turntable"].frames}),
+        (["train"], {"train__iterations": 2 * DEFAULTS["train"].iterations}),
+        (["bake"], {"whole": False}),
+        (["mesh"], {"views": 300}),
+        (["bake", "evaluate"], {"megapixels": 600.0}),
+        (["turntable"], {"turntable__frames": 4 * DEFAULTS["turntable"].frames}),
     ],
 )
-def test_more_of_it_takes_longer_and_nothing_else_does(stage: str, more: dict[str, Any]) -> None:
+def test_more_of_it_takes_longer_and_nothing_else_does(stages: list[str], more: dict[str, Any]) -> None:
     before, after = seconds(), seconds(**more)
-    assert [name for name in before if after[name] != before[name]] == [stage]
-    assert after[stage] > 1.2 * before[stage]
+    assert [name for name in before if after[name] != before[name]] == stages
+    assert all(after[stage] > 1.2 * before[stage] for stage in stages)
 
 
 def test_slower_machines_take_longer_and_more_cores_less() -> None:

@@ -14,8 +14,6 @@ from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from pipeline.run import Run
 from pipeline.runner import refuse_what_cannot_work
-from stages.renamed_settings import REMOVED, RENAMED
-from stages.settings import describe_settings
 from workflows.asset import STAGES
 from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
@@ -129,25 +127,6 @@ def test_times_are_read(text: str, seconds: float) -> None:
     for other in ("", "soon", "10 minutes", "m", "-3s", "5s1m"):
         with pytest.raises(UsageError, match="as in 90s, 10m or 1h30m"):
             seconds_of(other)
-
-
-@pytest.mark.parametrize(("option", "remedy"), [("train.hidden=64", "train.hidden_dim"), ("train.rate_hold=5", "train.rate_hold was removed")])
-def test_old_names_are_answered_with_the_new_ones(option: str, remedy: str) -> None:
-    settings = Settings({stage.name: stage.settings for stage in STAGES})
-    with pytest.raises(UnknownSetting, match=re.escape(remedy)):
-        settings.put_option(option)
-    assert settings.put_recorded({"train": {"hidden": 64, "budget": 0.0, "far": 0.0, "rate_hold": 0}}) == []
-    train = settings.resolved()["train"]
-    assert (train.hidden_dim, train.time_budget, train.far_plane) == (64, "off", "auto")
-
-
-def test_the_table_of_old_names_leads_to_settings_of_today() -> None:
-    for stage in STAGES:
-        known = {info.name for info in describe_settings(stage.settings)}
-        for old, new in RENAMED.get(stage.name, {}).items():
-            assert new in known
-            assert old not in known, "an old name cannot be used again: recorded settings could not be told apart"
-        assert not known & REMOVED.get(stage.name, {}).keys()
 
 
 @pytest.mark.parametrize("text", ["turntable.background=pink", "turntable.background=#12345", "mesh.density_threshold=0", "points.density_threshold=-3.5"])

@@ -10,7 +10,7 @@ import pytest
 from workflows.cli.main import main
 from workflows.paper.document import make
 from workflows.paper.result import Repetitions, Request
-from workflows.paper.structures import COLUMNS, NAMES, Case
+from workflows.paper.table7 import COLUMNS, NAMES, Case
 
 ONCE = Repetitions(cachings=1, queries=1)
 
@@ -29,11 +29,11 @@ def test_table_7_compares_all_structures(tmp_path: Path) -> None:
 
 
 def test_the_torch_versions_fill_the_same_table() -> None:
-    from workflows.paper import structures
+    from workflows.paper import table7 as table
 
-    rows, note = structures._measure(Case(32, 0.2), 1000, structures._in_torch("cpu"), ONCE)
+    rows, note = table._measure(Case(32, 0.2), 1000, table._in_torch("cpu"), ONCE)
     assert [row["structure"] for row in rows] == list(NAMES.values())
-    kernels, _ = structures._measure(Case(32, 0.2), 1000, structures._in_numba(), ONCE)
+    kernels, _ = table._measure(Case(32, 0.2), 1000, table._in_numba(), ONCE)
     for row, kernel in zip(rows, kernels, strict=True):
         assert row["memory of dense"] == pytest.approx(kernel["memory of dense"], rel=0.05, abs=0.01), row["structure"]
     assert "6,554 voxels" in note

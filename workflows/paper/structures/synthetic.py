@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.structures.voxels import Voxels
+from workflows.paper.structures.voxels import Voxels
 
 BODIES = 24  # half of them solid, half shells
 LEVELS = 1 << 16  # quantisation levels of the score

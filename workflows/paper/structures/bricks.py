@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.structures.bits import CHUNK, ONE, TASK, ZERO, assign_ranks, atomic_or, fill, floor_to_uint64, in_grid, popcount, rank
-from efficientnerf.structures.voxels import Voxels
+from workflows.paper.structures.bits import CHUNK, ONE, TASK, ZERO, assign_ranks, atomic_or, fill, floor_to_uint64, in_grid, popcount, rank
+from workflows.paper.structures.voxels import Voxels
 
 TWO, THREE, FOUR, SIX = np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(6)
 NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -192,7 +192,7 @@ class BrickTree:
         return {"blocks": self.blocks, "cells": self.cells, "values": self.values}
 
     def query(self, points: np.ndarray, packed: np.ndarray, occupied: np.ndarray) -> None:
-        """See `efficientnerf.structures.dense.DenseVoxels.query`."""
+        """See `workflows.paper.structures.dense.DenseVoxels.query`."""
         _query(points, self.side, np.uint64(-(-self.side // 16)), self.blocks, self.cells, self.values, packed, occupied)
 
 
@@ -284,5 +284,5 @@ class FullBricks:
         return {"index": self.index, "bricks": self.bricks}
 
     def query(self, points: np.ndarray, packed: np.ndarray, occupied: np.ndarray) -> None:
-        """See `efficientnerf.structures.dense.DenseVoxels.query`."""
+        """See `workflows.paper.structures.dense.DenseVoxels.query`."""
         _query_full(points, self.side, np.uint64(-(-self.side // 4)), self.index, self.bricks, packed, occupied)

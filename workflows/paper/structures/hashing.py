@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.structures.bits import CHUNK, ONE, TASK, ZERO, compare_and_swap, fill, floor_to_uint64, in_grid
-from efficientnerf.structures.voxels import Voxels
+from workflows.paper.structures.bits import CHUNK, ONE, TASK, ZERO, compare_and_swap, fill, floor_to_uint64, in_grid
+from workflows.paper.structures.voxels import Voxels
 
 LOAD_FACTOR = 0.5  # at most
 EMPTY = np.uint64(0xFFFFFFFFFFFFFFFF)  # not a key: keys have 63 bits
@@ -122,5 +122,5 @@ class HashMap:
         return {"table": self.table}
 
     def query(self, points: np.ndarray, packed: np.ndarray, occupied: np.ndarray) -> None:
-        """See `efficientnerf.structures.dense.DenseVoxels.query`."""
+        """See `workflows.paper.structures.dense.DenseVoxels.query`."""
         _query(points, self.side, np.uint64(self.slots), self.table, packed, occupied)

@@ -70,7 +70,7 @@ class _Structure(ABC):
 
 @dataclass(frozen=True, eq=False)
 class DenseVoxels(_Structure):
-    """See `efficientnerf.structures.dense`."""
+    """See `workflows.paper.structures.dense`."""
 
     side: int
     tensors: dict[str, Tensor]
@@ -87,7 +87,7 @@ class DenseVoxels(_Structure):
 
 @dataclass(frozen=True, eq=False)
 class BrickTree(_Structure):
-    """See `efficientnerf.structures.bricks.BrickTree`; masks and ranks in tensors of their own."""
+    """See `workflows.paper.structures.bricks.BrickTree`; masks and ranks in tensors of their own."""
 
     side: int
     tensors: dict[str, Tensor]
@@ -124,7 +124,7 @@ def _exclusive_sum(counts: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class FullBricks(_Structure):
-    """See `efficientnerf.structures.bricks.FullBricks`."""
+    """See `workflows.paper.structures.bricks.FullBricks`."""
 
     side: int
     tensors: dict[str, Tensor]
@@ -147,7 +147,7 @@ class FullBricks(_Structure):
 
 @dataclass(frozen=True, eq=False)
 class HashMap(_Structure):
-    """See `efficientnerf.structures.hashing`. All keys are inserted, and queried, in lockstep: of those that write to one free slot one wins, and the others
+    """See `workflows.paper.structures.hashing`. All keys are inserted, and queried, in lockstep: of those that write to one free slot one wins, and the others
     probe the next.
     """
 
@@ -200,7 +200,7 @@ def _shift_right(word: Tensor, by: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Octree(_Structure):
-    """See `efficientnerf.structures.octree`; depth levels of nodes."""
+    """See `workflows.paper.structures.octree`; depth levels of nodes."""
 
     side: int
     depth: int

@@ -1,17 +1,15 @@
 """Table 7 of the paper: memory, caching and query times of dense voxels, a sparse tensor, an octree and NerfTree on the same voxels.
 
-On the CPU the kernels of `efficientnerf.structures`, on CUDA their plain torch versions. The structures take turns within each repetition, so that
+On the CPU the kernels of `workflows.paper.structures`, on CUDA their plain torch versions. The structures take turns within each repetition, so that
 other load on the machine affects all of them equally.
 """
 
 from __future__ import annotations
 
-import os
 import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -19,16 +17,16 @@ import numpy as np
 import torch
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.structures import torch_structures
-from efficientnerf.structures.bits import fill, gather
-from efficientnerf.structures.bricks import BrickTree, FullBricks
-from efficientnerf.structures.dense import DenseVoxels
-from efficientnerf.structures.hashing import HashMap
-from efficientnerf.structures.octree import Octree
-from efficientnerf.structures.synthetic import clustered, random_points, ray_points, scattered, shuffled
-from efficientnerf.structures.voxels import Voxels
 from pipeline.errors import StageFailed
 from workflows.paper.result import PAPER, Repetitions, Request, Result
+from workflows.paper.structures import torch_structures
+from workflows.paper.structures.bits import fill, gather
+from workflows.paper.structures.bricks import BrickTree, FullBricks
+from workflows.paper.structures.dense import DenseVoxels
+from workflows.paper.structures.hashing import HashMap
+from workflows.paper.structures.octree import Octree
+from workflows.paper.structures.synthetic import clustered, random_points, ray_points, scattered, shuffled
+from workflows.paper.structures.voxels import Voxels
 
 NAMES = {
     "DenseVoxels": "dense voxels",
@@ -85,7 +83,7 @@ def structures(request: Request) -> Result:
     if not cuda:
         cases.append(Case(sides[0], 0.2, shuffled=True))
     points = max(round(POINTS * request.scale * (8 if cuda else 1)), 1000)
-    backend, load = (_in_torch(request.device) if cuda else _in_numba()), _OtherLoad()
+    backend = _in_torch(request.device) if cuda else _in_numba()
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     for case in cases:
@@ -93,7 +91,7 @@ def structures(request: Request) -> Result:
         measured, note = _measure(case, points, backend, request.timings)
         rows += measured
         notes.append(note)
-    return Result(COLUMNS, rows, [*_explained(points, request.timings), *notes, *([] if cuda else [_machine(load)])])
+    return Result(COLUMNS, rows, [*_explained(points, request.timings), *notes, *([] if cuda else [_machine()])])
 
 
 def _measure(case: Case, points: int, backend: Backend, timings: Repetitions) -> tuple[list[dict[str, Any]], str]:
@@ -200,33 +198,8 @@ def _explained(points: int, timings: Repetitions) -> list[str]:
     ]
 
 
-class _OtherLoad:
-    """Share of the processor time that other programs took since this was made."""
-
-    def __init__(self) -> None:
-        self.start, self.own = self._read(), self._own()
-
-    def _read(self) -> tuple[int, int] | None:
-        try:
-            ticks = [int(word) for word in Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
-        except (OSError, ValueError):
-            return None
-        return sum(ticks) - ticks[3] - ticks[4], sum(ticks)
-
-    def _own(self) -> float:
-        spent = os.times()
-        return (spent.user + spent.system) * (os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100)
-
-    def share(self) -> float | None:
-        """0 to 1, of all cores."""
-        now = self._read()
-        if now is None or self.start is None or now[1] == self.start[1]:
-            return None
-        return max(now[0] - self.start[0] - (self._own() - self.own), 0) / (now[1] - self.start[1])
-
-
-def _machine(load: _OtherLoad) -> str:
-    """Threads, caches, and memory bandwidth: random reads and sequential writes."""
+def _machine() -> str:
+    """Threads, and memory bandwidth: random reads and sequential writes."""
     table = np.empty(1 << 27, np.uint64)
     where = np.random.default_rng(SEED).integers(0, len(table), 1 << 21, np.uint64)
     out = np.empty(len(where), np.uint64)
@@ -242,21 +215,7 @@ def _machine(load: _OtherLoad) -> str:
         return min(times)
 
     reads, writes = len(where) / best(lambda: gather(table, where, out)), table.nbytes / best(lambda: fill(table, np.uint64(1)))
-    others = load.share()
     return (
         f"{numba.get_num_threads()} threads, {platform.system()}; memory: {reads / 1e6:.0f} million words a second at random places of 1 GiB, "
-        f"{writes / 1e9:.1f} GB/s written in a row; caches: {_caches()}; other programs took "
-        f"{'an unknown share' if others is None else f'{others:.0%}'} of the processor time."
+        f"{writes / 1e9:.1f} GB/s written in a row."
     )
-
-
-def _caches() -> str:
-    found = []
-    for entry in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
-        try:
-            level, kind, size = ((entry / name).read_text(encoding="ascii").strip() for name in ("level", "type", "size"))
-        except OSError:
-            continue
-        if kind != "Instruction":
-            found.append(f"L{level} {size}")
-    return ", ".join(found) or "unknown"

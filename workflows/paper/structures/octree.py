@@ -16,8 +16,8 @@ from itertools import pairwise
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.structures.bits import CHUNK, ONE, TASK, ZERO, assign_ranks, atomic_or, fill, floor_to_uint64, in_grid, rank
-from efficientnerf.structures.voxels import Voxels
+from workflows.paper.structures.bits import CHUNK, ONE, TASK, ZERO, assign_ranks, atomic_or, fill, floor_to_uint64, in_grid, rank
+from workflows.paper.structures.voxels import Voxels
 
 THREE, SIX, SEVEN = np.uint64(3), np.uint64(6), np.uint64(7)
 NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -171,5 +171,5 @@ class Octree:
         return {"child": self.child, "data": self.data}
 
     def query(self, points: np.ndarray, packed: np.ndarray, occupied: np.ndarray) -> None:
-        """See `efficientnerf.structures.dense.DenseVoxels.query`."""
+        """See `workflows.paper.structures.dense.DenseVoxels.query`."""
         _query(points, self.side, self.depth, self.child, self.data, packed, occupied)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.structures.bits import CHUNK, TASK, ZERO, fill, floor_to_uint64, in_grid
-from efficientnerf.structures.voxels import Voxels
+from workflows.paper.structures.bits import CHUNK, TASK, ZERO, fill, floor_to_uint64, in_grid
+from workflows.paper.structures.voxels import Voxels
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
