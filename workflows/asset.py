@@ -23,6 +23,6 @@ STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}.settings").STAGE
 WORKFLOW = Workflow(
     STAGES,
     Path(__file__).parent / "presets",
-    space=ByName("stages.memory.disk:space_needed"),
-    memory=ByName("stages.memory.plan:memory_needed"),
+    space=ByName("stages.memory.forecast:space_needed"),
+    memory=ByName("stages.memory.forecast:memory_needed"),
 )

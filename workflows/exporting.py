@@ -24,7 +24,7 @@ from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
 from stages.io import scene
 from stages.memory.need import Need, libraries, refuse_more_than
-from stages.memory.rendering import tree_bytes
+from stages.memory.tree import tree_bytes
 from stages.mesh.files import read_mesh
 from stages.mesh.memory import surface_needed
 from stages.mesh.run import SURFACE_SHARE, in_capture, mesh_of

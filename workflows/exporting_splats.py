@@ -16,7 +16,8 @@ from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
 from stages.memory.need import refuse_more_than
-from stages.splats.run import gaussians_of, needed
+from stages.splats.memory import needed
+from stages.splats.run import gaussians_of
 from stages.splats.settings import STAGE, SplatsSettings
 from workflows.cli.resolve import Settings
 from workflows.cli.target import is_run, open_run

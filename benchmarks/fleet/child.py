@@ -68,7 +68,7 @@ class Sleepers:
     def stages(self) -> Sequence[Stage]:
         return STAGES
 
-    def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
+    def prepare(self, run: Path, scene: dict[str, Any], memory: int | None) -> list[str]:
         settings = {stage.name: settings_dict(SleepSettings(**{"word": scene["name"], **scene["settings"].get(stage.name, {})})) for stage in STAGES}
         if not (run / NAME).is_file():
             Run.create(run, None, settings)

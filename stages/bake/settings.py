@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import LEAST_RESOLUTION, Auto, Count, Fraction, NonNegative, Off, Seed, setting
+from efficientnerf.settings import LEAST_RESOLUTION, Auto, Count, Fraction, NonNegative, Off, Seconds, Seed, setting
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
@@ -43,16 +43,16 @@ class BakeSettings:
         "auto", "Depth of a voxel over its width, in normalised device coordinates; auto: 2, or 1 with train.discretise.", advanced=True
     )
     brick_size: Annotated[int, Meta(ge=1, le=16)] = setting(4, "Voxels D_f along a side of a coarse cell of the NerfTree.", advanced=True)
-    visibility_rays: Annotated[int, Meta(ge=1000)] = setting(
+    visibility_rays: Annotated[int, Meta(ge=1000, le=10**9)] = setting(
         1_000_000, "Training pixels that the field is rendered for, to find the visible voxels.", advanced=True
     )
-    weight_threshold: Fraction = setting(
+    weight_threshold: Annotated[float, Meta(ge=0.0, le=0.1)] = setting(
         1e-3,
         "A voxel is kept where its weight in some pixel exceeds this; in forward-facing scenes those that 4 or more training images (half of fewer than 7) have"
         " in view are baked where it exceeds 30 times this.",
         advanced=True,
     )
-    max_mib: Annotated[float, Meta(ge=0.001)] | Auto = setting(  # the header alone has a thousand bytes
+    max_mib: Annotated[float, Meta(ge=0.03, le=65536.0)] | Auto = setting(  # header and palette of 9 harmonics: 28 kB
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
         " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed, whose codes"
@@ -81,7 +81,7 @@ class BakeSettings:
         " from 6 to 15 for each voxel; at least 320 steps.",
         advanced=True,
     )
-    time_budget: Annotated[float, Meta(gt=0.0)] | Off = setting(
+    time_budget: Seconds | Off = setting(
         "off", "Time of the stage, in place of a number of steps: steps of the refinement are timed, and as many are taken as fit; off: refine_steps.",
         unit="seconds",
         advanced=True,

@@ -39,24 +39,24 @@ from stages.compiling import compiling_kernels
 from stages.evaluate.asset import EvaluatedAsset, evaluated
 from stages.evaluate.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view, load_lpips
 from stages.evaluate.judging import judge, training_figures
-from stages.evaluate.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
+from stages.evaluate.memory import needed
+from stages.evaluate.mesh import FIGURES, EvaluatedMesh, load_mesh
 from stages.evaluate.refinement import refinement_of
 from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, MAX_FIELD_RAYS, EvaluateSettings, networks_of
 from stages.evaluate.sparse_points import COUNTS, observed_points
 from stages.evaluate.splats import FIGURES as SPLATS_FIGURES
 from stages.evaluate.splats import EvaluatedSplats, load_splats
-from stages.evaluate.strips import STRIP_RAYS, strip_views, write_strips
+from stages.evaluate.strips import strip_views, write_strips
 from stages.evaluate.summary import in_words, quality, summary
 from stages.evaluate.trivial import BLURS
 from stages.evaluate.video import write_captured_path
-from stages.evaluate.views import constant_background, evaluation_views, evenly_spaced, stride_for
+from stages.evaluate.views import bounded_stride, constant_background, evaluation_views, evenly_spaced, stride_for
 from stages.figures.plots import contact_sheet, thumbnail_of
 from stages.io.field_file import load_renderer
 from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
-from stages.io.scene import View, load
-from stages.memory.need import Need, refuse_what_does_not_fit
-from stages.memory.rendering import views_needed
+from stages.io.scene import View
+from stages.memory.need import refuse_what_does_not_fit
 from stages.scratch import note, noted, once
 from stages.train.averaged import as_taken
 
@@ -78,17 +78,6 @@ def run(job: Job) -> None:
     refuse_what_does_not_fit(job, needed(tree, job.settings, inputs, job.device), "Lower poses.max_image_size or bake.max_mib.")
     region = read_json(inputs.mesh.report).get("region", "foreground")
     evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree), refinement_of(inputs.bake))
-
-
-def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
-    """What comparing its views with photographs takes of memory."""
-    cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
-    scale = given(settings.field_image_scale)
-    most = max(camera.width * camera.height for camera in cameras)
-    rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
-    if settings.strips == "on":
-        rays = max(rays, min(most, STRIP_RAYS))
-    return views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, device, mesh=mesh_bytes(inputs.mesh))
 
 
 def evaluate(
@@ -149,7 +138,7 @@ def evaluate(
 def _field_stride(views: Sequence[View], scale: float | None) -> int:
     """The stride of the pixels that the field renders; None: as is affordable."""
     if scale is not None:
-        return max(1, math.ceil(1.0 / scale - 1e-6))
+        return bounded_stride(views, max(1, math.ceil(1.0 / scale - 1e-6)))
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     return max(math.ceil(longest / MAX_FIELD_IMAGE_SIZE), stride_for(views, MAX_FIELD_RAYS))
 

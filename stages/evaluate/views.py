@@ -52,7 +52,12 @@ def evenly_spaced(count: int, wanted: int | None) -> list[int]:
 def stride_for(views: Sequence[View], rays: int) -> int:
     """The stride at which the views together have at most about this many rays."""
     total = sum(view.camera.width * view.camera.height for view in views)
-    return max(1, math.ceil(math.sqrt(total / rays)))
+    return bounded_stride(views, max(1, math.ceil(math.sqrt(total / rays))))
+
+
+def bounded_stride(views: Sequence[View], stride: int) -> int:
+    """The stride, or the largest one that leaves a pixel of each view."""
+    return min([stride, *(min(view.camera.width, view.camera.height) for view in views)])
 
 
 def ground_truth(folder: Path, view: View, background: tuple[float, float, float] | None, stride: int = 1) -> GroundTruth:

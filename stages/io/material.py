@@ -17,7 +17,8 @@ from stages.formats.importers.masks import masks_of
 from stages.formats.importers.photographs import is_video, photographs
 from stages.formats.importers.source import MIN_IMAGES, Source
 from stages.io.pictures import MAX_SIDE, UnreadableImage, read_header
-from stages.poses.memory import refuse_large_videos
+from stages.memory.need import refuse_what_does_not_fit
+from stages.poses.memory import video_needed
 from stages.video.figure import write_frames_plot, write_frames_sheet
 from stages.video.frames import Reader, frames_of
 from stages.video.panorama import VIEWS, is_panorama, views_of
@@ -90,7 +91,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
     for path in found.videos.values():
         with contextlib.suppress(UnreadableVideo), opened(path) as video:  # said where it is read
             sizes.append(video.stored)
-    refuse_large_videos(job, sizes)
+    refuse_what_does_not_fit(job, video_needed(sizes), "Export the video at a lower resolution.")
     reader = Reader(min(DECODERS, count_cores()), job.work / "videos", job.progress, job.safe_point, warn)
     try:
         chosen = frames_of(found.videos, count=job.settings.frames, max_side=max_side, reader=reader)

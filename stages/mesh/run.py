@@ -15,7 +15,7 @@ from efficientnerf.surface.agreement import AssetView
 from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import Mesh, face_areas, face_volumes, moved, topology
 from efficientnerf.surface.nested import scene_surface
-from pipeline.errors import StageFailed
+from pipeline.errors import UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
@@ -25,12 +25,12 @@ from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
 from stages.io.png import write_png
-from stages.memory.need import Need, refuse_what_does_not_fit
+from stages.memory.need import refuse_what_does_not_fit
 from stages.mesh.check import asset_views, checked, level_of, shown_by, warning_of
 from stages.mesh.files import write_empty_meshes
-from stages.mesh.memory import surface_needed
+from stages.mesh.memory import needed
 from stages.mesh.settings import MeshSettings, refuse_normal_map_without_texture
-from stages.mesh.texture import facts_of, largest_photograph, textured, with_relief
+from stages.mesh.texture import facts_of, textured, with_relief
 from stages.mesh.timing import Stopwatch
 
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
@@ -43,7 +43,7 @@ def mesh_of(
     tree: NerfTree, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
     dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Mesh:  # fmt: skip
-    """The tree's surface in the training frame; `progress` takes (done, total, text). Raises StageFailed where there is none at a density that was asked for;
+    """The tree's surface in the training frame; `progress` takes (done, total, text). Raises UsageError where there is none at a density that was stated;
     else it has no faces then, and "no_surface" among its facts says why.
 
     views   is given those of the asset that say which components it shows
@@ -75,7 +75,7 @@ def mesh_of(
         )
     except NoSurface as error:
         if threshold is not None:
-            raise StageFailed(f"mesh: {error}. {remedy('mesh', threshold)}") from error
+            raise UsageError(f"mesh: {error}. {remedy('mesh', threshold)}") from error
         mesh = nothing(str(error))
     return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"})
 
@@ -159,12 +159,6 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
     write_json(outputs.report, describe(mesh, frame) | {"region": job.settings.region} | agreed)
     job.warn(f"the mesh is empty: {mesh.facts['no_surface']}. {remedy('mesh', None)}")
     job.say("no faces", faces=0, components=0, watertight=False)
-
-
-def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
-    """What meshing and texturing it take of memory."""
-    texture = 0 if settings.texture == "off" else settings.texture_size
-    return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
 
 
 @compiling_kernels

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Fraction, setting
+from efficientnerf.settings import Auto, Density, Fraction, setting
 from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, needs_of
@@ -22,10 +22,10 @@ class MeshSettings:
         "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
         advanced=True,
     )
-    max_faces: Annotated[int, Meta(ge=100)] | Literal["20k", "100k", "500k"] = setting(
+    max_faces: Annotated[int, Meta(ge=100, le=10**8)] | Literal["20k", "100k", "500k"] = setting(
         200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
     )
-    density_threshold: Annotated[float, Meta(gt=0.0)] | Auto = setting(
+    density_threshold: Density | Auto = setting(
         "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
     )
     min_component: Fraction = setting(

@@ -10,7 +10,7 @@ from efficientnerf.settings import given
 from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import PointCloud
 from efficientnerf.surface.nested import scene_points
-from pipeline.errors import StageFailed
+from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of
 from stages.compiling import compiling_kernels
@@ -29,7 +29,7 @@ def points_of(
 ) -> PointCloud:
     """Points on the tree's surface, clipped to a region, in the capture's frame.
 
-    Raises StageFailed where there is none; `progress` takes (done, total, text).
+    Raises StageFailed where there is none, UsageError where there is none at a density that was stated; `progress` takes (done, total, text).
     """
     progress = whole_progress(progress, 1 + len(tree.outer))
     views, fused = asset_views(tree, progress)
@@ -52,7 +52,8 @@ def points_of(
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
+        failure = StageFailed if settings.density_threshold == "auto" else UsageError
+        raise failure(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
     back = frame.world_from_capture.inverse()
     return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
 

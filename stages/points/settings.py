@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Fraction, PositiveInt, Seed, setting
+from efficientnerf.settings import Auto, Density, Fraction, Seed, setting
 from pipeline.stage import ByName, Stage
 from stages.artifacts import PointsInputs, needs_of
 
@@ -19,8 +19,8 @@ class PointsSettings:
     region: Literal["foreground", "all"] = setting(
         "foreground", "What gets points: the subject with what supports it, its edge clipped (foreground), or the whole scene (all).", advanced=True
     )
-    num_points: PositiveInt = setting(200_000, "Number of points.")
-    density_threshold: Annotated[float, Meta(gt=0.0)] | Auto = setting(
+    num_points: Annotated[int, Meta(ge=1, le=10**8)] = setting(200_000, "Number of points.")
+    density_threshold: Density | Auto = setting(
         "auto",
         "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes.",
         advanced=True,

@@ -34,7 +34,8 @@ from stages.io.scene import SPLITS, Scene, View, save, save_points
 from stages.io.silhouettes import SmallPictures
 from stages.masking.photographs import cameras_of_photographs, mask_choice, masks_made_for
 from stages.masking.polarity import capture_kept_white
-from stages.poses.memory import reading_threads, refuse_large_photographs
+from stages.memory.need import refuse_what_does_not_fit
+from stages.poses.memory import decoding_needed, reading_threads
 from stages.poses.settings import PosesSettings
 from stages.verdict.writing import judge
 
@@ -54,7 +55,8 @@ def run(job: Job) -> None:
 
     capture = read(job, settings, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
-    refuse_large_photographs(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos])
+    sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
+    refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
     small = SmallPictures()
     capture, mask_facts = with_mask_use(job, capture, small, warn)
     capture, written = _write_images(job, capture, warn)

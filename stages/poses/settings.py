@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, PositiveInt, setting
+from efficientnerf.settings import Auto, PositiveInt, given, setting
+from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
 from stages.formats import importers
 
@@ -16,6 +18,9 @@ if TYPE_CHECKING:  # mypy takes no Literal of a tuple that is computed
     Format = str
 else:
     Format = Literal[importers.FORMATS]  # the names of the table of importers
+
+Coordinate = Annotated[float, Meta(ge=-1e9, le=1e9)]
+LEAST_SIDE = 1e-9  # of a crop box, in the capture's units
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class PosesSettings:
         1024, "Longest side of the images that later stages read; larger ones are reduced.", unit="pixels"
     )
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "Axis of the capture's frame that points up; auto: estimated.")
-    crop_box: tuple[float, float, float, float, float, float] | Auto = setting(
+    crop_box: tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] | Auto = setting(
         "auto", "Crop box in the capture's frame: x y z of one corner, then of the opposite one; auto: estimated."
     )
     box_margin: Annotated[float, Meta(ge=0.0, le=2.0)] = setting(
@@ -72,7 +77,9 @@ class PosesSettings:
         "What is kept of given masks: what is not black in them (white), or what is (black); auto: white, unless black shows one compact object in nearly all.",
         advanced=True,
     )
-    test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
+    test_every: Annotated[int, Meta(ge=2, le=10**6)] = setting(
+        8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True
+    )
     llff_factor: PositiveInt | Auto = setting(
         "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
     )
@@ -107,4 +114,20 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
     return [*importers.files(source, settings), *networks]
 
 
-STAGE = Stage(name="poses", version=14, settings=PosesSettings, needs=(), run=ByName("stages.poses.run:run"), reads_source=True, source_files=files)
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where a crop box is stated that has no volume."""
+    box = given(settings["poses"].crop_box)
+    if box is not None and min(abs(low - high) for low, high in zip(box[:3], box[3:], strict=True)) < LEAST_SIDE:
+        raise UsageError(f"poses.crop_box={list(box)}: has no volume; expected x y z of one corner, and of the opposite one.")
+
+
+STAGE = Stage(
+    name="poses",
+    version=14,
+    settings=PosesSettings,
+    needs=(),
+    run=ByName("stages.poses.run:run"),
+    reads_source=True,
+    source_files=files,
+    check=check,
+)

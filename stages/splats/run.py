@@ -33,9 +33,8 @@ from stages.framing.camera_paths import turntable_cameras
 from stages.framing.restriction import restricted
 from stages.io.png import write_png
 from stages.io.refined_cameras import load_scene
-from stages.io.scene import views_of
-from stages.memory.need import Need, refuse_what_does_not_fit
-from stages.splats.memory import splats_needed
+from stages.memory.need import refuse_what_does_not_fit
+from stages.splats.memory import most_gaussians, needed
 from stages.splats.pictures import photographs, render_cameras, renders
 from stages.splats.settings import SplatsSettings
 
@@ -67,15 +66,7 @@ def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
     steps = given(settings.iterations)
     if steps is None:
         steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, MOST_STEPS))
-    return Budget(min(settings.count, max(1, int(np.median(pixels)))) if pixels else settings.count, settings.sh_degree, steps, settings.seed)
-
-
-def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None) -> Need:
-    """What `gaussians_of` takes of memory."""
-    own = captured is None or settings.pictures == "asset" or settings.region == "foreground"
-    cameras = render_cameras(tree) if own or captured is None else [view.camera for view in views_of(load_scene(*captured), "train")]
-    pixels = [camera.width * camera.height for camera in cameras]
-    return splats_needed(tree, budget_of(settings, pixels).count, settings.sh_degree, sum(pixels), max(pixels, default=0))
+    return Budget(most_gaussians(settings, pixels), settings.sh_degree, steps, settings.seed)
 
 
 def preview(tree: NerfTree, gaussians: Gaussians) -> np.ndarray:

@@ -17,8 +17,8 @@ from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.framing.camera_paths import turntable_cameras
 from stages.framing.restriction import restricted
 from stages.memory.need import refuse_what_does_not_fit
-from stages.memory.rendering import frames_needed
 from stages.scratch import Warn
+from stages.turntable.memory import frames_needed
 from stages.turntable.settings import TurntableSettings
 
 

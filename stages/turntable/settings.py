@@ -39,7 +39,7 @@ class TurntableSettings:
     elevation: Annotated[float, Meta(ge=-90.0, le=90.0)] | Auto = setting(
         "auto", "Angle of the camera above the horizon; auto: that of the capture's cameras.", unit="degrees", advanced=True
     )
-    radius: Annotated[float, Meta(ge=1e-9)] | Auto = setting(
+    radius: Annotated[float, Meta(ge=1e-9, le=1e9)] | Auto = setting(
         "auto", "Distance of the camera from the centre in the capture's units; auto: that of the capture's cameras, or more to fit the asset.", advanced=True
     )
     fov: Annotated[float, Meta(ge=1.0, le=160.0)] | Auto = setting(

@@ -10,9 +10,11 @@ import pytest
 
 from efficientnerf.backends import kernel_cache
 from pipeline.errors import UsageError
+from pipeline.executors.memory import parse_size
 from workflows.asset import WORKFLOW
 from workflows.budget import MIN_BAKE, MIN_TRAIN, PHOTOGRAPHS_TRAIN_SHARE, TRAIN_SHARE, share_budget
 from workflows.cli.request import Options, plan_run
+from workflows.fleet.program import WorkflowProgram
 
 
 @pytest.fixture
@@ -98,3 +100,6 @@ def test_what_a_run_takes_whatever_its_limit_is_said_as_it_begins(
     monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr("pipeline.executors.memory.usable_memory", lambda *_: None)
     assert len(plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny", memory=memory)).warnings) == expected
+    scene = {"sources": [str(source)], "settings": {}, "preset": "tiny", "seed": None}
+    warnings = WorkflowProgram(WORKFLOW).prepare(tmp_path / "fleet" / "run", scene, parse_size(memory))
+    assert len([text for text in warnings if "its share of the worker's memory" in text]) == expected, "a fleet's scene, too"

@@ -20,10 +20,10 @@ from stages.framing.camera_paths import PATHS, similarity_of
 from stages.framing.restriction import restricted, with_region
 from stages.io.camera_path import read_camera_path
 from stages.memory.need import refuse_more_than
-from stages.memory.rendering import frames_needed
 from stages.mesh import run as mesh
 from stages.points import run as points
 from stages.splats import run as splats
+from stages.turntable.memory import frames_needed
 from stages.turntable.run import cameras_of
 from stages.turntable.settings import TurntableSettings
 from workflows import exporting, exporting_splats

@@ -31,6 +31,7 @@ class Options:
     """The options of the command line; None or empty where not given.
 
     table  settings of a fleet's scene, as its manifest has them
+    share  bytes of its worker's memory that the scene's stages have
     """
 
     source: Path | None = None
@@ -50,6 +51,7 @@ class Options:
     features_model: tuple[str, str] | None = None
     device: str | None = None
     memory: str | None = None
+    share: int | None = None
     strict: bool = False
     allow_outside: bool = False
 
@@ -133,7 +135,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
     warnings += _without_effect(settings, config, options)
     memory, limit = _memory(options.memory, standing, warnings)
-    warnings += _beyond(limit, workflow.stages)
+    warnings += _beyond(limit if options.share is None else Limit(options.share, "its share of the worker's memory"), workflow.stages)
     run = Run(
         path,
         sources[0] if sources else None,

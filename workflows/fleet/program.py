@@ -31,11 +31,12 @@ class WorkflowProgram:
     def stages(self) -> Sequence[Stage]:
         return self.workflow.stages
 
-    def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
+    def prepare(self, run: Path, scene: dict[str, Any], memory: int | None) -> list[str]:
         """As `enerf run` does it: of a run that is there, settings that the manifest does not have become those of its preset again."""
         preset = scene["preset"] or (self._open(run).preset if (run / NAME).is_file() else None)
         sources = [Path(source) for source in scene["sources"]]
-        options = Options(source=sources[0] if sources else None, also=tuple(sources[1:]), preset=preset, seed=scene["seed"], table=scene["settings"])
+        facts = {"preset": preset, "seed": scene["seed"], "table": scene["settings"], "share": memory}
+        options = Options(source=sources[0] if sources else None, also=tuple(sources[1:]), **facts)
         plan = plan_run(run, self.workflow, options)
         with plan.written() as written:
             refuse_what_cannot_work(self.stages, written)

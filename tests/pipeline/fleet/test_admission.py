@@ -101,6 +101,7 @@ def test_what_is_not_known_has_a_share_and_a_limit_that_is_not_known_is_none(tmp
     assert run(tmp_path / "one", workers, scenes(20)).state == "done"
     given = {(task.worker, task.request["kind"], task.memory) for task in workers.tasks}
     assert given >= {("a", "stage", 2 * GIB), ("b", "stage", None), ("a", "prepare", GIB // 2), ("b", "finish", None)}
+    assert {task.request["memory"] for task in workers.tasks if what(task.request) == "prepare"} == {2 * GIB, None}, "for warnings"
     workers = Simulated([Worker("a", 8, None, slots=2)], taking({("s0", "train"): 900 * GIB}))
     found = run(tmp_path / "two", workers, scenes(3))
     assert found.state == "done"

@@ -328,6 +328,13 @@ def test_stages_are_admitted_by_what_they_write(tmp_path: Path, monkeypatch: pyt
     assert run(tmp_path, Simulated([Worker("a", 2)], answer), scenes(5), former=found).state == "done"
 
 
+def test_a_full_disk_fails_a_scene_and_the_next_command_tries_it_again(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 2)], at("s1", "bake", kind="disk", text="bake: no space left."))
+    found = run(tmp_path, workers, scenes(3))
+    assert [(scene.state, scene.reason) for scene in found.scenes] == [("done", None), ("failed", "bake: no space left."), ("done", None)]
+    assert run(tmp_path, Simulated([Worker("a", 2)]), scenes(3), former=found).state == "done"
+
+
 def test_what_was_written_already_is_not_asked_for_twice(tmp_path: Path) -> None:
     """Free space has shrunk by it."""
     (tmp_path / "s0" / ".work" / "train").mkdir(parents=True)

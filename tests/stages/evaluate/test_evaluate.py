@@ -17,10 +17,11 @@ from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import Interrupted
 from stages.evaluate.splats import EvaluatedSplats
-from stages.evaluate.views import subsample, subsample_camera, upsample
+from stages.evaluate.views import bounded_stride, stride_for, subsample, subsample_camera, upsample
 from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
+from stages.io.scene import View
 from tests.fakes import WHITE, BallField
 from tests.stages.evaluate.balls import HEIGHT, TREE, WIDTH, figures_of, job_in, make_scene, measure, settings
 from tests.stages.spoilers import SPOILERS
@@ -167,6 +168,15 @@ def test_every_scratch_file_of_an_evaluation_may_be_damaged(tmp_path: Path, patt
         assert (job.out / name).read_bytes() == (whole.out / name).read_bytes()
     warned = [event["text"].partition(" ")[0] for event in events if event["event"] == "warning" and ".json" in event["text"].partition(" ")[0]]
     assert warned == ["view_00000.json" if pattern == "view_*" else "view_00001.json"]
+
+
+def test_stride_for_bounds_the_pixels() -> None:
+    view = View("a", None, "test", Camera("a", 100, 100, "SIMPLE_PINHOLE", (1.0, 50.0, 50.0), np.eye(4)), None, 0.0, 1.0)
+    assert stride_for([view] * 4, 40_000) == 1
+    assert stride_for([view] * 4, 10_000) == 2
+    assert stride_for([view] * 4, 9_999) == 3
+    assert stride_for([], 1) == 1
+    assert stride_for([view], 1) == bounded_stride([view], 10**6) == min(view.camera.width, view.camera.height), "each view keeps a pixel"
 
 
 @pytest.mark.parametrize("stride", [1, 3])

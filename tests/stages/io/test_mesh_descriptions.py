@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import struct
+import time
 import tracemalloc
 from collections.abc import Callable
 from contextlib import suppress
@@ -247,6 +248,14 @@ def test_memory_is_bounded_by_the_files_size(tmp_path: Path, name: str) -> None:
     path = tmp_path / f"a{Path(name).suffix or '.glb'}"
     path.write_bytes(large(name))
     assert peak_of(path) < TIMES * path.stat().st_size + ROOM
+
+
+def test_an_obj_of_many_blocks_takes_time_by_its_size(tmp_path: Path) -> None:
+    """20,000 blocks took 43 s, and time by the square of their number."""
+    data = b"".join(BLOCK.replace(b"%", b"%d" % k) for k in range(20_000))
+    began = time.process_time()
+    assert described(tmp_path / "a.obj", data)["faces"] == 20_000
+    assert time.process_time() - began < 5.0
 
 
 @pytest.mark.parametrize("suffix", sorted(MESHES))

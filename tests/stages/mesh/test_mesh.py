@@ -14,7 +14,7 @@ import trimesh
 from efficientnerf.asset import format
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface.mesh import Mesh
-from pipeline.errors import CorruptArtifact, StageFailed
+from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.stage import Job
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
 from stages.evaluate.mesh import load_mesh
@@ -114,7 +114,7 @@ def test_the_same_asset_gives_the_same_bytes(ball: Path, photographed: Path, tmp
 
 
 def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, photographed: Path, tmp_path: Path) -> None:
-    with pytest.raises(StageFailed, match=r"mesh\.density_threshold"):
+    with pytest.raises(UsageError, match=r"mesh\.density_threshold"):
         stage.run(Job(settings=MeshSettings(density_threshold=1e4), inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
 
 
