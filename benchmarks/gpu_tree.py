@@ -13,10 +13,9 @@ from efficientnerf.asset.refinement import device as refinement
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.rule import DECAY, EPSILON
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.layout import Hyperparameters, Moments, RayTargets
+from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients
-from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.backends.triton import tree_gradients, tree_steps
 from efficientnerf.geometry.cameras import rays
 
@@ -44,7 +43,7 @@ def patch_rays(tree: NerfTree, side: int, views: int, count: int) -> tuple[np.nd
 def voxels_met(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, first: np.ndarray) -> tuple[int, int]:
     """How many voxels packets meet, summed over the packets, and how many all do."""
     start, along, bases = in_voxels(tree, origins, directions)
-    cells, sh = cells_of(tree_grid(tree)), tree.sh.reshape(len(tree.sh), -1)
+    cells, sh = cells_of(tree), tree.sh.reshape(len(tree.sh), -1)
     dense = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values)
     _, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), dense, sh, targets, gradients.RecordBuffer())
     found = [records.numbers[begin:end, 0] for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True)]
@@ -66,7 +65,7 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
     grid, density, sh = refinement.values_of(tree, torch.device(device))
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp, none = torch.zeros(len(density), dtype=torch.int32, device=device), torch.zeros(0, device=device)
-    moments = tree_steps.Moments(none, none, torch.zeros_like(density), torch.zeros_like(density), torch.zeros_like(stamp))
+    moments = Moments(none, none, torch.zeros_like(density), torch.zeros_like(density), torch.zeros_like(stamp))
     neighbours = tree_steps.Neighbours(none, torch.zeros(0, 6, dtype=torch.int32, device=device))
 
     def loss_gradients() -> None:
@@ -75,7 +74,7 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
         tree_gradients.backward(grid, sent, density, sh, outputs, (by[0], by[1]), sums, stamp, 1)
 
     def step() -> None:  # of no length, so that every repetition does the same
-        rule = tree_steps.Hyperparameters(0.0, 0.0, 1.0, DECAY, EPSILON)
+        rule = Hyperparameters(0.0, 0.0, 1.0, DECAY, EPSILON)
         tree_steps.step(grid, (density, sh), sums, moments, stamp, rule, neighbours, number=1, rays=count)
 
     of_packets, of_all = voxels_met(tree, origins, directions, host, first)

@@ -95,16 +95,16 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
     from efficientnerf.asset.refinement.targets import step_rng
     from efficientnerf.asset.refinement.tiles import tiles_met
-    from efficientnerf.backends.numba.tree.walk import tree_grid
+    from efficientnerf.backends.layout import Moments
+    from efficientnerf.backends.numba.tree.cells import cells_of
     from efficientnerf.backends.numba.tree_training import gradients
-    from efficientnerf.backends.numba.tree_training.cells import cells_of
     from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
-    from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
+    from efficientnerf.backends.numba.tree_training.steps import step, values_of
     from efficientnerf.training.patches import PatchGrid
 
     tree, targets = loaded(run)
     state = initial_state(tree, MAX_INITIAL_THICKNESS)
-    cells, buffer, patches = cells_of(tree_grid(tree)), gradients.RecordBuffer(), PatchGrid(targets.pixels, side)
+    cells, buffer, patches = cells_of(tree), gradients.RecordBuffer(), PatchGrid(targets.pixels, side)
     values, error_map = values_of(cells, state.density, state.sh), ErrorMap(patches, tiles_met(tree, patches))
     width = state.sh.shape[1]
     moments = Moments(np.zeros(0, np.float32), np.zeros((0, width), np.float32), state.square_density, state.square_sh, state.visits)

@@ -44,6 +44,8 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
     "ray_directions": {"torch": "backends.torch.rays", "numba": "backends.numba.operations"},
     "tree_rays": {"numba": "backends.numba.operations", "triton": "backends.triton.tree"},
 }
+# The module whose `optimise`, `total_loss` and `max_weights` fit trees to photographs; see `efficientnerf.asset.refinement.fit`.
+FITTING: dict[Backend, str] = {"numba": "asset.refinement.host", "triton": "asset.refinement.device"}
 
 
 def backend_of(*tensors: Tensor) -> Backend:
@@ -66,6 +68,11 @@ def implementation(name: str, backend: Backend) -> Callable[..., Any]:
     modules = OPERATIONS[name]
     module = modules[backend] if backend in modules else modules["torch"]
     return getattr(importlib.import_module(f"efficientnerf.{module}"), name)
+
+
+def fitting(backend: Backend) -> Any:
+    """The module of FITTING."""
+    return importlib.import_module(f"efficientnerf.{FITTING[backend]}")
 
 
 @functools.cache

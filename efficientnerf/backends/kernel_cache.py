@@ -41,7 +41,8 @@ from efficientnerf.backends import Notice
 PACKAGE = Path(__file__).resolve().parent.parent
 KERNELS = ("backends/numba", "structures")  # folders of the package that hold kernels
 CONSTANTS = (  # modules that these import: numbers among them are part of the compiled code
-    "geometry/cameras.py", "geometry/ndc.py", "geometry/spaces.py", "rendering/compositing.py", "rendering/harmonics.py", "sampling/samples.py",
+    "backends/layout.py", "geometry/cameras.py", "geometry/ndc.py", "geometry/spaces.py", "rendering/compositing.py", "rendering/harmonics.py",
+    "sampling/samples.py",
 )  # fmt: skip
 KEPT, UNUSED_DAYS = 8, 30  # folders of other keys: so many, unless used within a day; none that was not used for so many days
 DAY = 86400.0

@@ -22,7 +22,7 @@ from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coor
 from efficientnerf.asset.region import voxel_centres
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import contributions, queries
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree.cells import cells_of as tree_cells
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
@@ -66,7 +66,7 @@ class Shown:
 
 def greatest_weights(tree: NerfTree, cameras: Sequence[Camera], count: int = RAYS) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of about `count` pixels, spread evenly over the pictures."""
-    grid, found = tree_grid(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
+    grid, found = tree_cells(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
     stride = max(1.0, np.sqrt(sum(camera.width * camera.height for camera in cameras) / count))
     for number, camera in enumerate(cameras):
         # Each picture's raster begins elsewhere, so that together they meet more voxels.

@@ -45,16 +45,18 @@ def build(self: JITFunction, *args: Any, grid: Any, warmup: bool, num_warps: int
     """Stands for `JITFunction.run`."""
     given = dict(zip(self.arg_names, args, strict=False)) | kwargs
     constants = {p.name: given[p.name] for p in self.params if p.is_constexpr}
-    signature, attributes = {}, {}
-    for place, name in enumerate(self.arg_names):
-        value = given[name]
-        if name in constants:
-            signature[name] = "constexpr"
-        elif isinstance(value, torch.Tensor):
-            signature[name] = TYPES[value.dtype]
-            attributes[(place,)] = [["tt.divisibility", 16]]  # as the allocator gives them
-        else:
-            signature[name] = "fp32" if isinstance(value, float) else "i32"
+    attributes: dict[tuple[int, ...], Any] = {}
+
+    def kind(value: Any, *place: int) -> Any:
+        if isinstance(value, tuple):
+            kinds = [kind(part, *place, n) for n, part in enumerate(value)]
+            return type(value)(*kinds) if hasattr(value, "_fields") else tuple(kinds)
+        if isinstance(value, torch.Tensor):
+            attributes[place] = [["tt.divisibility", 16]]  # as the allocator gives them
+            return TYPES[value.dtype]
+        return "fp32" if isinstance(value, float) else "i32"
+
+    signature = {name: "constexpr" if name in constants else kind(given[name], place) for place, name in enumerate(self.arg_names)}
     key = f"{self.__name__} {constants} {signature}"
     if key in seen:
         return
@@ -107,6 +109,7 @@ def images() -> None:
 
 
 def fit() -> None:
+    from efficientnerf.backends.layout import Hyperparameters, Moments
     from efficientnerf.backends.triton import tree_gradients, tree_steps
     from tests.efficientnerf.trees import random_cascades, random_tree
 
@@ -121,9 +124,9 @@ def fit() -> None:
         tree_gradients.backward(g, rays, *values, outputs, (outputs[0], outputs[1]), sums, stamp, 7)
         tree_gradients.max_contributions(g, rays, values[0], outputs[1], squares[0])
         for momentum, total_variation in ((0.0, 0.0), (0.9, 0.1)):
-            rule = tree_steps.Hyperparameters(0.1, 0.1, 0.5, 0.9, 1e-10, momentum, total_variation)
+            rule = Hyperparameters(0.1, 0.1, 0.5, 0.9, 1e-10, momentum, total_variation)
             neighbours = tree_steps.Neighbours(torch.zeros(count), torch.zeros(count, 6, dtype=torch.int32))
-            tree_steps.step(g, values, sums, tree_steps.Moments(*values, *squares, visits), stamp, rule, neighbours, number=7, rays=8)
+            tree_steps.step(g, values, sums, Moments(*values, *squares, visits), stamp, rule, neighbours, number=7, rays=8)
 
 
 if __name__ == "__main__":

@@ -14,13 +14,11 @@ from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.layout import EARLY_STOP, Hyperparameters, Moments, RayTargets
+from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients as kernels
-from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, Records, packets_of
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
-from efficientnerf.backends.numba.tree_training.steps import Moments, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
+from efficientnerf.backends.numba.tree_training.steps import sum_gradients, values_of
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
@@ -60,7 +58,7 @@ def packet_gradients(
     """`gradients` of packets whose first rays, and the end, are (P + 1,)."""
     start, along, bases = in_voxels(tree, origins, directions)
     density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
-    cells = cells_of(tree_grid(tree))
+    cells = cells_of(tree)
     dense = dense_densities(cells, voxel_places(cells, len(sh)), density)
     loss, records = kernels.forward_backward(
         cells, first, start, along, packet_bases(bases.astype(dtype), first), dense, sh, seen, RecordBuffer(dtype), stop=stop,
@@ -104,7 +102,7 @@ def records_of(tree: NerfTree, state: RefinementState, seed: int, packet: int = 
     seen = seen_at_random(100, 0.2, np.float32)
     start, along, bases = in_voxels(tree, origins, directions)
     first = packets_of(100, packet)
-    cells, basis = cells_of(tree_grid(tree)), packet_bases(bases, first)
+    cells, basis = cells_of(tree), packet_bases(bases, first)
     values = values_of(cells, state.density, state.sh)
     return kernels.forward_backward(cells, first, start, along, basis, values.dense, values.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
 

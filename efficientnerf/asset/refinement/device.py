@@ -19,14 +19,13 @@ from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.walk import tree_grid
-from efficientnerf.backends.numba.tree_training.cells import cells_of
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
+from efficientnerf.backends.layout import Hyperparameters, Moments
+from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
-from efficientnerf.backends.triton.tree_steps import Moments, Neighbours, step
+from efficientnerf.backends.triton.tree_steps import Neighbours, step
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.readback import LAG
@@ -79,7 +78,7 @@ class DeviceArrays:
 
 def voxels_beside(tree: NerfTree) -> np.ndarray:
     """(N, 6) int32: the voxels beyond the faces -x, x, -y, y, -z, z of each, -1 where none is stored. Those of different cascades are not beside each other."""
-    around, b = neighbours_of(cells_of(tree_grid(tree))).around, tree.brick
+    around, b = neighbours_of(cells_of(tree)).around, tree.brick
     index = tree.voxel_index.reshape(-1, b, b, b)
     found = np.full((len(tree.density_values), 6), -1, np.int32)
     for face in range(6):

@@ -13,24 +13,17 @@ PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from types import ModuleType
 
 import numpy as np
 
-from efficientnerf.asset.refinement import host
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.dispatch import fitting
 
 PATCH_SIDE = 4  # docs/experiments/tree-training-kernels.md
 WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measured the rays leave records
-
-
-def _device() -> ModuleType:
-    from efficientnerf.asset.refinement import device  # its kernels need Triton, which is there on CUDA alone
-
-    return device
 
 
 def optimise(
@@ -47,13 +40,7 @@ def optimise(
     patch_side               pixels along a side of the patches that rays are drawn in
     rule                     what is minimised besides
     """
-    if targets.on_device:
-        yield from _device().optimise(
-            state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
-            patch_side=patch_side, rule=rule,
-        )  # fmt: skip
-        return
-    yield from host.optimise(
+    yield from fitting(targets.backend).optimise(
         state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
         patch_side=patch_side, rule=rule,
     )  # fmt: skip
@@ -63,9 +50,7 @@ def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
     """Mean squared error of a channel over `count` training pixels drawn by `seed`; objects over the background of the scene."""
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
     bundles = (targets.draw(min(ERROR_RAYS, count - begin), rng, constant_background=True) for begin in range(0, count, ERROR_RAYS))
-    if targets.on_device:
-        return float(_device().total_loss(tree, targets, bundles)) / (3 * count)
-    return host.total_loss(tree, bundles) / (3 * count)
+    return float(fitting(targets.backend).total_loss(tree, targets, bundles)) / (3 * count)
 
 
 def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
@@ -77,9 +62,8 @@ def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progres
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 4, 0]))
     chosen = np.sort(targets.host_pixels.choose(count, rng))
     bundles = _reported((targets.of(chosen[begin : begin + WEIGHT_RAYS]) for begin in range(0, count, WEIGHT_RAYS)), count, progress)
-    if targets.on_device:
-        return _device().max_weights(tree, targets, bundles)
-    return host.max_weights(tree, bundles)
+    weights: np.ndarray = fitting(targets.backend).max_weights(tree, targets, bundles)
+    return weights
 
 
 def _reported(bundles: Iterator[Bundle], count: int, progress: Callable[[int, int], None] | None) -> Iterator[Bundle]:

@@ -15,13 +15,13 @@ from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.layout import Moments
 from efficientnerf.backends.numba.tree import contributions
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients
-from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
-from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
+from efficientnerf.backends.numba.tree_training.steps import step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.patches import PatchGrid
 
@@ -47,7 +47,7 @@ def optimise(
     view_dependent_lr_ratio: float, patch_side: int, rule: Rule = PLAIN,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`."""
-    cells, buffer = cells_of(tree_grid(state.tree)), RecordBuffer()
+    cells, buffer = cells_of(state.tree), RecordBuffer()
     values = values_of(cells, state.density, state.sh)
     patches = PatchGrid(targets.host_pixels, patch_side)
     error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=rule.error_map)
@@ -73,9 +73,9 @@ def optimise(
         yield error_map.record(drawn, loss) / 3
 
 
-def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:
+def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> float:
     """Sum of the losses of the rays of the bundles."""
-    cells, buffer, sh = cells_of(tree_grid(tree)), RecordBuffer(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
+    cells, buffer, sh = cells_of(tree), RecordBuffer(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
     dense, total = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values), 0.0
     for origins, directions, wanted in bundles:
         start, along, bases = in_voxels(tree, origins, directions)
@@ -84,9 +84,9 @@ def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:
     return total
 
 
-def max_weights(tree: NerfTree, bundles: Iterable[Bundle]) -> np.ndarray:
+def max_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to a ray of the bundles."""
-    grid, greatest = tree_grid(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
+    grid, greatest = cells_of(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
     for origins, directions, wanted in bundles:
         start, along, _ = in_voxels(tree, origins, directions)
         contributions.max_contributions(grid, start, along, tree.density_values, wanted.transmittance, greatest)

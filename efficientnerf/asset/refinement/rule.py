@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
+from efficientnerf.backends.layout import Hyperparameters
 
 DECAY, EPSILON = 0.99, 1e-10  # of RMSprop
 

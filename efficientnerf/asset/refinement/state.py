@@ -83,5 +83,3 @@ def initial_state(tree: NerfTree, max_thickness: float = np.inf) -> RefinementSt
 def subset_state(state: RefinementState, keep: np.ndarray, tree: NerfTree) -> RefinementState:
     """The state of `tree`, which is `state.tree` after `to_host` with the voxels `keep`, (N,) bool, alone, in their order."""
     return RefinementState(tree, **{name: getattr(state, name)[keep] for name in MOMENTS}, step=state.step, errors=state.errors)
-
-

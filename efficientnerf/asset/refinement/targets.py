@@ -6,13 +6,13 @@ R rays, H rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from efficientnerf.backends import dispatch
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.layout import RayTargets
 from efficientnerf.rendering import environment
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.pixels import Pixels
@@ -48,6 +48,11 @@ class Targets:
     def on_device(self) -> bool:
         """Whether they were sent to a device, where trees are then fitted to them."""
         return not isinstance(self.pixels, Pixels)
+
+    @property
+    def backend(self) -> Literal["numba", "triton"]:
+        """That which fits trees to them."""
+        return "triton" if self.on_device else "numba"
 
     @property
     def host_pixels(self) -> Pixels:

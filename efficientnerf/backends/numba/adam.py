@@ -5,11 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.table_entries import ENTRIES_PER_LINE, adam_line
+from efficientnerf.backends.numba.vector.maths import bits_of, select, sqrt
+from efficientnerf.backends.numba.vector.memory import load, pointer, store
 
 BLOCK = 8192  # values per task
-VALUES_PER_LINE = 2 * ENTRIES_PER_LINE
+LINE = 16  # values of a cache line of 64 bytes
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _adam_line(value, grad, first, second, n, beta1, beta2, scale1, scale2, eps):  # type: ignore[no-untyped-def]
+    """Adam on those of a line's values from n on whose gradient is not zero; clears the gradient. Reads nothing else where all gradients are zero."""
+    g = load(grad, n, LINE)
+    some = ~(g == _ZERO)
+    if bits_of(some) != 0:
+        m0, v0, x0 = load(first, n, LINE), load(second, n, LINE), load(value, n, LINE)
+        m = beta1 * m0 + (_ONE - beta1) * g
+        v = beta2 * v0 + (_ONE - beta2) * g * g
+        x = x0 - scale1 * m / (sqrt(scale2 * v) + eps)
+        store(first, n, select(some, m, m0))
+        store(second, n, select(some, v, v0))
+        store(value, n, select(some, x, x0))
+        store(grad, n, select(some, _ZERO, g))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -42,8 +59,8 @@ def adam(value, grad, first, second, learning_rate, beta1, beta2, correction1, c
     for block in numba.prange((count + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min(count, (block + 1) * BLOCK)
         if skip_zeros:
-            lines = (end - begin) // VALUES_PER_LINE
+            lines = (end - begin) // LINE
             for line in range(lines):
-                adam_line(p_value, p_grad, p_first, p_second, begin + line * VALUES_PER_LINE, beta1, beta2, scale1, scale2, eps)
-            begin += lines * VALUES_PER_LINE
+                _adam_line(p_value, p_grad, p_first, p_second, begin + line * LINE, beta1, beta2, scale1, scale2, eps)
+            begin += lines * LINE
         _adam_range(value, grad, first, second, begin, end, beta1, beta2, scale1, scale2, eps, skip_zeros)

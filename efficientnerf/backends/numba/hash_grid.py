@@ -15,12 +15,13 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.table_entries import ENTRIES_PER_LINE, gather_corners, prefetch, scatter_add_corners
+from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corners
+from efficientnerf.backends.numba.vector.memory import pointer, touch
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Mueller et al. 2022, section 3
 BLOCK = 128  # samples whose indices and weights are computed together
 TRANSPOSE_BLOCK = 4096  # points per task of `transpose_points`
+ENTRIES_PER_LINE = 8  # of a cache line of 64 bytes
 LINES_PER_SAMPLE = 4  # cache lines of a level that a sample reads, about: corners adjacent along x mostly share one
 TASK_SAMPLES = 2**15  # samples per task, at most: 32 features of as many take 4 MiB
 
@@ -59,7 +60,7 @@ def _prefetch_level(entries, side, dense, start, mask, samples):  # type: ignore
     count = side**3 if dense else np.int64(mask) + 1
     if LINES_PER_SAMPLE * samples * ENTRIES_PER_LINE >= count:
         for at in range(start, start + count, ENTRIES_PER_LINE):
-            prefetch(entries, 2 * at)
+            touch(entries, 2 * at)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -89,7 +90,7 @@ def _encode(points, table, sides, dense, starts, mask, tasks, out):  # type: ign
                 else:
                     _corner_indices(points, first, count, sides[level], starts[level], False, mask, index, weight)
                 for n in range(count):
-                    a, b = gather_corners(entries, p_index, p_weight, n, BLOCK)
+                    a, b = mix_corners(entries, p_index, p_weight, n, BLOCK, 2)
                     out[2 * level, first + n], out[2 * level + 1, first + n] = a, b
 
 
@@ -122,7 +123,7 @@ def _encode_backward(points, grad, sides, dense, starts, mask, order, table_grad
             else:
                 _corner_indices(points, first, count, sides[level], starts[level], False, mask, index, weight)
             for n in range(count):
-                scatter_add_corners(entries, p_index, p_weight, n, BLOCK, grad[2 * level, first + n], grad[2 * level + 1, first + n])
+                spread_corners(entries, p_index, p_weight, n, BLOCK, (grad[2 * level, first + n], grad[2 * level + 1, first + n]))
 
 
 def encode_backward(

@@ -1,7 +1,7 @@
 """A fully fused ReLU MLP on the CPU (numba, all cores): forward, and the gradients of weights and inputs.
 
 All layers of a block of samples are evaluated before the next block (Mueller et al. 2021, "Real-time neural radiance caching", whose activations stay in a
-GPU's shared memory): activations stay in a core's caches and sums in registers (`efficientnerf.backends.numba.tiles`).
+GPU's shared memory): activations stay in a core's caches and sums in registers (`efficientnerf.backends.numba.vector.products`).
 
 Samples are split into the same chunks and blocks on any number of threads, and sums over chunks are taken in order: results do not depend on the number of
 threads.
@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tiles import (
+from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.numba.vector.products import (
     LANES,
     ROWS,
     Matrix,

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.layout import RayBundle, SampleColumns
 from efficientnerf.backends.numba import adam as kernel
 from efficientnerf.backends.numba import compositing, hash_grid, mlp, occupancy, rays, sampling
+from efficientnerf.backends.numba.sampling import Box
 from efficientnerf.backends.numba.tree import nearest
 from efficientnerf.backends.numba.tree.rendering import render_rays
 from efficientnerf.backends.torch.hash_grid import HashLevels
@@ -25,16 +27,16 @@ def _array(t: Tensor) -> np.ndarray:
     return t.detach().contiguous().numpy()
 
 
-def _box(space: Space) -> tuple[np.ndarray, np.ndarray, bool]:
-    return space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted
+def _box(space: Space) -> Box:
+    return Box(space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted)
 
 
 def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, max_intervals: int,
     voxels: Tensor, threshold: float, *, unpruned: int = 0,
 ) -> Samples:  # fmt: skip
-    given: list[Any] = [_array(t) for t in (origins, directions, near, far, offset)] + [*_box(space), step, max_intervals, _array(voxels), threshold, unpruned]
-    *packed, tried = sampling.valid_samples(*given)
+    bundle = RayBundle(*(_array(t) for t in (origins, directions, near, far, offset)))
+    *packed, tried = sampling.valid_samples(bundle, _box(space), step, max_intervals, _array(voxels), threshold, unpruned)
     return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
 
 
@@ -45,9 +47,8 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: i
 
 
 def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
-    columns = (coarse.first, coarse.start, coarse.extent, coarse.length, pivotal)
-    given: list[Any] = [*map(_array, (origins, directions, offset)), *_box(space), *map(_array, columns), per_pivot]
-    fine = sampling.pivotal_samples(*given)
+    bundle, columns = RayBundle(*map(_array, (origins, directions, offset, offset, offset))), SampleColumns(*map(_array, coarse[1:5]))
+    fine = sampling.pivotal_samples(bundle, _box(space), _array(coarse.first), columns, _array(pivotal), per_pivot)
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 

@@ -3,21 +3,32 @@
 The reference is `efficientnerf.sampling.samples`. Rays are split into fixed blocks and each ray belongs to one thread: results depend neither on timing nor
 on the number of threads.
 
-R rays, N samples, D density voxels a side. The space is given by the centre (3,) and half the size (3,) of its box, float32, and whether it is contracted;
-in unit coordinates the box is [-1, 1]^3.
+R rays, N samples, D density voxels a side. In unit coordinates a space's box is [-1, 1]^3.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
+from efficientnerf.backends.layout import RayBundle, SampleColumns
 from efficientnerf.backends.numba import intervals
 from efficientnerf.backends.numba.intervals import LANES
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.vector.maths import lowest_bit
+from efficientnerf.backends.numba.vector.memory import pointer
 from efficientnerf.geometry.spaces import FARTHEST
 
 BLOCK = 64  # rays per task
+
+
+class Box(NamedTuple):
+    """A space: the centre (3,) and half the size (3,) of its box, float32, and whether it is contracted."""
+
+    centre: np.ndarray
+    half: np.ndarray
+    contracted: bool
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -55,10 +66,9 @@ def _init_lane(origins, directions, near, far, centre, half, contracted, r, stat
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _find_valid(  # type: ignore[no-untyped-def]
-    origins, directions, near, far, offset, centre, half, contracted, step, max_intervals, voxels, threshold, unpruned, counts, visited, t_exit, starts
-):
+def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, counts, visited, t_exit, starts):  # type: ignore[no-untyped-def]
     """March rays in groups of one per SIMD lane; writes the starts (R, max_intervals) of valid intervals, and of each ray how many are valid and visited."""
+    (origins, directions, near, far, offset), (centre, half, contracted) = rays, box
     farthest, never, side, grid = np.float32(FARTHEST), np.float32(-np.inf), voxels.shape[0], pointer(voxels)
     for block in numba.prange((len(origins) + LANES - 1) // LANES):
         begin, end = block * LANES, min(len(origins), (block + 1) * LANES)
@@ -69,14 +79,14 @@ def _find_valid(  # type: ignore[no-untyped-def]
         p_state = pointer(state)
         for _ in range(max_intervals):
             if contracted:
-                masks = intervals.next_intervals_contracted(p_state, grid, side, step, farthest)
+                masks = intervals.next_intervals(p_state, grid, side, step, farthest, True)
             else:
-                masks = intervals.next_intervals_bounded(p_state, grid, side, step, farthest)
+                masks = intervals.next_intervals(p_state, grid, side, step, farthest, False)
             if masks == 0:
                 break
             valid = masks >> LANES
             while valid != 0:
-                lane = intervals.lowest_bit(valid)
+                lane = lowest_bit(valid)
                 valid &= valid - 1
                 r = begin + lane
                 starts[r, counts[r]] = state[intervals.START, lane]
@@ -86,10 +96,9 @@ def _find_valid(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _write_valid(  # type: ignore[no-untyped-def]
-    origins, directions, offset, centre, half, contracted, step, t_exit, starts, first, start, extent, length, point
-):
+def _write_valid(rays, box, step, t_exit, starts, first, start, extent, length, point):  # type: ignore[no-untyped-def]
     """Pack the intervals that `_find_valid` found."""
+    (origins, directions, _near, _far, offset), (centre, half, contracted) = rays, box
     one = np.float32(1)
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
@@ -109,23 +118,18 @@ def _write_valid(  # type: ignore[no-untyped-def]
                 point[n, 0], point[n, 1], point[n, 2] = _unit_to_grid(ux + at * vx, uy + at * vy, uz + at * vz, contracted)
 
 
-def valid_samples(  # type: ignore[no-untyped-def]
-    origins, directions, near, far, offset, centre, half, contracted, step, max_intervals, voxels, threshold, unpruned=0
-):
+def valid_samples(bundle: RayBundle, box: Box, step: float, max_intervals: int, voxels: np.ndarray, threshold: float, unpruned: int = 0) -> tuple[Any, ...]:
     """`efficientnerf.sampling.valid.valid_samples` on float32 arrays: (first, start, extent, length, point, number of intervals visited)."""
-    rays = len(origins)
+    rays = len(bundle.origins)
     counts, visited, t_exit = np.zeros(rays, np.int64), np.zeros(rays, np.int64), np.empty(rays, np.float32)
     starts = np.empty((rays, max_intervals), np.float32)  # pages of a row are touched only as far as the ray has valid samples
-    step = np.float32(step)
-    _find_valid(
-        origins, directions, near, far, offset, centre, half, contracted, step, max_intervals, voxels, np.float32(threshold), unpruned,
-        counts, visited, t_exit, starts,
-    )  # fmt: skip
+    stride = np.float32(step)
+    _find_valid(bundle, box, stride, max_intervals, voxels, np.float32(threshold), unpruned, counts, visited, t_exit, starts)
     first = np.zeros(rays + 1, np.int64)
     np.cumsum(counts, out=first[1:])
     n = int(first[-1])
     start, extent, length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
-    _write_valid(origins, directions, offset, centre, half, contracted, step, t_exit, starts, first, start, extent, length, point)
+    _write_valid(bundle, box, stride, t_exit, starts, first, start, extent, length, point)
     return first, start, extent, length, point, int(visited.sum())
 
 
@@ -155,10 +159,9 @@ def select_pivots(weight, first, threshold, max_pivots, out):  # type: ignore[no
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _write_pivotal(  # type: ignore[no-untyped-def]
-    origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot,
-    fine_first, fine_start, fine_extent, fine_length, point,
-):  # fmt: skip
+def _write_pivotal(rays, box, first, coarse, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point):  # type: ignore[no-untyped-def]
+    """Divides the pivotal ones of the samples `coarse`."""
+    (origins, directions, _near, _far, offset), (centre, half, contracted), (start, extent, length, _point) = rays, box, coarse
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
             n = fine_first[r]
@@ -177,16 +180,11 @@ def _write_pivotal(  # type: ignore[no-untyped-def]
                     n += 1
 
 
-def pivotal_samples(  # type: ignore[no-untyped-def]
-    origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot
-):
+def pivotal_samples(bundle: RayBundle, box: Box, first: np.ndarray, coarse: SampleColumns, pivotal: np.ndarray, per_pivot: int) -> tuple[np.ndarray, ...]:
     """`efficientnerf.sampling.pivotal.pivotal_samples` on arrays: (first, start, extent, length, point)."""
     total = np.concatenate([np.zeros(1, np.int64), np.cumsum(pivotal, dtype=np.int64)])
     fine_first = total[first] * per_pivot
     n = int(fine_first[-1])
     fine_start, fine_extent, fine_length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
-    _write_pivotal(
-        origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot,
-        fine_first, fine_start, fine_extent, fine_length, point,
-    )  # fmt: skip
+    _write_pivotal(bundle, box, first, coarse, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point)
     return fine_first, fine_start, fine_extent, fine_length, point

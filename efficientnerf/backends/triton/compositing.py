@@ -118,19 +118,19 @@ def _totals(raw, length, weight, begin, end, WIDTH: tl.constexpr, EXPONENTIAL: t
 
 @triton.jit
 def _backward(  # type: ignore[no-untyped-def]
-    raw, length, first, harmonics, background, weight, rgb, grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background,
+    raw, length, first, harmonics, background, weight, rgb, grads, grad_raw, grad_background,
     K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """Chunks from the last to the first: what lies behind a sample is summed up, never a small difference of large numbers."""
+    """From `grads`, by colour, opacity, distortion and weight. Chunks from the last to the first: no small difference of large numbers is taken."""
     WIDTH: tl.constexpr = 1 + 3 * K
     r = tl.program_id(0).to(tl.int64)
     begin = tl.load(first + r)
     end = tl.load(first + r + 1)
     depth_before, length_before, total_weight, total_moment, base = _totals(raw, length, weight, begin, end, WIDTH, EXPONENTIAL, CHUNK)
-    g_red = tl.load(grad_colour + r * 3)
-    g_green = tl.load(grad_colour + r * 3 + 1)
-    g_blue = tl.load(grad_colour + r * 3 + 2)
-    g_distortion = tl.load(grad_distortion + r)
+    g_red = tl.load(grads[0] + r * 3)
+    g_green = tl.load(grads[0] + r * 3 + 1)
+    g_blue = tl.load(grads[0] + r * 3 + 2)
+    g_distortion = tl.load(grads[2] + r)
     transmittance = tl.exp(-depth_before)
     tl.store(grad_background + r * 3, transmittance * g_red)
     tl.store(grad_background + r * 3 + 1, transmittance * g_green)
@@ -139,7 +139,7 @@ def _backward(  # type: ignore[no-untyped-def]
     b0 = tl.load(background + r * 3)
     b1 = tl.load(background + r * 3 + 1)
     b2 = tl.load(background + r * 3 + 2)
-    behind_chunk = transmittance * (g_red * b0 + g_green * b1 + g_blue * b2 - tl.load(grad_opacity + r))
+    behind_chunk = transmittance * (g_red * b0 + g_green * b1 + g_blue * b2 - tl.load(grads[1] + r))
     weight_after_chunk = 0.0
     moment_after_chunk = 0.0
     k = tl.arange(0, KP)
@@ -164,7 +164,7 @@ def _backward(  # type: ignore[no-untyped-def]
         cr = tl.load(rgb + n * 3, live, other=0.0)
         cg = tl.load(rgb + n * 3 + 1, live, other=0.0)
         cb = tl.load(rgb + n * 3 + 2, live, other=0.0)
-        grad_own = tl.load(grad_weight + n, live, other=0.0) + g_red * cr + g_green * cg + g_blue * cb + g_distortion * by_weight
+        grad_own = tl.load(grads[3] + n, live, other=0.0) + g_red * cr + g_green * cg + g_blue * cb + g_distortion * by_weight
         weighted = w * grad_own
         behind = behind_chunk + tl.sum(weighted, 0) - tl.cumsum(weighted, 0)
         after = tl.exp(-(tl.maximum(depth_before, 0.0) + tl.cumsum(depth, 0)))
@@ -207,7 +207,7 @@ class _Composite(torch.autograd.Function):
         grad_raw, grad_background = torch.zeros_like(raw), torch.empty_like(background)
         if rays:
             _backward[(rays,)](
-                raw, length, first, harmonics, background, weight, rgb, *(g.contiguous() for g in grads[:4]), grad_raw, grad_background,
+                raw, length, first, harmonics, background, weight, rgb, tuple(g.contiguous() for g in grads[:4]), grad_raw, grad_background,
                 K=terms, KP=_padded(terms), EXPONENTIAL=ctx.exponential, CHUNK=CHUNK, num_warps=1,
             )  # fmt: skip
         return grad_raw, None, None, None, grad_background, None

@@ -14,6 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from efficientnerf.backends.layout import RayBundle, SampleColumns
 from efficientnerf.backends.triton.launch import INTERPRETED, LANES, blocks
 from efficientnerf.backends.triton.vectors import Vec3, along, store_vec3
 from efficientnerf.geometry.spaces import FARTHEST, Space
@@ -30,15 +31,6 @@ class Box(NamedTuple):
     half: Any
 
 
-class Buffers(NamedTuple):
-    """start, extent, length (N,) and point (N, 3) of Samples, which are written."""
-
-    start: Any
-    extent: Any
-    length: Any
-    point: Any
-
-
 @triton.jit
 def _grid(p, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
     """Unit coordinates to grid coordinates; see `efficientnerf.geometry.spaces`."""
@@ -52,8 +44,9 @@ def _grid(p, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _unit_rays(origins, directions, r, live, box):  # type: ignore[no-untyped-def]
+def _unit_rays(bundle, r, live, box):  # type: ignore[no-untyped-def]
     """Origins and directions (Vec3 each) of rays in unit coordinates."""
+    origins, directions = bundle.origins, bundle.directions
     ux = (tl.load(origins + r * 3, live, other=0.0) - box.centre.x) / box.half.x
     uy = (tl.load(origins + r * 3 + 1, live, other=0.0) - box.centre.y) / box.half.y
     uz = (tl.load(origins + r * 3 + 2, live, other=0.0) - box.centre.z) / box.half.z
@@ -100,16 +93,19 @@ def _store(buffers, at, t, size, length, point, live):  # type: ignore[no-untype
 
 @triton.jit(do_not_specialize=["unpruned"])
 def _march(  # type: ignore[no-untyped-def]
-    origins, directions, near, far, offset, cx, cy, cz, hx, hy, hz, voxels, first, counts, tried, start, extent, length, point,
-    rays, max_intervals, step, threshold, unpruned, side, CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
+    bundle, box, voxels, first, tallies, out, rays, max_intervals, step, threshold, unpruned, side,
+    CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Counts the valid samples of each ray, or writes them from `first` on."""
+    """Counts the valid samples of each ray, or writes them from `first` on into SampleColumns.
+
+    tallies  (R,) int32 each: valid samples, and intervals tried
+    """
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = r < rays
-    u, v = _unit_rays(origins, directions, r, live, Box(Vec3(cx, cy, cz), Vec3(hx, hy, hz)))
-    shift = tl.load(offset + r, live, other=0.0)
-    t = tl.load(near + r, live, other=1.0)
-    leave = tl.load(far + r, live, other=0.0)
+    u, v = _unit_rays(bundle, r, live, box)
+    shift = tl.load(bundle.offset + r, live, other=0.0)
+    t = tl.load(bundle.near + r, live, other=1.0)
+    leave = tl.load(bundle.far + r, live, other=0.0)
     if not CONTRACTED:
         t, leave = _clip_to_box(u, v, t, leave)
     at = tl.zeros((BLOCK,), tl.int64)
@@ -134,7 +130,7 @@ def _march(  # type: ignore[no-untyped-def]
         g = _grid(along(u, v, t + shift * size), CONTRACTED)
         found = alive & (tl.load(voxels + _voxel_of(g, side), alive, other=0.0) > limit)
         if WRITE:
-            _store(Buffers(start, extent, length, point), at, t, size, size / scale, g, found & (at < end))
+            _store(out, at, t, size, size / scale, g, found & (at < end))
             at += found.to(tl.int64)
         else:
             valid += found.to(tl.int32)
@@ -145,12 +141,12 @@ def _march(  # type: ignore[no-untyped-def]
             alive = alive & (at < end)
         n += 1
     if not WRITE:
-        tl.store(counts + r, valid, live)
-        tl.store(tried + r, passed, live)
+        tl.store(tallies[0] + r, valid, live)
+        tl.store(tallies[1] + r, passed, live)
 
 
-def _box(space: Space) -> tuple[float, ...]:
-    return (*(float(x) for x in space.centre), *(float(x) for x in space.half))
+def _box(space: Space) -> Box:
+    return Box(Vec3(*(float(x) for x in space.centre)), Vec3(*(float(x) for x in space.half)))
 
 
 def _offsets(counts: Tensor) -> Tensor:
@@ -167,12 +163,12 @@ def valid_samples(
     origins, directions, near, far, offset, voxels = (t.detach().contiguous() for t in (origins, directions, near, far, offset, voxels))
     rays, side = len(origins), voxels.shape[0]
     device = origins.device
-    counts, tried = (torch.zeros(rays, dtype=torch.int32, device=device) for _ in range(2))
-    bundle = (origins, directions, near, far, offset, *_box(space), voxels)
+    tallies = counts, tried = torch.zeros(rays, dtype=torch.int32, device=device), torch.zeros(rays, dtype=torch.int32, device=device)
+    bundle = (RayBundle(origins, directions, near, far, offset), _box(space), voxels)
     rest = (rays, max_intervals, float(step), float(threshold), unpruned, side)
     grid, shape = (blocks(rays, RAYS),), {"CONTRACTED": space.contracted, "BLOCK": RAYS, "num_warps": 1}
     nothing = origins.new_empty(0)
-    _march[grid](*bundle, counts, counts, tried, nothing, nothing, nothing, nothing, *rest, WRITE=False, **shape)
+    _march[grid](*bundle, counts, tallies, SampleColumns(*[nothing] * 4), *rest, WRITE=False, **shape)
     first = _offsets(counts)
     total_tried = tried.sum(dtype=torch.int64)
     complete = None
@@ -183,7 +179,7 @@ def valid_samples(
         first.clamp_(max=capacity)
     # Zeros: the padding, and what the two passes, compiled on their own, might disagree about by a rounding.
     start, extent, length, point = (origins.new_zeros(samples), origins.new_zeros(samples), origins.new_zeros(samples), origins.new_zeros(samples, 3))
-    _march[grid](*bundle, first, counts, tried, start, extent, length, point, *rest, WRITE=True, **shape)
+    _march[grid](*bundle, first, tallies, SampleColumns(start, extent, length, point), *rest, WRITE=True, **shape)
     return Samples(first, start, extent, length, point, all_tried, complete)
 
 
@@ -235,25 +231,25 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: i
 
 @triton.jit
 def _pivotal(  # type: ignore[no-untyped-def]
-    origins, directions, offset, cx, cy, cz, hx, hy, hz, first, start, extent, length, pivotal, before,
-    fine_start, fine_extent, fine_length, point, rays, samples, capacity,
+    bundle, box, first, coarse, pivotal, before, fine, rays, samples, capacity,
     CONTRACTED: tl.constexpr, PER_PIVOT: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
+    """Divides the pivotal ones of the samples `coarse`, SampleColumns, into `fine`; before: pivotal samples before each."""
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < samples
     live = live & (tl.load(pivotal + n, live, other=0) != 0)
     ray = _ray_of(first, n, rays, BITS)
-    u, v = _unit_rays(origins, directions, ray, live, Box(Vec3(cx, cy, cz), Vec3(hx, hy, hz)))
-    shift = tl.load(offset + ray, live, other=0.0)
-    size = tl.load(extent + n, live, other=0.0) / PER_PIVOT
-    part = tl.load(length + n, live, other=0.0) / PER_PIVOT
-    begin = tl.load(start + n, live, other=0.0)
+    u, v = _unit_rays(bundle, ray, live, box)
+    shift = tl.load(bundle.offset + ray, live, other=0.0)
+    size = tl.load(coarse.extent + n, live, other=0.0) / PER_PIVOT
+    part = tl.load(coarse.length + n, live, other=0.0) / PER_PIVOT
+    begin = tl.load(coarse.start + n, live, other=0.0)
     at = tl.load(before + n, live, other=0) * PER_PIVOT
     for slot in tl.static_range(PER_PIVOT):
         put = live & (at + slot < capacity)
         t = begin + slot * size
         g = _grid(along(u, v, t + shift * size), CONTRACTED)
-        _store(Buffers(fine_start, fine_extent, fine_length, point), at + slot, t, size, part, g, put)
+        _store(fine, at + slot, t, size, part, g, put)
 
 
 def pivotal_samples(
@@ -274,8 +270,8 @@ def pivotal_samples(
     start, extent, length, point = (origins.new_zeros(total), origins.new_zeros(total), origins.new_zeros(total), origins.new_zeros(total, 3))
     if rays and samples and total:
         _pivotal[(blocks(samples),)](
-            origins, directions, offset, *_box(space), coarse.first, coarse.start, coarse.extent, coarse.length, pivotal.view(torch.int8), before,
-            start, extent, length, point, rays, samples, total,
+            RayBundle(origins, directions, offset, offset, offset), _box(space), coarse.first, SampleColumns(*coarse[1:5]), pivotal.view(torch.int8), before,
+            SampleColumns(start, extent, length, point), rays, samples, total,
             CONTRACTED=space.contracted, PER_PIVOT=per_pivot, BITS=rays.bit_length(), BLOCK=LANES,
         )  # fmt: skip
     return Samples(first, start, extent, length, point, coarse.tried, complete)

@@ -19,11 +19,12 @@ import triton
 from torch import Tensor
 
 from efficientnerf.asset.cascades import brick_ranges, cascades_of
-from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.leaps import leaps
+from efficientnerf.asset.tree import NerfTree, leaps
 from efficientnerf.backends.transfer import constant, to_device
 from efficientnerf.backends.triton.launch import INTERPRETED
-from efficientnerf.backends.triton.tree_rendering import render
+from efficientnerf.backends.triton.tree_march import Cascades, Rays
+from efficientnerf.backends.triton.tree_rendering import DeviceCamera, Voxels, render
+from efficientnerf.backends.triton.vectors import Vec3
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
 
@@ -32,50 +33,26 @@ BRICKS_PER_BLOCK = 2**14
 # A program's warps by the length of a voxel's row of coefficients: as few as keep the row and the basis in registers; twice as many for nested trees.
 WARPS = {4: 1, 16: 1, 32: 1, 64: 4, 128: 4}
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+NO_CAMERA = DeviceCamera(*[Vec3(0.0, 0.0, 0.0)] * 4, *[0.0] * 4)
 
 
-class DeviceCascades(NamedTuple):
-    """The grids of a tree on a device.
-
-    shape   coarse cells of cascade 0
-    shapes  (L, 3) int32 coarse cells of each
-    first   (L,) int64 where each one's cells begin
-    place   (L, 4) float32 corner, and side of a voxel, voxels of cascade 0
-    step    distance between samples, voxels
-    """
-
-    shape: tuple[int, int, int]
-    shapes: Tensor
-    first: Tensor
-    place: Tensor
-    step: float
-
-    @property
-    def grids(self) -> int:
-        """L."""
-        return len(self.first)
-
-    @property
-    def arrays(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self.shapes, self.first, self.place
-
-
-def device_cascades(tree: NerfTree, device: str | torch.device) -> DeviceCascades:
-    """The grids of a tree, sent to a device."""
+def device_cascades(tree: NerfTree, owner: Tensor) -> Cascades:
+    """The grids of a tree, sent to the device of `owner`, the first result of `brick_arrays`."""
+    device = owner.device
     cascades = cascades_of(tree)
     sizes = [cascade.brick_index.size for cascade in cascades]
     place = [(*((cascade.bounds_min - tree.bounds_min) / tree.voxel), cascade.voxel / tree.voxel) for cascade in cascades]
     shapes = torch.tensor([cascade.shape for cascade in cascades], dtype=torch.int32, device=device)
     first = torch.tensor(np.cumsum([0, *sizes[:-1]]), dtype=torch.int64, device=device)
-    return DeviceCascades(tree.shape, shapes, first, torch.tensor(np.asarray(place), dtype=torch.float32, device=device), tree.step_size)
+    return Cascades(owner, shapes, first, torch.tensor(np.asarray(place), dtype=torch.float32, device=device), Vec3(*tree.shape), float(tree.step_size))
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceTree:
     """What the kernel reads.
 
-    grid     (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may skip; of a nested tree those of all cascades
-             one after the other
+    cascades  grids; their `owner` is (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may skip; of a nested tree
+              those of all cascades one after the other
     density  (B, E^3) float16, voxels of a brick with its border, z fastest; 0 where nothing is stored
     index    (B, E^3) int32: which voxel's coefficients, -1 where nothing is stored
     sh       (N, row) float16: K coefficients for red, green and blue each, then zeros
@@ -84,7 +61,7 @@ class DeviceTree:
     environment  (H, 2 H, 3) float32 or None, see `NerfTree`
     """
 
-    grid: Tensor
+    cascades: Cascades
     density: Tensor
     index: Tensor
     sh: Tensor
@@ -92,13 +69,12 @@ class DeviceTree:
     terms: int
     voxel: float
     low: np.ndarray
-    cascades: DeviceCascades
     nearest: bool = False
     environment: Tensor | None = None
 
     @property
     def bytes(self) -> int:
-        tensors = (self.grid, self.density, self.index, self.sh, *(() if self.environment is None else (self.environment,)))
+        tensors = (self.cascades.owner, self.density, self.index, self.sh, *(() if self.environment is None else (self.environment,)))
         return sum(t.numel() * t.element_size() for t in tensors)
 
 
@@ -112,7 +88,7 @@ class DeviceRendering(NamedTuple):
 
 
 def brick_arrays(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Tensor]:
-    """`grid` and `index` of a DeviceTree, on the device; bricks are taken in blocks, so that little more than the result is needed."""
+    """`cascades.owner` and `index` of a DeviceTree, on the device; bricks are taken in blocks, so that little more than the result is needed."""
     voxel_index = torch.from_numpy(np.ascontiguousarray(tree.voxel_index, np.int32)).to(device)
     index = torch.empty(len(voxel_index), (tree.brick + 2) ** 3, dtype=torch.int32, device=device)
     grids = []
@@ -151,7 +127,7 @@ def device_tree_of(tree: NerfTree) -> DeviceTree:
 
 def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTree:
     """Send a tree to the device; in blocks, so that little more than the result is needed."""
-    grid, index = brick_arrays(tree, device)
+    owner, index = brick_arrays(tree, device)
     values = torch.from_numpy(np.ascontiguousarray(tree.density_values, np.float32)).to(device)
     density = torch.empty(index.shape, dtype=torch.float16, device=device)
     for begin in range(0, len(index), BRICKS_PER_BLOCK):
@@ -164,27 +140,25 @@ def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTr
         part = torch.from_numpy(np.ascontiguousarray(tree.coefficients(slice(begin, begin + step)))).to(device)
         sh[begin : begin + step, : 3 * terms] = part.transpose(1, 2).reshape(len(part), 3 * terms).clamp(-65504, 65504).half()
     surroundings = None if tree.environment is None else torch.from_numpy(np.ascontiguousarray(tree.environment, np.float32)).to(device)
-    cascades = device_cascades(tree, device)
-    return DeviceTree(grid, density, index, sh, tree.brick, terms, tree.voxel, tree.bounds_min, cascades, tree.lookup == "nearest", surroundings)
+    cascades, nearest = device_cascades(tree, owner), tree.lookup == "nearest"
+    return DeviceTree(cascades, density, index, sh, tree.brick, terms, tree.voxel, tree.bounds_min, nearest, surroundings)
 
 
 def _launch(
-    t: DeviceTree, count: int, buffers: tuple[Tensor, Tensor, Tensor] | None, camera: tuple[float, ...], size: tuple[int, int],
-    background: tuple[float, float, float] | None,
-) -> DeviceRendering:  # fmt: skip
-    device = t.grid.device
-    out = DeviceRendering(*(torch.empty(count, *tail, device=device) for tail in ((3,), (), (), (3,))))
+    t: DeviceTree, count: int, rays: Rays | None, camera: DeviceCamera, size: tuple[int, int], background: tuple[float, float, float] | None
+) -> DeviceRendering:
+    out = DeviceRendering(*(torch.empty(count, *tail, device=t.density.device) for tail in ((3,), (), (), (3,))))
     if count == 0:
         return out
     wide, high = TILE
-    programs = triton.cdiv(count, wide * high) if buffers else triton.cdiv(size[0], wide) * triton.cdiv(size[1], high)
+    programs = triton.cdiv(count, wide * high) if rays else triton.cdiv(size[0], wide) * triton.cdiv(size[1], high)
     # Without voxels there is nothing that the kernel would read, but it must have something to point at.
     density, index, sh = (x if len(x) else x.new_zeros(1, x.shape[1]) for x in (t.density, t.index, t.sh))
     render[(programs,)](
-        *(buffers or (out.colour, out.colour, out.colour)), t.grid, *t.cascades.arrays, density, index, sh, *out,
-        count, *size, *t.cascades.shape, t.cascades.step, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
-        PINHOLE=buffers is None, OVER=background is not None, NEAREST=t.nearest, CASCADES=t.cascades.grids, BRICK=t.brick, K=t.terms,
-        ROW=t.sh.shape[1], WIDE=wide, HIGH=high, num_warps=WARPS[t.sh.shape[1]] * min(2, t.cascades.grids),
+        rays or Rays(*[out.colour] * 3), t.cascades, Voxels(density, index, sh, float(t.voxel)), out, count, *size, camera,
+        Vec3(*(float(x) for x in background or (0, 0, 0))),
+        PINHOLE=rays is None, OVER=background is not None, NEAREST=t.nearest, CASCADES=len(t.cascades.first), BRICK=t.brick, K=t.terms,
+        ROW=t.sh.shape[1], WIDE=wide, HIGH=high, num_warps=WARPS[t.sh.shape[1]] * min(2, len(t.cascades.first)),
     )  # fmt: skip
     return out
 
@@ -198,7 +172,7 @@ def render_rays(t: DeviceTree, origins: Tensor, directions: Tensor, views: Tenso
     start = ((origins.double() - constant(t.low, origins.double())) / t.voxel).float().contiguous()
     along = directions.float().contiguous()
     view_directions = along if views is None else views.float().contiguous()
-    return _launch(t, len(start), (start, along, view_directions), (0.0,) * 16, (0, 0), None)
+    return _launch(t, len(start), Rays(start, along, view_directions), NO_CAMERA, (0, 0), None)
 
 
 def tree_rays(
@@ -229,21 +203,21 @@ def render_image(t: DeviceTree, camera: Camera, *, background: tuple[float, floa
         raise ValueError(f"supersample {supersample}: expected at least 1")
     height, width = camera.height * supersample, camera.width * supersample
     over = background if supersample == 1 else None
-    rotation = to_device(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), t.grid.device)
+    rotation = to_device(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), t.density.device)
     if camera.model in PINHOLES:
         k = camera.intrinsics
-        place = (*((camera.centre - t.low) / t.voxel), *camera.world_from_camera[:3, :3].ravel())
-        lens = (k["fx"] * supersample, k["fy"] * supersample, k["cx"] * supersample, k["cy"] * supersample)
-        flat = _launch(t, height * width, None, tuple(float(x) for x in (*place, *lens)), (width, height), over)
+        centre, rows = ((camera.centre - t.low) / t.voxel).tolist(), camera.world_from_camera[:3, :3].astype(np.float64).tolist()
+        lens = (float(k[name] * supersample) for name in ("fx", "fy", "cx", "cy"))
+        flat = _launch(t, height * width, None, DeviceCamera(Vec3(*centre), *(Vec3(*row) for row in rows), *lens), (width, height), over)
     else:
-        local = _camera_directions(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
+        local = _camera_directions(camera.width, camera.height, camera.model, camera.params, supersample, t.density.device)
         place = tuple(float(x) for x in (camera.centre - t.low) / t.voxel)
         start = torch.stack([torch.full_like(local[:, 0], x) for x in place], dim=1)
         along = local @ rotation
-        flat = _launch(t, len(start), (start, along, along), (0.0,) * 16, (0, 0), over)
+        flat = _launch(t, len(start), Rays(start, along, along), NO_CAMERA, (0, 0), over)
         flat = flat._replace(depth=flat.depth * local[:, 2])
     if background is None and t.environment is not None:
-        local = _camera_directions(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
+        local = _camera_directions(camera.width, camera.height, camera.model, camera.params, supersample, t.density.device)
         flat = flat._replace(colour=flat.colour + (1 - flat.opacity[:, None]) * environment.lookup_on(t.environment, local @ rotation))
     shape = (camera.height, supersample, camera.width, supersample)
     if supersample == 1:

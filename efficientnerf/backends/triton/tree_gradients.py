@@ -23,11 +23,11 @@ from torch import Tensor
 
 from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.layout import RayTargets
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
-from efficientnerf.backends.triton.tree import DeviceCascades, brick_arrays, device_cascades
-from efficientnerf.backends.triton.tree_march import Cascades, colour_of, corner_place, corner_weight, interpolate_harmonics, march_cascades
+from efficientnerf.backends.triton.tree import brick_arrays, device_cascades
+from efficientnerf.backends.triton.tree_march import Cascades, Rays, colour_of, corner_place, corner_weight, interpolate_harmonics, march_cascades
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, store_vec3, zeros_vec3
 
 # Rays and warps of a program by the length of a row of coefficients: so few that what a sample needs stays in registers. Rays of a bundle come from
@@ -39,23 +39,14 @@ RAYS_PER_PROGRAM = 256 if INTERPRETED else 32  # where no coefficients are read
 BITS_PER_RAY = 8
 
 
-class Rays(NamedTuple):
-    """Of a batch, on the device, contiguous float32 (R, 3): origins and directions in voxel coordinates of cascade 0, and directions in the world, `views`."""
-
-    origins: Tensor
-    directions: Tensor
-    views: Tensor
-
-
 @dataclass(frozen=True, eq=False)
 class DeviceGrid:
-    """Where the voxels of a tree lie; `grid`, `cascades` and `index` as in `efficientnerf.backends.triton.tree.DeviceTree`.
+    """Where the voxels of a tree lie; `cascades` and `index` as in `efficientnerf.backends.triton.tree.DeviceTree`.
 
     cascade_of  (N,) uint8 the cascade of each voxel; (1,) where there is one
     """
 
-    grid: Tensor
-    cascades: DeviceCascades
+    cascades: Cascades
     index: Tensor
     brick: int
     terms: int
@@ -75,16 +66,26 @@ class DeviceGrid:
 
 
 def device_grid(tree: NerfTree, device: str | torch.device) -> DeviceGrid:
-    grid, index = brick_arrays(tree, device)
+    owner, index = brick_arrays(tree, device)
     if not len(index):
         index = index.new_full((1, index.shape[1]), -1)  # nothing is read, but kernels need a pointer
     cascade_of = torch.from_numpy(voxel_cascades(tree) if tree.outer else np.zeros(1, np.uint8)).to(device)
-    return DeviceGrid(grid, device_cascades(tree, device), index, tree.brick, tree.harmonics_count, tree.voxel, tree.lookup == "nearest", cascade_of)
+    return DeviceGrid(device_cascades(tree, owner), index, tree.brick, tree.harmonics_count, tree.voxel, tree.lookup == "nearest", cascade_of)
+
+
+class Voxels(NamedTuple):
+    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels; min_weight: below it samples absorb, and have neither a colour
+    nor a gradient."""
+
+    index: Any
+    density: Any
+    sh: Any
+    voxel: Any
+    min_weight: Any
 
 
 class Scene(NamedTuple):
-    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels; min_weight: below it samples absorb, and have neither a colour
-    nor a gradient; basis (R, C) harmonics of the columns; column (C,)."""
+    """Voxels; basis (R, C) harmonics of the columns; column (C,)."""
 
     index: Any
     density: Any
@@ -155,12 +156,12 @@ def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.const
 
 
 @triton.jit
-def _rays(origins, directions, views, rays, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _rays(rays, count, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """This program's rays: numbers, which of them exist, origins, directions, and harmonics of each column of a row (BLOCK, ROW)."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = r < rays
-    origin, direction = load_vec3(origins, r, live), load_vec3(directions, r, live)
-    return r, live, origin, direction, basis_columns(load_vec3(views, r, live), tl.arange(0, ROW) // 3, K)
+    live = r < count
+    origin, direction = load_vec3(rays.origins, r, live), load_vec3(rays.directions, r, live)
+    return r, live, origin, direction, basis_columns(load_vec3(rays.views, r, live), tl.arange(0, ROW) // 3, K)
 
 
 @triton.jit
@@ -171,13 +172,12 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
 
 @triton.jit
 def _forward(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, rays, nx, ny, nz, step, voxel, min_weight,
+    rays, cascades, voxels, colour, transmittance, count,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Premultiplied colour (R, 3) and final transmittance (R,) of rays."""
-    r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
-    scene = Scene(index, density, sh, voxel, min_weight, basis, tl.arange(0, ROW))
+    r, live, origin, direction, basis = _rays(rays, count, K, ROW, BLOCK)
+    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, voxels.min_weight, basis, tl.arange(0, ROW))
     start = Forward(tl.full((BLOCK,), 1.0, tl.float32), zeros_vec3(BLOCK))
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
     store_vec3(colour, r, end.colour, live)
@@ -215,18 +215,21 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 
 @triton.jit(do_not_specialize=["number", "terms"])
 def _backward(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, grad_colour, grad_opacity, sum_thickness, sum_sh, stamp,
-    rays, nx, ny, nz, step, voxel, min_weight, number, terms, scale,
+    rays, cascades, voxels, outputs, gradients, sums, stamp, count, number, terms, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds `scale` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as integers; stamps the voxels that rays meet."""
-    r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
-    scene = Scene(index, density, sh, voxel, min_weight, basis, tl.arange(0, ROW))
-    behind = load_vec3(colour, r, live)
-    by_colour = load_vec3(grad_colour, r, live)
-    by_end = tl.load(transmittance + r, live, other=1.0) * tl.load(grad_opacity + r, live, other=0.0)
-    given = (scene, Upstream(by_colour, by_end), Sums(sum_thickness, sum_sh, stamp, number, terms, scale))
+    """Adds `scale` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as integers; stamps the voxels that rays meet.
+
+    outputs    colour and transmittance, of `_forward`
+    gradients  of the loss by colour, and by opacity
+    sums       by optical thickness, and by harmonics
+    """
+    r, live, origin, direction, basis = _rays(rays, count, K, ROW, BLOCK)
+    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, voxels.min_weight, basis, tl.arange(0, ROW))
+    behind = load_vec3(outputs[0], r, live)
+    by_colour = load_vec3(gradients[0], r, live)
+    by_end = tl.load(outputs[1] + r, live, other=1.0) * tl.load(gradients[1] + r, live, other=0.0)
+    given = (scene, Upstream(by_colour, by_end), Sums(sums[0], sums[1], stamp, number, terms, scale))
     start = Backward(tl.full((BLOCK,), 1.0, tl.float32), behind)
     march_cascades(cascades, origin, direction, live, given, start, _add_gradients, CASCADES, BRICK, NEAREST, K, ROW)
 
@@ -245,14 +248,13 @@ def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 
 @triton.jit
 def _max_contributions(  # type: ignore[no-untyped-def]
-    origins, directions, owner, shapes, first, place, index, density, transmittance, maximum, rays, nx, ny, nz, step, voxel,
+    rays, cascades, index, density, transmittance, maximum, count, voxel,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Raises `maximum` (N,) to what voxels contribute to rays."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = r < rays
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
-    origin, direction = load_vec3(origins, r, live), load_vec3(directions, r, live)
+    live = r < count
+    origin, direction = load_vec3(rays.origins, r, live), load_vec3(rays.directions, r, live)
     given = (index, density, voxel, tl.load(transmittance + r, live, other=0.0), maximum)
     march_cascades(cascades, origin, direction, live, given, Absorption(tl.full((BLOCK,), 1.0, tl.float32)), _raise_maximum, CASCADES, BRICK, NEAREST, 0, 0)
 
@@ -270,8 +272,8 @@ def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, *, min_weigh
     count = len(rays.origins)
     colour, transmittance = torch.empty(count, 3, device=density.device), torch.empty(count, device=density.device)
     _forward[(blocks(count, g.rays),)](
-        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, colour, transmittance, count, *g.cascades.shape, g.cascades.step, float(g.voxel),
-        float(min_weight), NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
+        rays, g.cascades, Voxels(g.index, density, sh, float(g.voxel), float(min_weight)), colour, transmittance, count,
+        NEAREST=g.nearest, CASCADES=len(g.cascades.first), BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
     return colour, transmittance
 
@@ -297,9 +299,9 @@ def backward(
     """
     count = len(rays.origins)
     _backward[(blocks(count, g.rays),)](
-        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, *outputs, *(part.contiguous() for part in by), *sums, stamp,
-        count, *g.cascades.shape, g.cascades.step, float(g.voxel), float(min_weight), number, min(terms, g.terms), fixed_point_scale(count),
-        NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
+        rays, g.cascades, Voxels(g.index, density, sh, float(g.voxel), float(min_weight)), outputs, tuple(part.contiguous() for part in by), sums, stamp,
+        count, number, min(terms, g.terms), fixed_point_scale(count),
+        NEAREST=g.nearest, CASCADES=len(g.cascades.first), BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
 
 
@@ -307,7 +309,6 @@ def max_contributions(g: DeviceGrid, rays: Rays, density: Tensor, transmittance:
     """Raise `maximum` (N,) to the greatest contributions of voxels to rays, which reach the box with `transmittance` (R,)."""
     count = len(rays.origins)
     _max_contributions[(blocks(count, RAYS_PER_PROGRAM),)](
-        rays.origins, rays.directions, g.grid, *g.cascades.arrays, g.index, density, transmittance, maximum, count, *g.cascades.shape,
-        g.cascades.step, float(g.voxel),
-        NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, BLOCK=RAYS_PER_PROGRAM, num_warps=1,
+        rays, g.cascades, g.index, density, transmittance, maximum, count, float(g.voxel),
+        NEAREST=g.nearest, CASCADES=len(g.cascades.first), BRICK=g.brick, BLOCK=RAYS_PER_PROGRAM, num_warps=1,
     )  # fmt: skip

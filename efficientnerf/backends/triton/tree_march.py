@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import triton
 import triton.language as tl
 
+from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.triton.vectors import Vec3, along, sigmoid
 
-STOP = tl.constexpr(1e-3)  # transmittance at which a ray ends
+STOP = tl.constexpr(EARLY_STOP)  # transmittance at which a ray ends
 
 
 class Grid(NamedTuple):
@@ -31,18 +32,30 @@ class Grid(NamedTuple):
 
 
 class Cascades(NamedTuple):
-    """owner  pointer to the coarse cells of all grids, as in Grid
-    shape     of cascade 0, as in Grid
-    others    of L cascades, pointers, see `efficientnerf.backends.triton.tree.DeviceCascades`: shapes, first, place
-    step      between samples, voxels
+    """The grids of a tree, L cascades.
+
+    owner   the coarse cells of all grids, as in Grid
+    shapes  (L, 3) int32 coarse cells of each
+    first   (L,) int64 where each one's cells begin
+    place   (L, 4) float32 corner, and side of a voxel, voxels of cascade 0
+    shape   of cascade 0, as in Grid
+    step    between samples, voxels
     """
 
     owner: Any
-    shape: Any
     shapes: Any
     first: Any
     place: Any
+    shape: Any
     step: Any
+
+
+class Rays(NamedTuple):
+    """Of a batch, float32 (R, 3), contiguous: origins and directions in voxel coordinates of cascade 0, and directions in the world, `views`."""
+
+    origins: Any
+    directions: Any
+    views: Any
 
 
 class Ray(NamedTuple):

@@ -13,7 +13,6 @@ import triton.language as tl
 
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.tree_march import (
-    Cascades,
     Grid,
     cascade_grid,
     colour_of,
@@ -28,7 +27,7 @@ from efficientnerf.backends.triton.vectors import Vec3, add_scaled, along, load_
 MIN_WEIGHT = tl.constexpr(1e-4)  # below it a sample's colour is not looked up, and its weight is added to that of the next one
 
 
-class Camera(NamedTuple):
+class DeviceCamera(NamedTuple):
     """centre Vec3, voxel coordinates; x, y, z Vec3, rows of the rotation, camera to world; focal lengths and principal point, pixels."""
 
     centre: Any
@@ -41,8 +40,17 @@ class Camera(NamedTuple):
     principal_y: Any
 
 
+class Voxels(NamedTuple):
+    """density, index, sh of `DeviceTree`; voxel: side of cascade 0's voxels in the frame."""
+
+    density: Any
+    index: Any
+    sh: Any
+    voxel: Any
+
+
 class Scene(NamedTuple):
-    """density, index, sh of `DeviceTree`; voxel: side of cascade 0's voxels in the frame; basis (R, C) harmonics of the columns; column (C,)."""
+    """Voxels; basis (R, C) harmonics of the columns; column (C,)."""
 
     density: Any
     index: Any
@@ -127,41 +135,37 @@ def _surface_normal(cascades, density, p, live, CASCADES: tl.constexpr, BRICK: t
 
 @triton.jit
 def render(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, shapes, first, place, density, index, sh, colour, opacity, depth, normal,
-    rays, width, height, nx, ny, nz, step, voxel, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, red, green, blue,
+    rays, cascades, voxels, out, count, width, height, camera, background,
     PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr,
     ROW: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
 ):  # fmt: skip
-    """PINHOLE: pixels of a camera at (ox, oy, oz), voxel coordinates, with the rotation r, camera to world; depth along the view axis, infinity
-    where the opacity is below a half. Else: rays of the buffers, voxel coordinates, harmonics along `views`; depth along the ray.
+    """PINHOLE: pixels of a camera; depth along the view axis, infinity where the opacity is below a half. Else: `count` rays; depth along the ray.
 
-    OVER composites over (red, green, blue). WIDE x HIGH pixels make a program.
+    OVER composites over the background, Vec3. WIDE x HIGH pixels make a program. out: `efficientnerf.backends.triton.tree.DeviceRendering`.
     """
     BLOCK: tl.constexpr = WIDE * HIGH
     column = tl.arange(0, ROW)
     if PINHOLE:
-        camera = Camera(Vec3(ox, oy, oz), Vec3(r00, r01, r02), Vec3(r10, r11, r12), Vec3(r20, r21, r22), fx, fy, cx, cy)
         r, live, origin, direction, cosine = _pixel_rays(camera, width, height, WIDE, HIGH)
         basis = basis_columns(direction, column % K, K)
     else:
         r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-        live = r < rays
-        direction = load_vec3(directions, r, live)
-        origin = load_vec3(origins, r, live)
+        live = r < count
+        direction = load_vec3(rays.directions, r, live)
+        origin = load_vec3(rays.origins, r, live)
         cosine = tl.full((BLOCK,), 1.0, tl.float32)
-        basis = basis_columns(load_vec3(views, r, live), column % K, K)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
+        basis = basis_columns(load_vec3(rays.views, r, live), column % K, K)
     start = State(tl.full((BLOCK,), 1.0, tl.float32), tl.zeros((BLOCK,), tl.float32), zeros_vec3(BLOCK), tl.full((BLOCK,), float("inf"), tl.float32))
-    scene = Scene(density, index, sh, voxel, basis, column)
+    scene = Scene(voxels.density, voxels.index, voxels.sh, voxels.voxel, basis, column)
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
 
     opaque = live & (end.transmittance <= 0.5)
     surface = along(origin, direction, tl.where(opaque, end.depth, 0.0))
-    facing = _surface_normal(cascades, density, surface, opaque, CASCADES, BRICK, NEAREST)
+    facing = _surface_normal(cascades, voxels.density, surface, opaque, CASCADES, BRICK, NEAREST)
     rgb = end.colour
     if OVER:
-        rgb = add_scaled(rgb, end.transmittance, Vec3(red, green, blue))
-    store_vec3(colour, r, rgb, live)
-    tl.store(opacity + r, 1 - end.transmittance, live)
-    tl.store(depth + r, tl.where(opaque, end.depth * voxel * cosine, float("inf")), live)
-    store_vec3(normal, r, facing, live)
+        rgb = add_scaled(rgb, end.transmittance, background)
+    store_vec3(out.colour, r, rgb, live)
+    tl.store(out.opacity + r, 1 - end.transmittance, live)
+    tl.store(out.depth + r, tl.where(opaque, end.depth * voxels.voxel * cosine, float("inf")), live)
+    store_vec3(out.normal, r, facing, live)

@@ -6,28 +6,18 @@ Gradients are sums in fixed point (`efficientnerf.backends.triton.tree_gradients
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
-from efficientnerf.backends.numba.tree_training.steps import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION
+from efficientnerf.backends.layout import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION, Hyperparameters, Moments
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, fixed_point_scale
 
+LEAST, MOST, MOST_VISITS = tl.constexpr(MIN_THICKNESS), tl.constexpr(MAX_THICKNESS), tl.constexpr(MAX_VISITS)
 VOXELS_PER_PROGRAM = 256 if INTERPRETED else 32
-
-
-class Moments(NamedTuple):
-    """Running means of the gradients, (N,) and (N, 3 K), without rows where there is no momentum; of their squares (N,), (N,); and visits (N,) int32."""
-
-    density: Tensor
-    sh: Tensor
-    square_density: Tensor
-    square_sh: Tensor
-    visits: Tensor
 
 
 class Neighbours(NamedTuple):
@@ -41,13 +31,30 @@ class Neighbours(NamedTuple):
     beside: Tensor
 
 
+class Rule(NamedTuple):
+    """voxel: side of cascade 0's voxels; the numbers of Hyperparameters, logarithms of two of them, and `total_variation` the share of the differences."""
+
+    voxel: Any
+    density_rate: Any
+    sh_rate: Any
+    view_share: Any
+    decay: Any
+    log_decay: Any
+    epsilon: Any
+    momentum: Any
+    log_momentum: Any
+    total_variation: Any
+    sparsity: Any
+    entropy: Any
+
+
 @triton.jit
-def _total_variation(v, met, thickness, side, weight, before, beside, min_thickness):  # type: ignore[no-untyped-def]
+def _total_variation(v, met, thickness, side, weight, before, beside):  # type: ignore[no-untyped-def]
     """Share `weight` of the differences of the logarithm of the optical thickness to those of the neighbours."""
     here, slope = tl.log(thickness), tl.zeros_like(thickness)
     for face in tl.static_range(6):
         other = tl.load(beside + 6 * v + face, met, other=-1)
-        beyond = tl.maximum(tl.load(before + other, other >= 0, other=0.0) * side, min_thickness)
+        beyond = tl.maximum(tl.load(before + other, other >= 0, other=0.0) * side, LEAST)
         slope += tl.where(other >= 0, here - tl.log(beyond), 0.0)
     return weight * slope
 
@@ -64,51 +71,53 @@ def _of_opacity(thickness, sparsity, entropy):  # type: ignore[no-untyped-def]
 
 @triton.jit(do_not_specialize=["number", "terms"])
 def _step(  # type: ignore[no-untyped-def]
-    density, sh, sum_thickness, sum_sh, mean_density, mean_sh, square_density, square_sh, visits, before, beside, stamp, cascade_of, place,
-    voxels, number, terms, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, momentum, log_momentum, total_variation, sparsity,
-    entropy, min_thickness, max_thickness, max_visits,
+    values, sums, moments, neighbours, stamp, cascade_of, place, voxels, number, terms, unit, rule,
     CASCADES: tl.constexpr, MOMENTUM: tl.constexpr, SMOOTH: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each. MOMENTUM: Adam. SMOOTH: with total variation."""
+    """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each. MOMENTUM: Adam. SMOOTH: with total variation.
+
+    values  density and harmonics; sums: gradients by optical thickness and harmonics
+    """
+    density, sh, h = values[0], values[1], rule
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     met = tl.load(stamp + v, v < voxels, other=-1) == number
     if tl.max(met.to(tl.int32), 0) > 0:
-        visited = tl.minimum(tl.load(visits + v, met, other=0) + 1, max_visits)
-        tl.store(visits + v, visited, met)
-        correction = 1 / (1 - tl.exp(visited.to(tl.float32) * log_decay))
+        visited = tl.minimum(tl.load(moments.visits + v, met, other=0) + 1, MOST_VISITS)
+        tl.store(moments.visits + v, visited, met)
+        correction = 1 / (1 - tl.exp(visited.to(tl.float32) * h.log_decay))
         ahead = 1.0
         if MOMENTUM:
-            ahead = 1 / (1 - tl.exp(visited.to(tl.float32) * log_momentum))
-        side = voxel
+            ahead = 1 / (1 - tl.exp(visited.to(tl.float32) * h.log_momentum))
+        side = h.voxel
         if CASCADES > 1:
-            side = voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
+            side = h.voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
         # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
-        depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, min_thickness)
-        g = tl.load(sum_thickness + v, met, other=0).to(tl.float32) * unit * depth
-        g += _of_opacity(depth, sparsity, entropy)
-        square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * g * g
+        depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, LEAST)
+        g = tl.load(sums[0] + v, met, other=0).to(tl.float32) * unit * depth
+        g += _of_opacity(depth, h.sparsity, h.entropy)
+        square = h.decay * tl.load(moments.square_density + v, met, other=0.0) + (1 - h.decay) * g * g
         if MOMENTUM:
-            g = momentum * tl.load(mean_density + v, met, other=0.0) + (1 - momentum) * g
-            tl.store(mean_density + v, g, met)
-        change = density_rate * ahead * g / (tl.sqrt(square * correction) + epsilon)
+            g = h.momentum * tl.load(moments.density + v, met, other=0.0) + (1 - h.momentum) * g
+            tl.store(moments.density + v, g, met)
+        change = h.density_rate * ahead * g / (tl.sqrt(square * correction) + h.epsilon)
         if SMOOTH:
-            change += _total_variation(v, met, depth, side, total_variation, before, beside, min_thickness)
-        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), min_thickness), max_thickness) / side, met)
-        tl.store(square_density + v, square, met)
-        tl.store(sum_thickness + v, tl.zeros_like(v), met)
+            change += _total_variation(v, met, depth, side, h.total_variation, neighbours.density, neighbours.beside)
+        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), LEAST), MOST) / side, met)
+        tl.store(moments.square_density + v, square, met)
+        tl.store(sums[0] + v, tl.zeros_like(v), met)
         column = tl.arange(0, ROW)
         at = v[:, None] * WIDTH + column[None, :]
         there = met[:, None] & (column < 3 * terms)[None, :]
-        by_sh = tl.load(sum_sh + at, there, other=0).to(tl.float32) * unit
-        square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(by_sh * by_sh, 1) / (3 * terms)
-        tl.store(square_sh + v, square, met)
+        by_sh = tl.load(sums[1] + at, there, other=0).to(tl.float32) * unit
+        square = h.decay * tl.load(moments.square_sh + v, met, other=0.0) + (1 - h.decay) * tl.sum(by_sh * by_sh, 1) / (3 * terms)
+        tl.store(moments.square_sh + v, square, met)
         if MOMENTUM:
-            by_sh = momentum * tl.load(mean_sh + at, there, other=0.0) + (1 - momentum) * by_sh
-            tl.store(mean_sh + at, by_sh, there)
-        scale = sh_rate * ahead / (tl.sqrt(square * correction) + epsilon)
-        share = tl.where(column < 3, 1.0, view_share)
+            by_sh = h.momentum * tl.load(moments.sh + at, there, other=0.0) + (1 - h.momentum) * by_sh
+            tl.store(moments.sh + at, by_sh, there)
+        scale = h.sh_rate * ahead / (tl.sqrt(square * correction) + h.epsilon)
+        share = tl.where(column < 3, 1.0, h.view_share)
         tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * share[None, :] * by_sh, there)
-        tl.store(sum_sh + at, tl.zeros_like(at), there)
+        tl.store(sums[1] + at, tl.zeros_like(at), there)
 
 
 def step(
@@ -122,10 +131,10 @@ def step(
     voxels = len(moments.visits)
     if h.total_variation > 0:
         neighbours.density.copy_(values[0])
+    numbers = (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))
+    rule = Rule(*map(float, (*numbers, min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy)))
     _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
-        *values, *sums, *moments, *neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, min(h.terms, g.terms), 1 / fixed_point_scale(rays),
-        *map(float, (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))),
-        *map(float, (min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS,
-        CASCADES=g.cascades.grids, MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
+        values, sums, moments, neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, min(h.terms, g.terms), 1 / fixed_point_scale(rays), rule,
+        CASCADES=len(g.cascades.first), MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
         BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

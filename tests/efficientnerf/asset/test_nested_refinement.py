@@ -19,9 +19,9 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import ray_parts, render_reference, tree_density
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import contributions as kernels
+from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree.nearest import CAPACITY
 from efficientnerf.backends.numba.tree.nearest import render_rays as render_nearest
-from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.rendering import environment
 from tests.efficientnerf.balls import pixels
 from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
@@ -107,7 +107,7 @@ def test_greatest_weights_are_those_of_plain_sums_in_any_number_of_parts() -> No
     found = []
     for parts in (1, 3):
         into = np.zeros((parts, len(tree.density_values)), np.float32)
-        kernels.max_contributions(tree_grid(tree), start, along, tree.density_values, gain, into, stop=0.0)
+        kernels.max_contributions(cells_of(tree), start, along, tree.density_values, gain, into, stop=0.0)
         found.append(into.max(axis=0))
     np.testing.assert_array_equal(*found)
     np.testing.assert_allclose(found[0], weights_by_sums(tree, origins, directions, gain), atol=1e-5)

@@ -17,11 +17,10 @@ from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.layout import EARLY_STOP
+from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree.contributions import max_contributions
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
-from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
-from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS, pixels
@@ -59,7 +58,7 @@ def test_records_grow_until_all_samples_fit() -> None:
     start, along, bases = in_voxels(tree, origins, directions)
     o = initial_state(tree)
     seen = seen_at_random(300, 0.0, np.float32)
-    cells = cells_of(tree_grid(tree))
+    cells = cells_of(tree)
     dense = dense_densities(cells, voxel_places(cells, len(o.sh)), o.density)
     _, records = kernels.forward_backward(cells, packets_of(300), start, along, bases, dense, o.sh, seen, buffer)
     assert 7 < (records.begin[:, -1] - records.begin[:, 0]).max() <= buffer.capacity
@@ -202,7 +201,7 @@ def test_greatest_weights_are_those_of_a_march_by_hand() -> None:
     for parts in (1, 3):
         into = np.zeros((parts, len(tree.density_values)), np.float32)
         for half in (slice(0, 25), slice(25, 40)):  # what is known is raised
-            max_contributions(tree_grid(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
+            max_contributions(cells_of(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
         found.append(into.max(axis=0))
     np.testing.assert_array_equal(*found)
     np.testing.assert_allclose(found[0], weights_by_hand(tree, origins, directions, gain), atol=1e-5)

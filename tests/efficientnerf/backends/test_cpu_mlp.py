@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.backends.numba import mlp, tiles
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba import mlp
+from efficientnerf.backends.numba.vector import products
+from efficientnerf.backends.numba.vector.memory import pointer
 from efficientnerf.fields import hash
 from efficientnerf.training.optimiser import ParameterGroup
 from tests.efficientnerf.networks import passes, weights_of
@@ -102,12 +103,12 @@ def test_nan_stays_nan(bfloat16: bool) -> None:
 
 @numba.njit
 def _copy_rows(x, out):  # type: ignore[no-untyped-def]
-    tiles.copy_rows(tiles.Rows(pointer(x), 0, x.shape[1]), x.shape[1], pointer(out), out.shape[0], out.shape[1])
+    products.copy_rows(products.Rows(pointer(x), 0, x.shape[1]), x.shape[1], pointer(out), out.shape[0], out.shape[1])
 
 
 @numba.njit
 def _pack_row_pairs(x, out):  # type: ignore[no-untyped-def]
-    tiles.pack_row_pairs(tiles.Rows(pointer(x), 0, x.shape[1]), x.shape[1], pointer(out), out.shape[0], out.shape[1])
+    products.pack_row_pairs(products.Rows(pointer(x), 0, x.shape[1]), x.shape[1], pointer(out), out.shape[0], out.shape[1])
 
 
 def test_conversion_to_bfloat16_rounds_as_torch_does() -> None:
@@ -128,10 +129,10 @@ def test_conversion_to_bfloat16_rounds_as_torch_does() -> None:
 PROGRAM = """
 import sys
 import numpy as np
-from efficientnerf.backends.numba import tiles
+from efficientnerf.backends.numba.vector import products
 from tests.efficientnerf.networks import passes, weights_of
 
-assert not tiles.DOTS and tiles.VECTORS == 1
+assert not products.DOTS and products.VECTORS == 1
 rng = np.random.default_rng(5)
 weights = weights_of(24, 64, 2, 28, rng)
 features, grad = rng.normal(size=(24, 200)).astype(np.float32), rng.normal(size=(200, 28)).astype(np.float32)

@@ -13,9 +13,9 @@ import torch
 from efficientnerf.asset.cascades import voxel_cascades, voxel_coordinates, voxel_sides
 from efficientnerf.asset.refinement.state import RefinementState, initial_state
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.layout import MOST_VARIATION
+from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training import steps as host
-from efficientnerf.backends.numba.tree_training.cells import cells_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.refinements import GRIDS, empty_moments, records_of, rule_of
@@ -63,7 +63,7 @@ def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str
     tree = made()
     o, adam, smooth = initial_state(tree), "momentum" in more, "total_variation" in more
     there = OnDevice(tree, o, adam=adam, smooth=smooth)
-    cells = cells_of(tree_grid(tree))
+    cells = cells_of(tree)
     moments, neighbours = empty_moments(o, adam=adam), neighbours_of(cells) if smooth else NO_NEIGHBOURS
     rule = rule_of(**more)
     width = 3 * more.get("terms", 25)
@@ -132,6 +132,6 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     logarithm = torch.from_numpy(np.log(o.density.astype(np.float64) * sides)).requires_grad_()
     (slope,) = torch.autograd.grad(penalty(tree, logarithm, "total_variation"), logarithm)
     moved = np.log(there.values[0].cpu().numpy().astype(np.float64) / o.density)
-    np.testing.assert_allclose(moved, -min(0.1 * weight, host.MOST_VARIATION) * slope.numpy(), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(moved, -min(0.1 * weight, MOST_VARIATION) * slope.numpy(), rtol=1e-3, atol=1e-5)
     assert not there.moments.square_density.any()
     assert np.abs(moved).max() > 0.1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.layout import RayTargets
 from tests import reference
 from tests.efficientnerf.refinements import device_gradients, gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import random_tree, rays_at

@@ -14,13 +14,13 @@ from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_co
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.layout import MIN_THICKNESS, MOST_VARIATION
+from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training import gradients as kernels
-from efficientnerf.backends.numba.tree_training.cells import cells_of
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Values, step, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import Values, step, sum_gradients, values_of
+from efficientnerf.backends.numba.vector.memory import pointer
 from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
@@ -86,7 +86,7 @@ def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: 
         by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
         sum_gradients(records, by_density, by_sh)
         rule = rule_of(momentum=momentum, terms=terms)
-        step(records, values_of(cells_of(tree_grid(tree)), o.density, o.sh), moments, rule)
+        step(records, values_of(cells_of(tree), o.density, o.sh), moments, rule)
         met = np.zeros(count, bool)
         for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
             met[records.numbers[begin:end, 0]] = True
@@ -117,7 +117,7 @@ def test_the_same_bytes_on_any_number_of_threads() -> None:
         for count in (1, threads):
             numba.set_num_threads(count)
             o = initial_state(tree)
-            moments, cells = empty_moments(o, adam=True), cells_of(tree_grid(tree))
+            moments, cells = empty_moments(o, adam=True), cells_of(tree)
             values = values_of(cells, o.density, o.sh)
             for _ in range(2):
                 loss, records = kernels.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer())
@@ -170,7 +170,7 @@ def test_regularisers_are_slopes_of_their_terms(made: Callable[[], NerfTree], ki
     sum_gradients(records, by_density, by_sh)
     old = np.log(o.density.astype(np.float64) * voxel_sides(tree))
     slope = by_density.astype(np.float64) * o.density
-    values = values_of(cells_of(tree_grid(tree)), o.density, o.sh)
+    values = values_of(cells_of(tree), o.density, o.sh)
     step(records, values, empty_moments(o, adam=False), rule_of(**{kind: 0.7}))
     np.testing.assert_array_equal(values.dense[values.places], o.density)
     met = o.visits > 0
@@ -190,7 +190,7 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     tree = made()
     noisy = replace(tree, density_values=np.random.default_rng(0).uniform(1, 30, len(tree.density_values)).astype(np.float32))
     plain, smooth = initial_state(noisy), initial_state(noisy)
-    cells = cells_of(tree_grid(tree))
+    cells = cells_of(tree)
     old = np.log(plain.density.astype(np.float64) * voxel_sides(tree))
     for o, more in ((plain, {}), (smooth, {"total_variation": weight})):
         step(records_of(tree, o, 1), values_of(cells, o.density, o.sh), empty_moments(o, adam=False), rule_of(**more), neighbours_of(cells))
@@ -210,7 +210,7 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
 @pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
 def test_values_know_their_voxels(made: Callable[[], NerfTree]) -> None:
     tree = made()
-    values = values_of(cells_of(tree_grid(tree)), tree.density_values, tree.sh.reshape(len(tree.sh), -1))
+    values = values_of(cells_of(tree), tree.density_values, tree.sh.reshape(len(tree.sh), -1))
     np.testing.assert_array_equal(values.cascades, voxel_cascades(tree))
     np.testing.assert_allclose(values.sides, cascade_sides(tree), rtol=1e-15)
     np.testing.assert_array_equal(values.dense[values.places], tree.density_values)
@@ -225,7 +225,7 @@ def test_rows_of_any_length_take_their_own_gradient_and_no_other(degree: int) ->
     records, before = records_of(tree, o, 1), o.sh.copy()
     by_density, by_sh = np.zeros(o.density.shape), np.zeros(o.sh.shape)
     sum_gradients(records, by_density, by_sh)
-    step(records, values_of(cells_of(tree_grid(tree)), o.density, o.sh), empty_moments(o, adam=False), rule_of())
+    step(records, values_of(cells_of(tree), o.density, o.sh), empty_moments(o, adam=False), rule_of())
     met = o.visits > 0
     assert 0 < met.sum() < len(met)
     np.testing.assert_array_equal(o.sh[~met], before[~met])
@@ -240,7 +240,7 @@ def test_voxels_without_density_are_neighbours_and_absent_ones_are_not(made: Cal
     density = np.random.default_rng(0).uniform(1, 30, len(tree.density_values)).astype(np.float32)
     density[::3] = 0
     tree = replace(tree, density_values=density)
-    cells, sides = cells_of(tree_grid(tree)), voxel_sides(tree)
+    cells, sides = cells_of(tree), voxel_sides(tree)
     values, beside = values_of(cells, density, tree.sh.reshape(len(density), -1)), neighbours_of(cells)
     thickness = np.maximum(density * sides, MIN_THICKNESS)
     at = np.concatenate([voxel_coordinates(tree), voxel_cascades(tree)[:, None]], axis=1)
@@ -259,8 +259,8 @@ def test_total_variation_smooths_what_was_met_alone(made: Callable[[], NerfTree]
     tree = made()
     o = initial_state(tree)
     before = o.density.copy()
-    values = values_of(cells_of(tree_grid(tree)), o.density, o.sh)
+    values = values_of(cells_of(tree), o.density, o.sh)
     step(records_of(tree, o, 2), values, empty_moments(o, adam=False), rule_of(total_variation=1e6),
-         neighbours_of(cells_of(tree_grid(tree))))  # fmt: skip
+         neighbours_of(cells_of(tree)))  # fmt: skip
     np.testing.assert_array_equal(o.density[o.visits == 0], before[o.visits == 0])
     assert (o.density != before)[o.visits > 0].mean() > 0.8

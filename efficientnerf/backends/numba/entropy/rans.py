@@ -16,7 +16,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import advanced, pointer
+from efficientnerf.backends.numba.vector.memory import advanced, pointer
 
 BITS = 14  # of probabilities
 SLOTS = 1 << BITS

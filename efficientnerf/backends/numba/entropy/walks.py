@@ -12,7 +12,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.entropy.rans import coded, coded_bit, coded_few, digits, slice_of
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.vector.memory import pointer
 
 BIT_CONTEXTS = 128  # which of seven neighbours are set
 DENSITY_CONTEXTS = 33

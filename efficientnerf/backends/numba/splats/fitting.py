@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer, sigmoid
-from efficientnerf.backends.numba.splats.lanes import LANES
-from efficientnerf.backends.numba.splats.projection import HARMONICS, MEAN, OPACITY, ROTATION, SCALE, basis16, colour16, conic16, image16
+from efficientnerf.backends.numba.splats.projection import HARMONICS, LANES, MEAN, OPACITY, ROTATION, SCALE, basis16, colour16, conic16, image16
 from efficientnerf.backends.numba.splats.raster import ERROR, SUMS
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max_lanes, min_lanes, select_lanes, sqrt_lanes, store_lanes
+from efficientnerf.backends.numba.vector.maths import broadcast, maximum, minimum, select, sigmoid, sqrt
+from efficientnerf.backends.numba.vector.memory import load, pointer, store
 
 GROUPS_A_TASK = 64
 PARTS = 6  # mean, scales, rotation, opacity, base colour, other harmonics
@@ -69,19 +68,20 @@ def _geometry_gradients(p, at, lens, total, out):  # type: ignore[no-untyped-def
     """Gradients by mean, logarithms of scales, quaternion and logit into rows MEAN to OPACITY of `out`; returns the longest standard deviation."""
     _x, _y, _depth, _seen, wx, wy, nx, ny, s, turned = image16(p, at, lens)
     ax, ay, _covariance, (a, b, c) = conic16(nx, ny, s)
-    v, vx, vy, vxx, vxy, vyy = load16(total, 0), load16(total, 16), load16(total, 32), load16(total, 48), load16(total, 64), load16(total, 80)
+    v, vx, vy = load(total, 0, LANES), load(total, 16, LANES), load(total, 32, LANES)
+    vxx, vxy, vyy = load(total, 48, LANES), load(total, 64, LANES), load(total, 80, LANES)
     px, py = a * vx + b * vy, b * vx + c * vy
-    store_lanes(out, 16 * MEAN, px * wx[0] + py * wy[0])
-    store_lanes(out, 16 * (MEAN + 1), px * wx[1] + py * wy[1])
-    store_lanes(out, 16 * (MEAN + 2), px * wx[2] + py * wy[2])
+    store(out, 16 * MEAN, px * wx[0] + py * wy[0])
+    store(out, 16 * (MEAN + 1), px * wx[1] + py * wy[1])
+    store(out, 16 * (MEAN + 2), px * wx[2] + py * wy[2])
     # By the covariance in the image: half of Q V Q, Q the conic; by its root A twice that times A.
     qx, qy, rx, ry = a * vxx + b * vxy, a * vxy + b * vyy, b * vxx + c * vxy, b * vxy + c * vyy
     hxx, hxy, hyy = qx * a + qy * b, qx * b + qy * c, rx * b + ry * c
     dx0, dx1, dx2 = hxx * ax[0] + hxy * ay[0], hxx * ax[1] + hxy * ay[1], hxx * ax[2] + hxy * ay[2]
     dy0, dy1, dy2 = hxy * ax[0] + hyy * ay[0], hxy * ax[1] + hyy * ay[1], hxy * ax[2] + hyy * ay[2]
-    store_lanes(out, 16 * SCALE, dx0 * ax[0] + dy0 * ay[0])
-    store_lanes(out, 16 * (SCALE + 1), dx1 * ax[1] + dy1 * ay[1])
-    store_lanes(out, 16 * (SCALE + 2), dx2 * ax[2] + dy2 * ay[2])
+    store(out, 16 * SCALE, dx0 * ax[0] + dy0 * ay[0])
+    store(out, 16 * (SCALE + 1), dx1 * ax[1] + dy1 * ay[1])
+    store(out, 16 * (SCALE + 2), dx2 * ax[2] + dy2 * ay[2])
     dx0, dx1, dx2, dy0, dy1, dy2 = dx0 * s[0], dx1 * s[1], dx2 * s[2], dy0 * s[0], dy1 * s[1], dy2 * s[2]
     (w, x, y, z), length, _matrix = turned
     g00, g01, g02 = wx[0] * dx0 + wy[0] * dy0, wx[0] * dx1 + wy[0] * dy1, wx[0] * dx2 + wy[0] * dy2
@@ -92,12 +92,12 @@ def _geometry_gradients(p, at, lens, total, out):  # type: ignore[no-untyped-def
     by_y = _TWO * (x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20) - _TWO * y * (g00 + g22))
     by_z = _TWO * (x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01) - _TWO * z * (g00 + g11))
     along = by_w * w + by_x * x + by_y * y + by_z * z
-    store_lanes(out, 16 * ROTATION, (by_w - along * w) / length)
-    store_lanes(out, 16 * (ROTATION + 1), (by_x - along * x) / length)
-    store_lanes(out, 16 * (ROTATION + 2), (by_y - along * y) / length)
-    store_lanes(out, 16 * (ROTATION + 3), (by_z - along * z) / length)
-    store_lanes(out, 16 * OPACITY, v * (_ONE - sigmoid(load16(p, at + 16 * OPACITY))))
-    return max_lanes(s[0], max_lanes(s[1], s[2]))
+    store(out, 16 * ROTATION, (by_w - along * w) / length)
+    store(out, 16 * (ROTATION + 1), (by_x - along * x) / length)
+    store(out, 16 * (ROTATION + 2), (by_y - along * y) / length)
+    store(out, 16 * (ROTATION + 3), (by_z - along * z) / length)
+    store(out, 16 * OPACITY, v * (_ONE - sigmoid(load(p, at + 16 * OPACITY, LANES))))
+    return maximum(s[0], maximum(s[1], s[2]))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -105,59 +105,59 @@ def _colour_gradients(p, at, lens, degree, total, basis, out):  # type: ignore[n
     """Gradients by the harmonics into rows from HARMONICS on."""
     basis16(p, at, lens, degree, basis)
     red, green, blue = colour16(p, at, degree, basis)
-    red, green = select_lanes(red > _NONE, load16(total, 96), _NONE), select_lanes(green > _NONE, load16(total, 112), _NONE)
-    blue = select_lanes(blue > _NONE, load16(total, 128), _NONE)
+    red, green = select(red > _NONE, load(total, 96, LANES), _NONE), select(green > _NONE, load(total, 112, LANES), _NONE)
+    blue = select(blue > _NONE, load(total, 128, LANES), _NONE)
     for k in range((degree + 1) * (degree + 1)):
-        value, row = load16(basis, 16 * k), 16 * (HARMONICS + 3 * k)
-        store_lanes(out, row, value * red)
-        store_lanes(out, row + 16, value * green)
-        store_lanes(out, row + 32, value * blue)
+        value, row = load(basis, 16 * k, LANES), 16 * (HARMONICS + 3 * k)
+        store(out, row, value * red)
+        store(out, row + 16, value * green)
+        store(out, row + 32, value * blue)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _step_part(p, at, m, to, part, begin, end, rate, ahead, correction, moves, h, gradient):  # type: ignore[no-untyped-def]
     """Adam on rows `begin` to `end` of a group whose lanes `moves` are to move."""
-    square = broadcast16(_NONE)
+    square = broadcast(_NONE, LANES)
     for row in range(begin, end):
-        g = load16(gradient, 16 * row)
+        g = load(gradient, 16 * row, LANES)
         square = square + g * g
-    old = load16(m, to + 16 * (SQUARES + part))
+    old = load(m, to + 16 * (SQUARES + part), LANES)
     square = old * h.decay + square * ((_ONE - h.decay) / np.float32(end - begin))
-    store_lanes(m, to + 16 * (SQUARES + part), select_lanes(moves, square, old))
-    scale = ahead * rate / (sqrt_lanes(square * correction) + h.epsilon)
+    store(m, to + 16 * (SQUARES + part), select(moves, square, old))
+    scale = ahead * rate / (sqrt(square * correction) + h.epsilon)
     for row in range(begin, end):
         place, before = to + 16 * (GRADIENTS + row), at + 16 * row
-        old = load16(m, place)
-        mean = old * h.momentum + load16(gradient, 16 * row) * (_ONE - h.momentum)
-        store_lanes(m, place, select_lanes(moves, mean, old))
-        value = load16(p, before)
-        store_lanes(p, before, select_lanes(moves, value - scale * mean, value))
+        old = load(m, place, LANES)
+        mean = old * h.momentum + load(gradient, 16 * row, LANES) * (_ONE - h.momentum)
+        store(m, place, select(moves, mean, old))
+        value = load(p, before, LANES)
+        store(p, before, select(moves, value - scale * mean, value))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):  # type: ignore[no-untyped-def]
     """A step of a group with such sums of its pairs."""
-    moves = load16(total, 16 * SUMS) > _HALF
-    visits = load16(m, to)
+    moves = load(total, 16 * SUMS, LANES) > _HALF
+    visits = load(m, to, LANES)
     for lane in range(LANES):
         visit = np.int64(m[to + lane])
         correct[lane] = h.of_mean[min(visit, len(h.of_mean) - 1)]
         correct[16 + lane] = h.of_square[min(visit, len(h.of_square) - 1)]
-    ahead, correction = load16(correct, 0), load16(correct, 16)
+    ahead, correction = load(correct, 0, LANES), load(correct, 16, LANES)
     longest = _geometry_gradients(p, at, lens, total, gradient)
     _colour_gradients(p, at, lens, degree, total, basis, gradient)
-    store_lanes(m, to, select_lanes(moves, visits + _ONE, visits))
+    store(m, to, select(moves, visits + _ONE, visits))
     terms = 3 * (degree + 1) * (degree + 1)
     _step_part(p, at, m, to, 0, MEAN, SCALE, longest * h.rates[0], ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 1, SCALE, ROTATION, broadcast16(h.rates[1]), ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 2, ROTATION, OPACITY, broadcast16(h.rates[2]), ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 3, OPACITY, HARMONICS, broadcast16(h.rates[3]), ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 4, HARMONICS, HARMONICS + 3, broadcast16(h.rates[4]), ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 1, SCALE, ROTATION, broadcast(h.rates[1], LANES), ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 2, ROTATION, OPACITY, broadcast(h.rates[2], LANES), ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 3, OPACITY, HARMONICS, broadcast(h.rates[3], LANES), ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 4, HARMONICS, HARMONICS + 3, broadcast(h.rates[4], LANES), ahead, correction, moves, h, gradient)
     if degree > 0:
-        _step_part(p, at, m, to, 5, HARMONICS + 3, HARMONICS + terms, broadcast16(h.rates[5]), ahead, correction, moves, h, gradient)
+        _step_part(p, at, m, to, 5, HARMONICS + 3, HARMONICS + terms, broadcast(h.rates[5], LANES), ahead, correction, moves, h, gradient)
     for n in range(3):
         row = at + 16 * (SCALE + n)
-        store_lanes(p, row, min_lanes(max_lanes(load16(p, row), h.least), h.greatest))
+        store(p, row, minimum(maximum(load(p, row, LANES), h.least), h.greatest))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

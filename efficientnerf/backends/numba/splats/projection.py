@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer, sigmoid
-from efficientnerf.backends.numba.splats.lanes import LANES, arctangent16, exp16
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max_lanes, min_lanes, select_lanes, sqrt_lanes, store_lanes
 from efficientnerf.backends.numba.tree.view_colours import sh_basis
+from efficientnerf.backends.numba.vector.maths import arctangent, broadcast, exp, maximum, minimum, select, sigmoid, sqrt
+from efficientnerf.backends.numba.vector.memory import load, pointer, store
 
+LANES = 16  # Gaussians of a group
 MEAN, SCALE, ROTATION, OPACITY, HARMONICS = 0, 3, 6, 10, 11  # rows of values: logarithms of scales, logit of the opacity
 X, Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, WIDTH, HEIGHT, DEPTH = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11  # of a projected Gaussian
 RECORD = 16  # numbers of one
@@ -56,19 +56,19 @@ def _plane(x, y, z, lens):  # type: ignore[no-untyped-def]
     each."""
     if lens.fisheye:
         square = x * x + y * y
-        across, whole = sqrt_lanes(max_lanes(square, np.float32(1e-20))), square + z * z
-        angle = _TWO * arctangent16(across / max_lanes(sqrt_lanes(whole) + z, np.float32(1e-12)))
-        nx, ny, whole = x / across, y / across, max_lanes(whole, np.float32(1e-20))
+        across, whole = sqrt(maximum(square, np.float32(1e-20))), square + z * z
+        angle = _TWO * arctangent(across / maximum(sqrt(whole) + z, np.float32(1e-12)))
+        nx, ny, whole = x / across, y / across, maximum(whole, np.float32(1e-20))
         straight = across < np.float32(1e-5) * z  # angle / across is 1 / z there
-        per, along = select_lanes(straight, _ONE / max_lanes(z, np.float32(1e-12)), angle / across), z / whole
+        per, along = select(straight, _ONE / maximum(z, np.float32(1e-12)), angle / across), z / whole
         cross, back = nx * ny * (along - per), across / whole * np.float32(-1)
         u_x, v_y = nx * nx * along + (_ONE - nx * nx) * per, ny * ny * along + (_ONE - ny * ny) * per
         return x * per, y * per, whole > lens.numbers[13] * lens.numbers[13], u_x, cross, nx * back, cross, v_y, ny * back
     ahead = z > lens.numbers[13]
-    per = _ONE / select_lanes(ahead, z, _ONE)
+    per = _ONE / select(ahead, z, _ONE)
     u, v = x * per, y * per
-    u_near, v_near = min_lanes(max_lanes(u, lens.limits[0]), lens.limits[1]), min_lanes(max_lanes(v, lens.limits[2]), lens.limits[3])
-    zero = broadcast16(_NONE)
+    u_near, v_near = minimum(maximum(u, lens.limits[0]), lens.limits[1]), minimum(maximum(v, lens.limits[2]), lens.limits[3])
+    zero = broadcast(_NONE, LANES)
     return u, v, ahead, per, zero, u_near * per * np.float32(-1), zero, per, v_near * per * np.float32(-1)
 
 
@@ -96,8 +96,8 @@ def _distorted(u, v, lens):  # type: ignore[no-untyped-def]
 def rotation16(p, at):  # type: ignore[no-untyped-def]
     """The unit quaternion of a group and its length, and the matrix by rows."""
     at += 16 * ROTATION
-    w, x, y, z = load16(p, at), load16(p, at + 16), load16(p, at + 32), load16(p, at + 48)
-    length = sqrt_lanes(max_lanes(w * w + x * x + y * y + z * z, np.float32(1e-20)))
+    w, x, y, z = load(p, at, LANES), load(p, at + 16, LANES), load(p, at + 32, LANES), load(p, at + 48, LANES)
+    length = sqrt(maximum(w * w + x * x + y * y + z * z, np.float32(1e-20)))
     w, x, y, z = w / length, x / length, y / length, z / length
     matrix = (
         _ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y),
@@ -112,12 +112,12 @@ def image16(p, at, lens):  # type: ignore[no-untyped-def]
     """A group in the image: (x, y) pixels, depth, whether it can be seen; the derivative of (x, y) by the point of the world (2, 3); that times the rotation
     (2, 3); the standard deviations; and the rotation."""
     t, n = lens.turn, lens.numbers
-    a, b, c = load16(p, at) - lens.centre[0], load16(p, at + 16) - lens.centre[1], load16(p, at + 32) - lens.centre[2]
+    a, b, c = load(p, at, LANES) - lens.centre[0], load(p, at + 16, LANES) - lens.centre[1], load(p, at + 32, LANES) - lens.centre[2]
     x, y, z = a * t[0] + b * t[1] + c * t[2], a * t[3] + b * t[4] + c * t[5], a * t[6] + b * t[7] + c * t[8]
     u, v, seen, u_x, u_y, u_z, v_x, v_y, v_z = _plane(x, y, z, lens)
     seen = seen & (u * u + v * v < n[14])
     px, py, _a, _b, _c, _d = _distorted(u, v, lens)
-    at_u, at_v = (u, v) if lens.fisheye else (min_lanes(max_lanes(u, lens.limits[0]), lens.limits[1]), min_lanes(max_lanes(v, lens.limits[2]), lens.limits[3]))
+    at_u, at_v = (u, v) if lens.fisheye else (minimum(maximum(u, lens.limits[0]), lens.limits[1]), minimum(maximum(v, lens.limits[2]), lens.limits[3]))
     _x, _y, x_u, x_v, y_u, y_v = _distorted(at_u, at_v, lens)
     jx = (n[0] * (x_u * u_x + x_v * v_x), n[0] * (x_u * u_y + x_v * v_y), n[0] * (x_u * u_z + x_v * v_z))
     jy = (n[1] * (y_u * u_x + y_v * v_x), n[1] * (y_u * u_y + y_v * v_y), n[1] * (y_u * u_z + y_v * v_z))
@@ -129,10 +129,10 @@ def image16(p, at, lens):  # type: ignore[no-untyped-def]
     ny = (wy[0] * r[0] + wy[1] * r[3] + wy[2] * r[6], wy[0] * r[1] + wy[1] * r[4] + wy[2] * r[7], wy[0] * r[2] + wy[1] * r[5] + wy[2] * r[8])
     low, high = -MOST_LOG_SCALE, MOST_LOG_SCALE
     scales = (
-        exp16(min_lanes(max_lanes(load16(p, at + 16 * SCALE), low), high)), exp16(min_lanes(max_lanes(load16(p, at + 16 * (SCALE + 1)), low), high)),
-        exp16(min_lanes(max_lanes(load16(p, at + 16 * (SCALE + 2)), low), high)),
+        exp(minimum(maximum(load(p, at + 16 * SCALE, LANES), low), high)), exp(minimum(maximum(load(p, at + 16 * (SCALE + 1), LANES), low), high)),
+        exp(minimum(maximum(load(p, at + 16 * (SCALE + 2), LANES), low), high)),
     )  # fmt: skip
-    depth = sqrt_lanes(x * x + y * y + z * z) if lens.fisheye else z
+    depth = sqrt(x * x + y * y + z * z) if lens.fisheye else z
     return px * n[0] + n[2], py * n[1] + n[3], depth, seen, wx, wy, nx, ny, scales, turned
 
 
@@ -151,18 +151,18 @@ def conic16(nx, ny, scales):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def basis16(p, at, lens, degree, out):  # type: ignore[no-untyped-def]
     """Harmonics of the view directions of a group, `out` (K, 16)."""
-    x, y, z = load16(p, at) - lens.centre[0], load16(p, at + 16) - lens.centre[1], load16(p, at + 32) - lens.centre[2]
-    length = sqrt_lanes(max_lanes(x * x + y * y + z * z, np.float32(1e-30)))
+    x, y, z = load(p, at, LANES) - lens.centre[0], load(p, at + 16, LANES) - lens.centre[1], load(p, at + 32, LANES) - lens.centre[2]
+    length = sqrt(maximum(x * x + y * y + z * z, np.float32(1e-30)))
     sh_basis(x / length, y / length, z / length, degree, out)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def colour16(p, at, degree, basis):  # type: ignore[no-untyped-def]
     """1/2 + the sum of the harmonics of a group, three channels; not clipped."""
-    red, green, blue = broadcast16(_HALF), broadcast16(_HALF), broadcast16(_HALF)
+    red, green, blue = broadcast(_HALF, LANES), broadcast(_HALF, LANES), broadcast(_HALF, LANES)
     for k in range((degree + 1) * (degree + 1)):
-        value, row = load16(basis, 16 * k), at + 16 * (HARMONICS + 3 * k)
-        red, green, blue = red + value * load16(p, row), green + value * load16(p, row + 16), blue + value * load16(p, row + 32)
+        value, row = load(basis, 16 * k, LANES), at + 16 * (HARMONICS + 3 * k)
+        red, green, blue = red + value * load(p, row, LANES), green + value * load(p, row + 16, LANES), blue + value * load(p, row + 32, LANES)
     return red, green, blue
 
 
@@ -171,27 +171,27 @@ def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore
     """Records of a group into out[first : first + 16]; WIDTH is 0 for what is not in the image."""
     x, y, depth, seen, _wx, _wy, nx, ny, scales, _turned = image16(p, at, lens)
     _ax, _ay, covariance, conic = conic16(nx, ny, scales)
-    opacity = sigmoid(load16(p, at + 16 * OPACITY))
+    opacity = sigmoid(load(p, at + 16 * OPACITY, LANES))
     # ln o <= 8 (o^(1/8) - 1): beyond this many squared standard deviations alpha is below LEAST_ALPHA.
-    reach = np.float32(2 * 5.5412637) + np.float32(16) * (sqrt_lanes(sqrt_lanes(sqrt_lanes(opacity))) - _ONE)
-    reach = max_lanes(reach, _NONE)
-    wide, high = sqrt_lanes(reach * covariance[0]), sqrt_lanes(reach * covariance[2])
+    reach = np.float32(2 * 5.5412637) + np.float32(16) * (sqrt(sqrt(sqrt(opacity))) - _ONE)
+    reach = maximum(reach, _NONE)
+    wide, high = sqrt(reach * covariance[0]), sqrt(reach * covariance[2])
     seen = seen & (opacity >= LEAST_ALPHA) & (x + wide > _NONE) & (y + high > _NONE)
     seen = seen & (x - wide < np.float32(lens.width)) & (y - high < np.float32(lens.height))
     basis16(p, at, lens, degree, basis)
     red, green, blue = colour16(p, at, degree, basis)
-    store_lanes(row, 16 * X, x)
-    store_lanes(row, 16 * Y, y)
-    store_lanes(row, 16 * CONIC_A, conic[0])
-    store_lanes(row, 16 * CONIC_B, conic[1])
-    store_lanes(row, 16 * CONIC_C, conic[2])
-    store_lanes(row, 16 * ALPHA, opacity)
-    store_lanes(row, 16 * RED, max_lanes(red, _NONE))
-    store_lanes(row, 16 * (RED + 1), max_lanes(green, _NONE))
-    store_lanes(row, 16 * (RED + 2), max_lanes(blue, _NONE))
-    store_lanes(row, 16 * WIDTH, select_lanes(seen, wide, _NONE))
-    store_lanes(row, 16 * HEIGHT, select_lanes(seen, high, _NONE))
-    store_lanes(row, 16 * DEPTH, depth)
+    store(row, 16 * X, x)
+    store(row, 16 * Y, y)
+    store(row, 16 * CONIC_A, conic[0])
+    store(row, 16 * CONIC_B, conic[1])
+    store(row, 16 * CONIC_C, conic[2])
+    store(row, 16 * ALPHA, opacity)
+    store(row, 16 * RED, maximum(red, _NONE))
+    store(row, 16 * (RED + 1), maximum(green, _NONE))
+    store(row, 16 * (RED + 2), maximum(blue, _NONE))
+    store(row, 16 * WIDTH, select(seen, wide, _NONE))
+    store(row, 16 * HEIGHT, select(seen, high, _NONE))
+    store(row, 16 * DEPTH, depth)
     for lane in range(LANES):
         for n in range(12):
             out[first + lane, n] = row[16 * n + lane]

@@ -17,33 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.splats.lanes import LOG2_E, sums16
 from efficientnerf.backends.numba.splats.pairs import BLOCK, TILE, Pairs
-from efficientnerf.backends.numba.splats.projection import (
-    ALPHA,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
-    LEAST_ALPHA,
-    MOST_ALPHA,
-    RECORD,
-    RED,
-    X,
-    Y,
-)
-from efficientnerf.backends.numba.tree.packets.lanes import (
-    bits_of,
-    broadcast16,
-    exp2_neg_lanes,
-    load16,
-    mask16,
-    max_lanes,
-    min_lanes,
-    select_lanes,
-    store_lanes,
-)
-from efficientnerf.backends.numba.tree_training.tasks import take_next
+from efficientnerf.backends.numba.splats.projection import ALPHA, CONIC_A, CONIC_B, CONIC_C, LANES, LEAST_ALPHA, MOST_ALPHA, RECORD, RED, X, Y
+from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each
+from efficientnerf.backends.numba.vector.memory import fetch_add, load, pointer, store
 
 SUMS = 16  # numbers of a pair
 ERROR = 9  # of them: the squared error where the Gaussian shows, times its weight
@@ -68,36 +45,36 @@ def _exponent(p, at, x, y):  # type: ignore[no-untyped-def]
     """A Gaussian's distances from pixels, and what it hides before it is capped."""
     dx, dy = x - p[at + X], y - p[at + Y]
     q = dx * (dx * p[at + CONIC_A] + dy * (_TWO * p[at + CONIC_B])) + dy * dy * p[at + CONIC_C]
-    return dx, dy, exp2_neg_lanes(max_lanes(q * (_HALF * LOG2_E), _NONE)) * p[at + ALPHA]
+    return dx, dy, exp2_neg(maximum(q * (_HALF * LOG2_E), _NONE)) * p[at + ALPHA]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):  # type: ignore[no-untyped-def]
     """A block front to back: colour, transmittance and how many pairs were met, whose numbers go to `met`."""
-    red, green, blue, light = broadcast16(_NONE), broadcast16(_NONE), broadcast16(_NONE), broadcast16(_ONE)
+    red, green, blue, light = broadcast(_NONE, LANES), broadcast(_NONE, LANES), broadcast(_NONE, LANES), broadcast(_ONE, LANES)
     count = 0
     for pair in range(first, end):
         if mask[pair] & bit:
             at = np.int64(gaussian[pair]) * RECORD
             _dx, _dy, strength = _exponent(p, at, x, y)
-            alpha = min_lanes(strength, MOST_ALPHA)
+            alpha = minimum(strength, MOST_ALPHA)
             left = light * (_ONE - alpha)
             counts = open_ & (alpha >= LEAST_ALPHA)
             ends = counts & (left < LEAST_TRANSMITTANCE)
             counts = counts & ~ends
             open_ = open_ & ~ends
             if bits_of(counts) != 0:
-                weight = select_lanes(counts, light * alpha, _NONE)
+                weight = select(counts, light * alpha, _NONE)
                 red, green, blue = red + weight * p[at + RED], green + weight * p[at + RED + 1], blue + weight * p[at + RED + 2]
-                light = select_lanes(counts, left, light)
+                light = select(counts, left, light)
                 met[count] = pair
                 count += 1
             if bits_of(open_) == 0:
                 break
-    store_lanes(place, 0, red)
-    store_lanes(place, 16, green)
-    store_lanes(place, 32, blue)
-    store_lanes(place, 48, light)
+    store(place, 0, red)
+    store(place, 16, green)
+    store(place, 32, blue)
+    store(place, 48, light)
     return count
 
 
@@ -119,8 +96,8 @@ def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, tran
     for block in range(16):
         left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
         if left < width and top < height:
-            open_ = mask16(_pixels(left, top, width, height, xs, ys))
-            x, y = load16(pointer(xs), 0), load16(pointer(ys), 0)
+            open_ = mask_of(_pixels(left, top, width, height, xs, ys), LANES)
+            x, y = load(pointer(xs), 0, LANES), load(pointer(ys), 0, LANES)
             _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, open_, met, pointer(place))
             for lane in range(16):
                 i, j = top + lane // BLOCK, left + lane % BLOCK
@@ -135,10 +112,10 @@ def _render(begin, end, workers, task, records, pairs, longest, colour, transmit
     for _ in numba.prange(workers):
         met, place = np.empty(longest, np.int64), np.empty(64, np.float32)
         xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
-        tile = begin + take_next(pointer(task))
+        tile = begin + fetch_add(pointer(task), 0, 1)
         while tile < end:
             _render_tile(tile, pointer(records), pairs, colour.shape[1], colour.shape[0], met, place, xs, ys, colour, transmittance)
-            tile = begin + take_next(pointer(task))
+            tile = begin + fetch_add(pointer(task), 0, 1)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -178,30 +155,32 @@ def _residual(left, top, place, picture, slopes):  # type: ignore[no-untyped-def
 def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):  # type: ignore[no-untyped-def]
     """Sums of the pairs that a block met, added to theirs: what the error changes by, with -q / 2 (v), with that times distances (v dx, v dy, v dx dx, v dx dy,
     v dy dy) and with the colour; and the error where it shows."""
-    by_red, by_green, by_blue, error = load16(slopes, 0), load16(slopes, 16), load16(slopes, 32), load16(slopes, 64)
-    behind = load16(place, 0) * by_red + load16(place, 16) * by_green + load16(place, 32) * by_blue + load16(place, 48) * load16(slopes, 48)
-    light, open_ = broadcast16(_ONE), inside
+    by_red, by_green, by_blue, error = load(slopes, 0, LANES), load(slopes, 16, LANES), load(slopes, 32, LANES), load(slopes, 64, LANES)
+    behind = (
+        load(place, 0, LANES) * by_red + load(place, 16, LANES) * by_green + load(place, 32, LANES) * by_blue + load(place, 48, LANES) * load(slopes, 48, LANES)
+    )
+    light, open_ = broadcast(_ONE, LANES), inside
     for n in range(count):
         pair = met[n]
         at = np.int64(gaussian[pair]) * RECORD
         dx, dy, strength = _exponent(p, at, x, y)
-        alpha = min_lanes(strength, MOST_ALPHA)
+        alpha = minimum(strength, MOST_ALPHA)
         rest = _ONE - alpha
         left = light * rest
         counts = open_ & (alpha >= LEAST_ALPHA)
         ends = counts & (left < LEAST_TRANSMITTANCE)
         counts = counts & ~ends
         open_ = open_ & ~ends
-        weight = select_lanes(counts, light * alpha, _NONE)
+        weight = select(counts, light * alpha, _NONE)
         gain = by_red * p[at + RED] + by_green * p[at + RED + 1] + by_blue * p[at + RED + 2]
         behind = behind - weight * gain
         v = (light * gain - behind / rest) * alpha
-        v = select_lanes(counts & (strength < MOST_ALPHA), v, _NONE)
-        light = select_lanes(counts, left, light)
+        v = select(counts & (strength < MOST_ALPHA), v, _NONE)
+        light = select(counts, left, light)
         vx, vy = v * dx, v * dy
         to = np.int64(slot[pair]) * SUMS
-        found = sums16(v, vx, vy, vx * dx, vx * dy, vy * dy, weight * by_red, weight * by_green, weight * by_blue, weight * error)
-        store_lanes(sums, to, load16(sums, to) + found)
+        found = sum_each((v, vx, vy, vx * dx, vx * dy, vy * dy, weight * by_red, weight * by_green, weight * by_blue, weight * error))
+        store(sums, to, load(sums, to, LANES) + found)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -213,8 +192,8 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):  # typ
     for block in range(16):
         left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
         if left < width and top < height:
-            inside = mask16(_pixels(left, top, width, height, xs, ys))
-            x, y = load16(pointer(xs), 0), load16(pointer(ys), 0)
+            inside = mask_of(_pixels(left, top, width, height, xs, ys), LANES)
+            x, y = load(pointer(xs), 0, LANES), load(pointer(ys), 0, LANES)
             count = _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, inside, met, pointer(place))
             total += _residual(left, top, place, picture, slopes)
             _pull(p, met, count, pairs.gaussian, pairs.slot, x, y, inside, pointer(place), pointer(slopes), pointer(sums))
@@ -226,10 +205,10 @@ def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, erro
     for _ in numba.prange(workers):
         met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(80, np.float32)
         xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
-        tile = begin + take_next(pointer(task))
+        tile = begin + fetch_add(pointer(task), 0, 1)
         while tile < end:
             errors[tile] = _fit_tile(tile, pointer(records), pairs, picture, met, place, slopes, xs, ys, sums)
-            tile = begin + take_next(pointer(task))
+            tile = begin + fetch_add(pointer(task), 0, 1)
 
 
 def _longest(pairs: Pairs) -> int:

@@ -4,30 +4,58 @@ from __future__ import annotations
 
 import numpy as np
 
+from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
-from efficientnerf.backends.numba.tree.walk import SampleBuffer, TreeGrid, corner_weight, walk, walk_pointers
+from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, corner_weight, stored_voxel, tree_pointers
+from efficientnerf.backends.numba.tree.march import march_with
+from efficientnerf.backends.numba.tree_training.scalars import cast_like
+from efficientnerf.backends.numba.vector.memory import pointer
+
+
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
+def _raise(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
+    """Raises the voxels around a sample to its weight.
+
+    scene  pointers to what is raised (N,), of its type `zero`, and to scratch (8,); transmittance at which the ray arrives
+    state  (transmittance,)
+    """
+    (into, zero, index, arriving), (u, v, w), transmittance, sigma = scene, point, state[0], 0.0
+    fx, fy, fz = 0.0, 0.0, 0.0
+    if tree.nearest:
+        for n in range(8):
+            index[n] = np.int32(-1)
+        voxel = stored_voxel(int(u), int(v), int(w), cascade, tree)
+        index[0], sigma = voxel, np.float64(tree.density[voxel]) if voxel >= 0 else 0.0
+    else:
+        x, y, z = np.floor(u - 0.5), np.floor(v - 0.5), np.floor(w - 0.5)
+        fx, fy, fz = u - 0.5 - x, v - 0.5 - y, w - 0.5 - z
+        corner_voxels(int(x), int(y), int(z), cascade, tree, index)
+        for n in range(8):
+            if index[n] >= 0:
+                sigma += corner_weight(n, fx, fy, fz) * tree.density[index[n]]
+    if sigma > 0:
+        alpha = 1 - np.exp(-sigma * (tree.step_length * tree.scale[cascade]))
+        weight, gx, gy, gz = arriving * transmittance * alpha, cast_like(fx, tree.one), cast_like(fy, tree.one), cast_like(fz, tree.one)
+        for n in range(8):
+            voxel = index[n]
+            if voxel >= 0:
+                into[voxel] = max(into[voxel], cast_like(weight * corner_weight(n, gx, gy, gz), zero))
+        transmittance *= 1 - alpha
+    return (transmittance,)
+
+
+_march = march_with(_raise)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _max_contributions(grid, origins, directions, density, stop, max_samples, transmittance, visibility):  # type: ignore[no-untyped-def]
+def _max_contributions(cells, origins, directions, density, stop, transmittance, visibility):  # type: ignore[no-untyped-def]
     """Share p of the rays raises visibility[p]: no races, and a maximum does not depend on the order."""
     shares, rays = len(visibility), len(origins)
     for share in numba.prange(shares):
-        index, fraction = np.full((max_samples, 8), -1, np.int32), np.zeros((max_samples, 3), density.dtype)
-        alpha, light, distance, length = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
-        tree = walk_pointers(grid, density)
-        buffer = SampleBuffer(max_samples, pointer(index), pointer(fraction), pointer(alpha), pointer(light), pointer(distance), pointer(length))
-        into = visibility[share]
+        index, into, tree = np.empty(8, np.int32), visibility[share], tree_pointers(cells, density)
         for ray in range(rays * share // shares, rays * (share + 1) // shares):
-            count, _ = walk(origins[ray], directions[ray], tree, stop, buffer)
-            for m in range(count):
-                weight = transmittance[ray] * light[m] * alpha[m]
-                for n in range(8):
-                    v = index[m, n]
-                    if v >= 0:
-                        into[v] = max(into[v], into.dtype.type(weight * corner_weight(n, fraction[m, 0], fraction[m, 1], fraction[m, 2])))
+            scene = pointer(into), visibility.dtype.type(0), pointer(index), transmittance[ray]
+            _march(origins[ray], directions[ray], 0.0, tree, stop, scene, (1.0,))
 
 
 def contribution_shares() -> int:
@@ -36,7 +64,7 @@ def contribution_shares() -> int:
 
 
 def max_contributions(
-    grid: TreeGrid, origins: np.ndarray, directions: np.ndarray, density: np.ndarray, transmittance: np.ndarray, visibility: np.ndarray, *,
+    cells: Cells, origins: np.ndarray, directions: np.ndarray, density: np.ndarray, transmittance: np.ndarray, visibility: np.ndarray, *,
     stop: float = EARLY_STOP,
 ) -> None:  # fmt: skip
     """Raise the visibility of voxels to their greatest weight, times that of interpolation, on rays in voxel coordinates.
@@ -46,4 +74,4 @@ def max_contributions(
     transmittance        (R,) of what lies in front of the box
     visibility           (P, N) float32: for each share of the rays; P from 1 to the number of threads
     """
-    _max_contributions(grid, origins, directions, density, stop, grid.max_samples, transmittance, visibility)
+    _max_contributions(cells, origins, directions, density, float(stop), transmittance, visibility)

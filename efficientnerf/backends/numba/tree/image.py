@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import fetch_add, pointer
 from efficientnerf.backends.numba.tree.packets.layout import ENDS, FLOATS, INTS, LANES, TILE_RAYS, WARPED
 from efficientnerf.backends.numba.tree.packets.pixels import Outputs, write_clear
 from efficientnerf.backends.numba.tree.packets.tiles import Scene, TileScratch, clear_block, render_tile
 from efficientnerf.backends.numba.tree.ray_batch import ray_pointers
 from efficientnerf.backends.numba.tree.view_colours import packed_pointers
+from efficientnerf.backends.numba.vector.memory import fetch_add, pointer
 
 TILE = 8  # rays along each side of a tile
 BLOCK = 4  # tiles along each side of a block of them, which a thread takes

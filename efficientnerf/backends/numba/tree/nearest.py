@@ -8,59 +8,67 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
+from efficientnerf.backends.numba.tree.cells import cells_of, stored_voxel, tree_pointers
+from efficientnerf.backends.numba.tree.march import march_with
 from efficientnerf.backends.numba.tree.queries import normal_at
-from efficientnerf.backends.numba.tree.walk import SampleBuffer, tree_grid, walk_on, walk_pointers
+from efficientnerf.backends.numba.vector.memory import advanced, pointer
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.rendering.harmonics import basis_numpy
 
 BLOCK = 64  # rays per task
-CAPACITY = 256  # samples of a ray that are composited at once
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _shade(sh, basis, rgb):  # type: ignore[no-untyped-def]
-    """Sigmoid of the sum of one voxel's harmonics (K, 3) into `rgb`."""
+def _shade(sh, basis, terms, rgb):  # type: ignore[no-untyped-def]
+    """Sigmoid of the sum of one voxel's harmonics (K, 3) into `rgb`; all are pointers."""
     for c in range(3):
         logit = 0.0
-        for k in range(len(basis)):
-            logit += basis[k] * sh[k, c]
+        for k in range(terms):
+            logit += basis[k] * sh[3 * k + c]
         rgb[c] = 1 / (1 + np.exp(-logit))
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _composite(count, buffer, tree, basis, sh, rgb, colour):  # type: ignore[no-untyped-def]
-    """Adds the colour of a ray's samples to `colour`; returns the distance at which the transmittance falls to one half, voxels, or infinity."""
-    half, shaded = np.inf, np.int32(-1)
-    for n in range(count):
-        voxel, before = buffer.index[8 * n], buffer.transmittance[n]
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
+def _composite(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
+    """Adds a sample to the colour of a ray.
+
+    scene  pointers to harmonics (N, 3 K), those of the direction (K,), the colour of the voxel that was shaded last, and that of the ray; and K
+    state  transmittance; distance at which it falls to one half, voxels, or infinity; the voxel that was shaded last
+    """
+    (sh, basis, rgb, colour, terms), (u, v, w), (transmittance, half, shaded) = scene, point, state
+    voxel = stored_voxel(int(u), int(v), int(w), cascade, tree)
+    sigma = np.float64(tree.density[voxel]) if voxel >= 0 else 0.0
+    if sigma > 0:
+        scale = tree.scale[cascade]
+        length = tree.step_length * scale
+        alpha = 1 - np.exp(-sigma * length)
         if voxel != shaded:
-            _shade(sh[voxel], basis, rgb)
+            _shade(advanced(sh, 3 * terms * np.int64(voxel)), basis, terms, rgb)
             shaded = voxel
-        weight = before * buffer.alpha[n]
+        weight = transmittance * alpha
         for c in range(3):
             colour[c] += weight * rgb[c]
-        if before - weight <= 0.5 < before:
-            step = tree.step * (buffer.length[n] / tree.step_length)  # of the cascade, voxels of cascade 0
-            half = buffer.distance[n] - 0.5 * step + np.log(2 * before) / (tree.density[voxel] * buffer.length[n]) * step
-    return half
+        if transmittance - weight <= 0.5 < transmittance:
+            step = tree.step * (length / tree.step_length)  # of the cascade, voxels of cascade 0
+            half = t * scale - 0.5 * step + np.log(2 * transmittance) / (tree.density[voxel] * length) * step
+        transmittance *= 1 - alpha
+    return transmittance, half, shaded
+
+
+_march = march_with(_composite)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _render(grid, density, sh, origins, directions, bases, colour, opacity, half_distance):  # type: ignore[no-untyped-def]
-    rays = len(origins)
+def _render(cells, density, sh, origins, directions, bases, colour, opacity, half_distance):  # type: ignore[no-untyped-def]
+    rays, terms = len(origins), bases.shape[1]
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
-        index, fraction = np.full((CAPACITY, 8), -1, np.int32), np.zeros((CAPACITY, 3), np.float32)
-        alpha, transmittance, distance, length, rgb = np.empty(CAPACITY), np.empty(CAPACITY), np.empty(CAPACITY), np.empty(CAPACITY), np.empty(3)
-        buffer = SampleBuffer(CAPACITY, pointer(index), pointer(fraction), pointer(alpha), pointer(transmittance), pointer(distance), pointer(length))
-        tree = walk_pointers(grid, density)
+        rgb, tree = np.empty(3), tree_pointers(cells, density)
         for ray in range(block * BLOCK, min(rays, block * BLOCK + BLOCK)):
-            k, left = 0, 1.0
-            while k >= 0:
-                count, left, k = walk_on(origins[ray], directions[ray], tree, EARLY_STOP, buffer, k, left)
-                half_distance[ray] = min(half_distance[ray], _composite(count, buffer, tree, bases[ray], sh, rgb, colour[ray]))
+            scene = pointer(sh), advanced(pointer(bases), terms * ray), pointer(rgb), advanced(pointer(colour), 3 * ray), terms
+            left, half, _ = _march(origins[ray], directions[ray], 0.0, tree, EARLY_STOP, scene, (1.0, np.inf, np.int32(-1)))
+            half_distance[ray] = half
             opacity[ray] = 1 - left
 
 
@@ -72,10 +80,10 @@ def render_rays(
     starts = np.ascontiguousarray((origins - tree.bounds_min) / tree.voxel)
     bases = np.ascontiguousarray(basis_numpy(np.asarray(directions if sh_directions is None else sh_directions, np.float32), tree.degree))
     colour, opacity, half_distance = np.zeros((len(starts), 3)), np.zeros(len(starts)), np.full(len(starts), np.inf)
-    grid = tree_grid(tree)
+    cells = cells_of(tree)
     for part in pieces(len(starts)):
         given = (starts[part], directions[part], bases[part], colour[part], opacity[part], half_distance[part])
-        _render(grid, tree.density_values, tree.sh, *given)
+        _render(cells, tree.density_values, tree.sh, *given)
     depth = half_distance * tree.voxel
     normal, hit = np.zeros((len(starts), 3), np.float32), np.isfinite(half_distance)
     if hit.any():

@@ -10,7 +10,7 @@ import numpy as np
 from efficientnerf.asset.cascades import cascades_of, point_cascades
 from efficientnerf.asset.tree import Cascade, NerfTree
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.walk import TreeGrid, corner_voxels, walk_pointers
+from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, tree_pointers
 from efficientnerf.rendering.harmonics import basis_numpy
 
 BLOCK = 1024  # points per task
@@ -24,7 +24,7 @@ def _corners(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
     one = np.float32(1)
-    corner_voxels(i, j, k, tree, index, 0)
+    corner_voxels(i, j, k, 0, tree, index)
     for n in range(8):
         weight[n] = (fx if n & 4 else one - fx) * (fy if n & 2 else one - fy) * (fz if n & 1 else one - fz)
 
@@ -34,9 +34,10 @@ def _density(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
     """Density at a point, voxel coordinates; zero in an empty coarse cell. Leaves the corners in `index` and `weight`."""
     # Compared before conversion to integers: NaN and what is too large must not become an index.
     brick = tree.brick
-    if not (0 <= u < tree.nx * brick and 0 <= v < tree.ny * brick and 0 <= w < tree.nz * brick):
+    nx, ny, nz = tree.shape[0], tree.shape[1], tree.shape[2]
+    if not (0 <= u < nx * brick and 0 <= v < ny * brick and 0 <= w < nz * brick):
         return np.float32(0)
-    if tree.brick_index[(int(u) // brick * tree.ny + int(v) // brick) * tree.nz + int(w) // brick] < 0:
+    if tree.brick_index[(int(u) // brick * ny + int(v) // brick) * nz + int(w) // brick] < 0:
         return np.float32(0)
     _corners(u, v, w, tree, index, weight)
     total = np.float32(0)
@@ -94,7 +95,7 @@ def _colour(index, weight, sh, basis, out):  # type: ignore[no-untyped-def]
 def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = walk_pointers(grid, density)
+        tree = tree_pointers(grid, density)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             out[n] = _density(points[n, 0], points[n, 1], points[n, 2], tree, index, weight)
 
@@ -103,7 +104,7 @@ def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
 def _distances_back(points, directions, optical, step, most, grid, density, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = walk_pointers(grid, density)
+        tree = tree_pointers(grid, density)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             x, y, z = points[n, 0], points[n, 1], points[n, 2]
             after = np.float64(_density(x, y, z, tree, index, weight))
@@ -122,7 +123,7 @@ def _distances_back(points, directions, optical, step, most, grid, density, out)
 def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = walk_pointers(grid, density)
+        tree = tree_pointers(grid, density)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             _normal(points[n, 0], points[n, 1], points[n, 2], tree, index, weight, out[n])
 
@@ -131,7 +132,7 @@ def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
 def _colours(points, bases, grid, density, sh, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = walk_pointers(grid, density)
+        tree = tree_pointers(grid, density)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             _corners(points[n, 0], points[n, 1], points[n, 2], tree, index, weight)
             _colour(index, weight, sh, bases[n], out[n])
@@ -143,15 +144,16 @@ def _voxel_coordinates(tree: NerfTree, cascade: Cascade, points: np.ndarray) -> 
     return np.floor(at) + np.float32(0.5) if tree.lookup == "nearest" else at
 
 
-def _grids(tree: NerfTree, points: np.ndarray) -> Iterator[tuple[np.ndarray | slice, np.ndarray, TreeGrid]]:
+def _grids(tree: NerfTree, points: np.ndarray) -> Iterator[tuple[np.ndarray | slice, np.ndarray, Cells]]:
     """Which points belong to a cascade, their voxel coordinates in it, and it without its leaps, which points do not need; those beyond all boxes are of the
     first."""
     points, cascades = np.asarray(points, np.float64), cascades_of(tree)
     owner = point_cascades(tree, points).clip(0) if tree.outer else None
     for n, cascade in enumerate(cascades):
         chosen = slice(None) if owner is None else np.flatnonzero(owner == n)
-        grid = TreeGrid(
-            tree.brick, cascade.brick_index, tree.voxel_index, np.zeros((1, 1, 1), np.uint8), 1.0, float(cascade.voxel), tree.lookup == "nearest"
+        grid = Cells(
+            tree.brick, tree.lookup == "nearest", 1.0, float(cascade.voxel), tree.voxel_index, np.ascontiguousarray(cascade.brick_index).reshape(-1),
+            np.zeros(1, np.uint8), np.asarray([cascade.brick_index.shape], np.int64), np.zeros(1, np.int64), np.zeros((1, 3)), np.ones(1),
         )  # fmt: skip
         yield chosen, _voxel_coordinates(tree, cascade, points[chosen]), grid
 

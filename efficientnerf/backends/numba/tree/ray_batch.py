@@ -14,8 +14,6 @@ import numpy as np
 
 from efficientnerf.backends.numba.rays import warp_ray, world_distance, world_normal
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import advanced, pointer
-from efficientnerf.backends.numba.tree.packets.lanes import sqrt_lanes
 from efficientnerf.backends.numba.tree.packets.layout import (
     WARPED_BEGIN,
     WARPED_BEND,
@@ -24,6 +22,8 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     WARPED_ORIGIN,
     WARPED_SPEED,
 )
+from efficientnerf.backends.numba.vector.maths import sqrt
+from efficientnerf.backends.numba.vector.memory import advanced, pointer
 
 MIN_ADVANCE = 2.0  # voxels: a cone that advances by less has arrived; docs/experiments/renderer.md
 MAX_ADVANCES = 64
@@ -103,7 +103,7 @@ def _rotate(r, x, y, z):  # type: ignore[no-untyped-def]
 def pinhole_direction(x, y, rays):  # type: ignore[no-untyped-def]
     """Unit direction through (x, y), pixels, and its component along the view axis; of one ray or of those in lanes."""
     u, v = (x - rays.cx) / rays.fx, (y - rays.cy) / rays.fy
-    cosine = 1.0 / sqrt_lanes(u * u + v * v + 1.0)
+    cosine = 1.0 / sqrt(u * u + v * v + 1.0)
     dx, dy, dz = _rotate(rays.rotation, u * cosine, v * cosine, cosine)
     return dx, dy, dz, cosine
 

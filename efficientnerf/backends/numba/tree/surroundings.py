@@ -10,9 +10,9 @@ import math
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
 from efficientnerf.backends.numba.tree.ray_batch import RayBatch, ray_at, ray_pointers
+from efficientnerf.backends.numba.vector.memory import pointer
 
 RAYS_PER_CALL = 2**20  # so that signals are answered between calls
 

@@ -13,20 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import (
-    add_scaled4,
-    advanced,
-    broadcast_like,
-    load4,
-    pack4,
-    pointer,
-    scale4,
-    store,
-    unpack4,
-)
-from efficientnerf.backends.numba.tree.packets.halves import store_halves4
-from efficientnerf.backends.numba.tree.packets.lanes import bits_of, broadcast16, load16, load_bytes8, sqrt_lanes, to_floats
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
+from efficientnerf.backends.numba.vector.halves import store_halves
+from efficientnerf.backends.numba.vector.maths import bits_of, broadcast, broadcast_like, fma, pack, sqrt, to_float32, unpack
+from efficientnerf.backends.numba.vector.memory import advanced, load, load_bytes8, pointer, store_nth
 from efficientnerf.rendering import harmonics
 
 VOXELS_PER_TASK = 2**14
@@ -137,35 +127,35 @@ def sh_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
     """`efficientnerf.rendering.harmonics.basis` of one direction into (K,), or of four, given as Float32x4, into (K, 4)."""
     two, three, four, seven = np.float32(2), np.float32(3), np.float32(4), np.float32(7)
     xx, yy, zz = x * x, y * y, z * z
-    store(out, 0, broadcast_like(_C0, x))
+    store_nth(out, 0, broadcast_like(_C0, x))
     if degree > 0:
-        store(out, 1, y * -_C1)
-        store(out, 2, z * _C1)
-        store(out, 3, x * -_C1)
+        store_nth(out, 1, y * -_C1)
+        store_nth(out, 2, z * _C1)
+        store_nth(out, 3, x * -_C1)
     if degree > 1:
-        store(out, 4, x * y * _C2[0])
-        store(out, 5, y * z * _C2[1])
-        store(out, 6, (zz * two - xx - yy) * _C2[2])
-        store(out, 7, x * z * _C2[3])
-        store(out, 8, (xx - yy) * _C2[4])
+        store_nth(out, 4, x * y * _C2[0])
+        store_nth(out, 5, y * z * _C2[1])
+        store_nth(out, 6, (zz * two - xx - yy) * _C2[2])
+        store_nth(out, 7, x * z * _C2[3])
+        store_nth(out, 8, (xx - yy) * _C2[4])
     if degree > 2:
-        store(out, 9, y * (xx * three - yy) * _C3[0])
-        store(out, 10, x * y * z * _C3[1])
-        store(out, 11, y * (zz * four - xx - yy) * _C3[2])
-        store(out, 12, z * (zz * two - xx * three - yy * three) * _C3[3])
-        store(out, 13, x * (zz * four - xx - yy) * _C3[4])
-        store(out, 14, z * (xx - yy) * _C3[5])
-        store(out, 15, x * (xx - yy * three) * _C3[6])
+        store_nth(out, 9, y * (xx * three - yy) * _C3[0])
+        store_nth(out, 10, x * y * z * _C3[1])
+        store_nth(out, 11, y * (zz * four - xx - yy) * _C3[2])
+        store_nth(out, 12, z * (zz * two - xx * three - yy * three) * _C3[3])
+        store_nth(out, 13, x * (zz * four - xx - yy) * _C3[4])
+        store_nth(out, 14, z * (xx - yy) * _C3[5])
+        store_nth(out, 15, x * (xx - yy * three) * _C3[6])
     if degree > 3:
-        store(out, 16, x * y * (xx - yy) * _C4[0])
-        store(out, 17, y * z * (xx * three - yy) * _C4[1])
-        store(out, 18, x * y * (zz * seven - _ONE) * _C4[2])
-        store(out, 19, y * z * (zz * seven - three) * _C4[3])
-        store(out, 20, (zz * (zz * np.float32(35) - np.float32(30)) + three) * _C4[4])
-        store(out, 21, x * z * (zz * seven - three) * _C4[5])
-        store(out, 22, (xx - yy) * (zz * seven - _ONE) * _C4[6])
-        store(out, 23, x * z * (xx - yy * three) * _C4[7])
-        store(out, 24, (xx * (xx - yy * three) - yy * (xx * three - yy)) * _C4[8])
+        store_nth(out, 16, x * y * (xx - yy) * _C4[0])
+        store_nth(out, 17, y * z * (xx * three - yy) * _C4[1])
+        store_nth(out, 18, x * y * (zz * seven - _ONE) * _C4[2])
+        store_nth(out, 19, y * z * (zz * seven - three) * _C4[3])
+        store_nth(out, 20, (zz * (zz * np.float32(35) - np.float32(30)) + three) * _C4[4])
+        store_nth(out, 21, x * z * (zz * seven - three) * _C4[5])
+        store_nth(out, 22, (xx - yy) * (zz * seven - _ONE) * _C4[6])
+        store_nth(out, 23, x * z * (xx - yy * three) * _C4[7])
+        store_nth(out, 24, (xx * (xx - yy * three) - yy * (xx * three - yy)) * _C4[8])
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -176,11 +166,11 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
         table, base, code = grid.base_table, 3 * n, n * grid.groups
         r, g, b = y * table[3 * np.int64(grid.base[base])], y * table[3 * np.int64(grid.base[base + 1]) + 1], y * table[3 * np.int64(grid.base[base + 2]) + 2]
         if grid.terms > 1:
-            total = scale4(basis[lanes + lane], load4(grid.palette, 4 * np.int64(grid.codes[code + grid.code_columns[0]])))
+            total = basis[lanes + lane] * load(grid.palette, 4 * np.int64(grid.codes[code + grid.code_columns[0]]), 4)
             for k in range(1, grid.terms - 1):
                 e = k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])
-                total = add_scaled4(total, basis[(k + 1) * lanes + lane], load4(grid.palette, 4 * e))
-            _, red, green, blue = unpack4(total)
+                total = fma(basis[(k + 1) * lanes + lane], load(grid.palette, 4 * e, 4), total)
+            _, red, green, blue = unpack(total)
             r, g, b = r + red, g + green, b + blue
     else:
         e = 3 * grid.terms * np.int64(grid.voxel_of[n])
@@ -202,10 +192,10 @@ def _eight_codes(count, density, scale, base, table, codes, palette, basis, out)
     for n in range(count):
         y, eight = basis[n], load_bytes8(codes, 8 * n)
         r, g, b = table[3 * np.int64(base[3 * n])], table[3 * np.int64(base[3 * n + 1]) + 1], table[3 * np.int64(base[3 * n + 2]) + 2]
-        total = pack4(density[n] * scale, y * r, y * g, y * b)
+        total = pack((density[n] * scale, y * r, y * g, y * b))
         for k in range(8):
-            total = add_scaled4(total, basis[16 * k + 16 + n], load4(palette, 1024 * k + 4 * (eight >> 8 * k & 255)))
-        store_halves4(out, 4 * n, total)
+            total = fma(basis[16 * k + 16 + n], load(palette, 1024 * k + 4 * (eight >> 8 * k & 255), 4), total)
+        store_halves(out, 4 * n, total)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -232,17 +222,17 @@ def _colours(first, end, cascade, packed, direction, cone, density_scale, degree
     reach = np.float32(REACH * np.sqrt(d[0] * d[0] + d[4] * d[4] + d[8] * d[8]))
     ax, ay, az, cosine, sine = np.float32(cone[0]), np.float32(cone[1]), np.float32(cone[2]), np.float32(cone[3]), np.float32(cone[4])
     for begin in range(first, end, 16):
-        u, v, w = to_floats(load16(at, begin)), to_floats(load16(at, voxels + begin)), to_floats(load16(at, 2 * voxels + begin))
+        u, v, w = to_float32(load(at, begin, 16)), to_float32(load(at, voxels + begin, 16)), to_float32(load(at, 2 * voxels + begin, 16))
         x = u * np.float32(d[0]) + v * np.float32(d[1]) + w * np.float32(d[2]) + np.float32(x0)
         y = u * np.float32(d[4]) + v * np.float32(d[5]) + w * np.float32(d[6]) + np.float32(y0)
         z = u * np.float32(d[8]) + v * np.float32(d[9]) + w * np.float32(d[10]) + np.float32(z0)
-        length = sqrt_lanes(x * x + y * y + z * z)
+        length = sqrt(x * x + y * y + z * z)
         along = x * ax + y * ay + z * az
         p, q, r = x - along * ax, y - along * ay, z - along * az
-        beside = sqrt_lanes(p * p + q * q + r * r)
+        beside = sqrt(p * p + q * q + r * r)
         if bits_of(beside * cosine - along * sine > reach + length * ROUNDING) == ALL:
             continue
-        inverse = broadcast16(_ONE) / length
+        inverse = broadcast(_ONE, 16) / length
         sh_basis(x * inverse, y * inverse, z * inverse, degree, basis)
         count = min(16, end - begin)
         if eight:
@@ -251,7 +241,7 @@ def _colours(first, end, cascade, packed, direction, cone, density_scale, degree
             continue
         for n in range(begin, begin + count):
             r, g, b = sh_colour(n, grid, basis, n - begin, 16)
-            store_halves4(out, 4 * n, pack4(grid.density[n] * density_scale, r, g, b))
+            store_halves(out, 4 * n, pack((grid.density[n] * density_scale, r, g, b)))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -15,15 +15,13 @@ R rays, P packets, N voxels, K harmonics, M records, U chunks.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from efficientnerf.backends.layout import EARLY_STOP, RayTargets
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import fmuladd, pointer
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
-from efficientnerf.backends.numba.tree_training.cells import Cells, tree_pointers
-from efficientnerf.backends.numba.tree_training.corners import add_spread, mixed
+from efficientnerf.backends.numba.tree.cells import Cells, tree_pointers
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
     FIRST_BLOCKS,
@@ -37,31 +35,12 @@ from efficientnerf.backends.numba.tree_training.packets import (
     walk_ray,
 )
 from efficientnerf.backends.numba.tree_training.scalars import cast_like, sigmoid
-from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
+from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corners
+from efficientnerf.backends.numba.vector.maths import fma
+from efficientnerf.backends.numba.vector.memory import fetch_add, pointer, prefetch
 
 CHUNK = 32  # packets
 BIN_BITS = 15  # voxels of a bin, power of two
-
-
-class RayTargets(NamedTuple):
-    """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
-
-        sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
-
-    colour          (R, 3) of the photograph, less the colour of what lies in front of the box
-    background      (R, 3) colour of what lies behind the box
-    transmittance   (R,)   of what lies in front of the box
-    opacity         (R,)   of the photograph
-    opacity_weight  of the opacity's error
-
-    Arrays, or tensors of a device (`efficientnerf.backends.triton.tree_gradients`).
-    """
-
-    colour: Any
-    background: Any
-    transmittance: Any
-    opacity: Any
-    opacity_weight: float
 
 
 class Records(NamedTuple):
@@ -77,6 +56,31 @@ class Records(NamedTuple):
     gradient: np.ndarray
     begin: np.ndarray
     basis: np.ndarray
+
+
+class Packets(NamedTuple):
+    """Rays in packets: `first` (P + 1,) int64 first ray of each, and the end; origins and directions (R, 3) float64; bases (P, K) their harmonics."""
+
+    first: np.ndarray
+    origins: np.ndarray
+    directions: np.ndarray
+    bases: np.ndarray
+
+
+class TreeValues(NamedTuple):
+    """density of `dense_densities`, and sh (N, 3 K)."""
+
+    density: np.ndarray
+    sh: np.ndarray
+
+
+class Limits(NamedTuple):
+    """stop  transmittance below which a ray ends; min_weight: samples that weigh less absorb light, and have neither a colour nor a gradient; capacity: most
+    records of a chunk."""
+
+    stop: float
+    min_weight: float
+    capacity: int
 
 
 class RecordBuffer:
@@ -126,9 +130,9 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
         at, row = 4 * np.int64(packet.stored[2 * n]), width * np.int64(packet.stored[2 * n + 1])
         red, green, blue = basis[0] * sh[row], basis[0] * sh[row + 1], basis[0] * sh[row + 2]
         for k in range(1, terms):
-            red = fmuladd(basis[k], sh[row + 3 * k], red)
-            green = fmuladd(basis[k], sh[row + 3 * k + 1], green)
-            blue = fmuladd(basis[k], sh[row + 3 * k + 2], blue)
+            red = fma(basis[k], sh[row + 3 * k], red)
+            green = fma(basis[k], sh[row + 3 * k + 1], green)
+            blue = fma(basis[k], sh[row + 3 * k + 2], blue)
         packet.colour[at], packet.colour[at + 1], packet.colour[at + 2], packet.colour[at + 3] = red, green, blue, 1
     return found
 
@@ -136,7 +140,7 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _shade(n, packet):  # type: ignore[no-untyped-def]
     """Colour of a sample, sigmoids of what is interpolated between the corners that are stored; kept in `packet.shade`."""
-    red, green, blue, total = mixed(packet.colour, packet.slots, packet.weights, 8 * n)
+    red, green, blue, total = mix_corners(packet.colour, packet.slots, packet.weights, 8 * n, 1, 4)
     inverse = cast_like(1, total) / total if total > 0 else 0 * total
     r, g, b = sigmoid(red * inverse), sigmoid(green * inverse), sigmoid(blue * inverse)
     packet.shade[4 * n], packet.shade[4 * n + 1], packet.shade[4 * n + 2], packet.shade[4 * n + 3] = r, g, b, inverse
@@ -173,24 +177,24 @@ def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-u
         green += weight * g
         blue += weight * b
         scale = weight * inverse
-        add_spread(
-            packet.gradient, packet.slots, packet.weights, 8 * n, kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)),
-            kind(by_blue * scale * b * (1 - b)), kind(by_depth * light[3 * n + 2]),
-        )  # fmt: skip
+        by_logits = kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)), kind(by_blue * scale * b * (1 - b))
+        spread_corners(packet.gradient, packet.slots, packet.weights, 8 * n, 1, (*by_logits, kind(by_depth * light[3 * n + 2])))
     return loss
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _trace_packet(begin, end, origins, directions, targets, stop, min_weight, terms, basis, sh, tree, arrays, ends, left, loss):  # type: ignore[no-untyped-def]
+def _trace_packet(number, packets, targets, limits, sh, tree, arrays, ends, left, loss):  # type: ignore[no-untyped-def]
     """Losses of the rays of a packet and the gradients of its slots; returns how many voxels it met, or -1 where there is no room.
 
+    sh          pointer
     ends, left  (rays of the packet,) scratch
     """
-    packet = packet_pointers(arrays)
+    begin, end, origins, directions, basis = packets.first[number], packets.first[number + 1], packets.origins, packets.directions, packets.bases[number]
+    packet, terms = packet_pointers(arrays), len(basis)
     clear(packet, tree)
     way = clear_distance(begin, end, origins, directions, tree)
     for ray in range(begin, end):
-        left[ray - begin] = walk_ray(origins[ray], directions[ray], way, tree, stop, min_weight, packet)
+        left[ray - begin] = walk_ray(origins[ray], directions[ray], way, tree, limits.stop, limits.min_weight, packet)
         if left[ray - begin] < 0:
             return -1
         ends[ray - begin] = packet.state[SAMPLES]
@@ -241,42 +245,40 @@ def _enlarged(values, count, room):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _work(task, cells, first, origins, directions, bases, density, sh, targets, stop, min_weight, capacity, numbers, gradient, begin, counts, loss):  # type: ignore[no-untyped-def]
+def _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):  # type: ignore[no-untyped-def]
     """Takes chunks until none is left. Chunk u writes its records from u * capacity on, and to counts[u] how many there are; more than `capacity`: none."""
-    packets, terms = len(first) - 1, bases.shape[1]
-    tree, flat = tree_pointers(cells, density), pointer(sh)
+    first, density = packets.first, values.density
+    tree, flat = tree_pointers(cells, density), pointer(values.sh)
     arrays = packet_arrays(FIRST_BLOCKS, FIRST_SAMPLES, tree.cube, density)
     ends, left = np.empty(16, np.int64), np.empty(16, np.float64)
     own_numbers, own_gradient = np.empty((128 * CHUNK, 2), np.int32), np.empty((128 * CHUNK, 4), density.dtype)
     place = np.empty(begin.shape[1] - 1, np.int64)
-    chunk = take_next(pointer(task))
-    while chunk * CHUNK < packets:
+    chunk = fetch_add(pointer(task), 0, 1)
+    while chunk * CHUNK < len(first) - 1:
         written, bins = 0, begin[chunk]
         bins[:] = 0
-        for number in range(chunk * CHUNK, min(packets, (chunk + 1) * CHUNK)):
-            a, b = first[number], first[number + 1]
-            if b - a > len(ends):
-                ends, left = np.empty(b - a, np.int64), np.empty(b - a, np.float64)
-            found = _trace_packet(a, b, origins, directions, targets, stop, min_weight, terms, bases[number], flat, tree, arrays, ends, left, loss)
+        for number in range(chunk * CHUNK, min(len(first) - 1, (chunk + 1) * CHUNK)):
+            rays = first[number + 1] - first[number]
+            if rays > len(ends):
+                ends, left = np.empty(rays, np.int64), np.empty(rays, np.float64)
+            found = _trace_packet(number, packets, targets, limits, flat, tree, arrays, ends, left, loss)
             while found < 0:
                 arrays = packet_arrays(2 * arrays.most, 2 * arrays.samples, tree.cube, density)
-                found = _trace_packet(a, b, origins, directions, targets, stop, min_weight, terms, bases[number], flat, tree, arrays, ends, left, loss)
+                found = _trace_packet(number, packets, targets, limits, flat, tree, arrays, ends, left, loss)
             if written + found > len(own_numbers):
                 room = 2 * (written + found)
                 own_numbers, own_gradient = _enlarged(own_numbers, written, room), _enlarged(own_gradient, written, room)
             written = _leave_records(number, found, written, arrays, own_numbers, own_gradient, bins)
         counts[chunk] = written
-        if written <= capacity:
-            _sort_records(written, own_numbers, own_gradient, bins, chunk * capacity, numbers, gradient, place)
-        chunk = take_next(pointer(task))
+        if written <= limits.capacity:
+            _sort_records(written, own_numbers, own_gradient, bins, chunk * limits.capacity, numbers, gradient, place)
+        chunk = fetch_add(pointer(task), 0, 1)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _forward_backward(  # type: ignore[no-untyped-def]
-    workers, task, cells, first, origins, directions, bases, density, sh, targets, stop, min_weight, capacity, numbers, gradient, begin, counts, loss
-):
+def _forward_backward(workers, task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
-        _work(task, cells, first, origins, directions, bases, density, sh, targets, stop, min_weight, capacity, numbers, gradient, begin, counts, loss)
+        _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss)
 
 
 def forward_backward(
@@ -296,11 +298,10 @@ def forward_backward(
     chunks, bins = -(-(len(first) - 1) // CHUNK), (len(sh) >> BIN_BITS) + 1
     loss, counts, begin = np.zeros(len(origins)), np.zeros(chunks, np.int64), np.zeros((chunks, bins + 1), np.int64)
     buffer.reserve(chunks)
+    workers, packets, values = min(numba.get_num_threads(), max(chunks, 1)), Packets(first, origins, directions, bases), TreeValues(density, sh)
     while True:
-        _forward_backward(
-            min(numba.get_num_threads(), max(chunks, 1)), np.zeros(1, np.int64), cells, first, origins, directions, bases, density, sh, targets, stop,
-            min_weight, buffer.capacity, buffer.numbers, buffer.gradient, begin, counts, loss,
-        )  # fmt: skip
+        limits = Limits(float(stop), float(min_weight), buffer.capacity)
+        _forward_backward(workers, np.zeros(1, np.int64), cells, values, packets, targets, limits, buffer.numbers, buffer.gradient, begin, counts, loss)
         if not chunks or counts.max() <= buffer.capacity:
             return loss, Records(buffer.numbers, buffer.gradient, begin, bases)
         buffer.reserve(chunks, int(1.25 * counts.max()))

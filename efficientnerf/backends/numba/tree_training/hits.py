@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.walk import box_distances
+from efficientnerf.backends.numba.tree.march import box_distances
 
 
 @numba.njit(cache=True, error_model="numpy")

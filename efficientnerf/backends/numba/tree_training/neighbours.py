@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree_training.cells import Cells
+from efficientnerf.backends.numba.tree.cells import Cells
 
 
 class Neighbours(NamedTuple):

@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.walk import box_distances, most_samples
+from efficientnerf.backends.numba.tree.march import cascade_distances, march_with
 from efficientnerf.backends.numba.tree_training.scalars import absorbed, cast_like
-from efficientnerf.backends.numba.tree_training.tasks import prefetch
+from efficientnerf.backends.numba.vector.memory import pointer, prefetch
 
 FIRST_BLOCKS, FIRST_SAMPLES = 128, 1024  # that a packet has room for before it grows
 WORDS = 16  # of 4 bytes in a cache line
@@ -132,11 +131,16 @@ def _block(owner, tree, packet):  # type: ignore[no-untyped-def]
     return block
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _key(a, b, c, cascade):  # type: ignore[no-untyped-def]
+    """A number that stands for a coarse cell, from -1 on along each axis."""
+    return ((np.int64(cascade) * 2**20 + a + 1) * 2**21 + b + 1) * 2**21 + c + 1
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _entry(a, b, c, cascade, tree, packet):  # type: ignore[no-untyped-def]
-    """The entry of a coarse cell, from -1 on along each axis; made where it is new; -1 where there is no room."""
+def _entry(key, a, b, c, cascade, tree, packet):  # type: ignore[no-untyped-def]
+    """The entry of a coarse cell, from -1 on along each axis, by its `_key`; made where it is new; -1 where there is no room."""
     nx, ny, nz = tree.shape[3 * cascade], tree.shape[3 * cascade + 1], tree.shape[3 * cascade + 2]
-    key = ((np.int64(cascade) * 2**20 + a + 1) * 2**21 + b + 1) * 2**21 + c + 1
     size = 4 * packet.most
     at = _hash(key, size)
     while packet.cell_table[at] >= 0:
@@ -199,86 +203,51 @@ def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):  # type: ignore
     return sigma
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, clear, cascade, tree, stop, min_weight, transmittance, packet):  # type: ignore[no-untyped-def]
-    """Samples of a ray between two distances in one cascade, all in its voxels; returns the transmittance behind them, or -1 where there is no room.
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
+def _add(point, cell, cascade, tree, packet, min_weight, state):  # type: ignore[no-untyped-def]
+    """Adds a sample that has density, and weighs at least `min_weight`, to a packet.
 
-    clear  distance before which the ray meets nothing
+    state  transmittance, or -1 where there is no room; number of samples; entry that the last one lay in, and its key
     """
-    brick, inverse, first = tree.brick, tree.inverse, tree.first[cascade]
-    ny, nz = tree.shape[3 * cascade + 1], tree.shape[3 * cascade + 2]
-    sx, sy, sz = tree.shape[3 * cascade] * brick, ny * brick, nz * brick
-    length = tree.step_length * tree.scale[cascade]
-    ix = 1 / dx if dx != 0 else 1e30
-    iy = 1 / dy if dy != 0 else 1e30
-    iz = 1 / dz if dz != 0 else 1e30
-    last = int(np.floor(min((t1 - t0) / tree.step, most_samples(sx, sy, sz, tree.step)))) + 1
-    entry, ea, eb, ec = np.int64(-1), -2, -2, -2
-    count, k = packet.state[SAMPLES], 0
-    if clear > t0:
-        k = int(min((clear - t0) / tree.step, float(last)))  # no later than the first sample behind it
-    while k < last:
-        t = t0 + (k + 0.5) * tree.step
-        if t >= t1:
-            break
-        u, v, w = ox + t * dx, oy + t * dy, oz + t * dz
-        if not (0 <= u < sx and 0 <= v < sy and 0 <= w < sz):  # by rounding, at a face
-            k += 1
-            continue
-        a, b, c = int((int(u) + 0.5) * inverse), int((int(v) + 0.5) * inverse), int((int(w) + 0.5) * inverse)
-        leap = int(tree.leap[first + (a * ny + b) * nz + c])
-        if leap > 0:
-            fx = ((a + leap) * brick - ox) * ix if dx > 0 else ((a - leap + 1) * brick - ox) * ix
-            fy = ((b + leap) * brick - oy) * iy if dy > 0 else ((b - leap + 1) * brick - oy) * iy
-            fz = ((c + leap) * brick - oz) * iz if dz > 0 else ((c - leap + 1) * brick - oz) * iz
-            if dx == 0:
-                fx = 1e30
-            if dy == 0:
-                fy = 1e30
-            if dz == 0:
-                fz = 1e30
-            k = max(k + 1, int(np.ceil((min(fx, fy, fz) - t0) / tree.step - 0.5)))
-            continue
-        k += 1
-        x, y, z, fx, fy, fz = int(u), int(v), int(w), 0.0, 0.0, 0.0
-        if not tree.nearest:
-            x, y, z = int(u + 0.5) - 1, int(v + 0.5) - 1, int(w + 0.5) - 1
-            fx, fy, fz = u - 0.5 - x, v - 0.5 - y, w - 0.5 - z
-            a, b, c = int((x + brick + 0.5) * inverse) - 1, int((y + brick + 0.5) * inverse) - 1, int((z + brick + 0.5) * inverse) - 1
-        if a != ea or b != eb or c != ec:
-            entry, ea, eb, ec = _entry(a, b, c, cascade, tree, packet), a, b, c
-        if entry < 0 or count == packet.samples:
-            return -1.0
-        at = 8 * count
-        if tree.nearest:
-            sigma = _place(0, entry, 0, ((x - a * brick) * brick + y - b * brick) * brick + z - c * brick, tree.one, at, tree, packet)
-            for n in range(1, 8):
-                packet.slots[at + n], packet.weights[at + n] = np.int32(0), 0
-        else:
-            gx, gy, gz = cast_like(fx, tree.one), cast_like(fy, tree.one), cast_like(fz, tree.one)
-            sigma = _interpolated(entry, x - a * brick, y - b * brick, z - c * brick, gx, gy, gz, at, tree, packet)
-        if sigma > 0:
-            alpha = np.float64(absorbed(cast_like(sigma * length, tree.one)))
-            if transmittance * alpha >= min_weight:
-                packet.light[3 * count], packet.light[3 * count + 1], packet.light[3 * count + 2] = alpha, transmittance, length
-                for n in range(8):
-                    packet.met[packet.slots[at + n]] = np.uint8(1)
-                count += 1
-            transmittance *= 1 - alpha
-            if transmittance < stop:
-                break
-    packet.state[SAMPLES] = count
-    return transmittance
+    (u, v, w), (a, b, c), (transmittance, count, entry, key), brick = point, cell, state, tree.brick
+    x, y, z, fx, fy, fz = int(u), int(v), int(w), 0.0, 0.0, 0.0
+    if not tree.nearest:
+        x, y, z = int(u + 0.5) - 1, int(v + 0.5) - 1, int(w + 0.5) - 1
+        fx, fy, fz = u - 0.5 - x, v - 0.5 - y, w - 0.5 - z
+        a, b, c = int((x + brick + 0.5) * tree.inverse) - 1, int((y + brick + 0.5) * tree.inverse) - 1, int((z + brick + 0.5) * tree.inverse) - 1
+    here = _key(a, b, c, cascade)
+    if here != key:
+        entry, key = _entry(here, a, b, c, cascade, tree, packet), here
+    if entry < 0 or count == packet.samples:
+        return -1.0, count, entry, key
+    at = 8 * count
+    if tree.nearest:
+        sigma = _place(0, entry, 0, ((x - a * brick) * brick + y - b * brick) * brick + z - c * brick, tree.one, at, tree, packet)
+        for n in range(1, 8):
+            packet.slots[at + n], packet.weights[at + n] = np.int32(0), 0
+    else:
+        gx, gy, gz = cast_like(fx, tree.one), cast_like(fy, tree.one), cast_like(fz, tree.one)
+        sigma = _interpolated(entry, x - a * brick, y - b * brick, z - c * brick, gx, gy, gz, at, tree, packet)
+    if sigma > 0:
+        length = tree.step_length * tree.scale[cascade]
+        alpha = np.float64(absorbed(cast_like(sigma * length, tree.one)))
+        if transmittance * alpha >= min_weight:
+            packet.light[3 * count], packet.light[3 * count + 1], packet.light[3 * count + 2] = alpha, transmittance, length
+            for n in range(8):
+                packet.met[packet.slots[at + n]] = np.uint8(1)
+            count += 1
+        transmittance *= 1 - alpha
+    return transmittance, count, entry, key
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _cascade_distances(origin, direction, tree, n):  # type: ignore[no-untyped-def]
-    """Distances at which a ray enters and leaves the box of cascade n, voxels of cascade 0; see `box_distances`."""
-    x, y, z = origin[0] - tree.corner[3 * n], origin[1] - tree.corner[3 * n + 1], origin[2] - tree.corner[3 * n + 2]
-    side = tree.scale[n] * tree.brick
-    return box_distances(
-        x, y, z, direction[0], direction[1], direction[2], tree.shape[3 * n] * side, tree.shape[3 * n + 1] * side, tree.shape[3 * n + 2] * side
-    )
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
+def _add_sample(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
+    """`_add` for `march_with`; scene: the packet, and the least weight."""
+    # numba takes for dead what is written to a structure that comes out of a tuple: here it is an argument.
+    return _add(point, cell, cascade, tree, scene[0], scene[1], state)
+
+
+_march = march_with(_add_sample)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -296,7 +265,7 @@ def clear_distance(begin, end, origins, directions, tree):  # type: ignore[no-un
     for ray in range(begin, end):
         apart = max(apart, abs(origins[ray, 0] - ox), abs(origins[ray, 1] - oy), abs(origins[ray, 2] - oz))
         spread = max(spread, abs(directions[ray, 0] - dx), abs(directions[ray, 1] - dy), abs(directions[ray, 2] - dz))
-        t0, t1 = _cascade_distances(origins[ray], directions[ray], tree, 0)
+        t0, t1 = cascade_distances(origins[ray], directions[ray], tree, 0)
         if t1 > t0:
             t, most = min(t, t0), max(most, t1)
     speed = max(abs(dx), abs(dy), abs(dz)) + spread
@@ -318,28 +287,8 @@ def walk_ray(origin, direction, clear, tree, stop, min_weight, packet):  # type:
     where there is no room.
 
     clear  distance before which the ray meets nothing
-
-    Part p of a ray through a nested tree lies in cascade |L - 1 - p|, before or behind the box that is cut out of that.
     """
-    transmittance, outermost = 1.0, tree.cascades - 1
-    for part in range(2 * outermost + 1):
-        n = abs(outermost - part)
-        t0, t1 = _cascade_distances(origin, direction, tree, n)
-        if n == outermost and not t1 > t0:
-            return transmittance
-        if n > 0:
-            enter, leave = _cascade_distances(origin, direction, tree, n - 1)
-            if leave > enter and part < outermost:
-                t1 = enter
-            elif part > outermost:
-                t0 = leave if leave > enter else t1
-        if t1 > t0:
-            scale = tree.scale[n]
-            ox, oy, oz = origin[0] - tree.corner[3 * n], origin[1] - tree.corner[3 * n + 1], origin[2] - tree.corner[3 * n + 2]
-            transmittance = _walk_part(
-                ox / scale, oy / scale, oz / scale, direction[0], direction[1], direction[2], t0 / scale, t1 / scale, clear / scale, n, tree, stop, min_weight,
-                transmittance, packet,
-            )  # fmt: skip
-            if transmittance < stop:
-                return transmittance
+    start = 1.0, packet.state[SAMPLES], np.int64(-1), np.int64(-1)
+    transmittance, count, _last, _cell = _march(origin, direction, clear, tree, stop, (packet, min_weight), start)
+    packet.state[SAMPLES] = count
     return transmittance

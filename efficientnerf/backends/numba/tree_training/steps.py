@@ -18,20 +18,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from efficientnerf.backends.layout import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION, Hyperparameters, Moments
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, lowest_bit, store_lanes
-from efficientnerf.backends.numba.tree_training.cells import Cells, dense_densities, voxel_places
+from efficientnerf.backends.numba.tree.cells import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
-from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
-from efficientnerf.backends.numba.tree_training.rows import LANES, channels_from, load_first16, multiply_add16, padded, rows_of, store_first16, sum16
-from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
+from efficientnerf.backends.numba.vector.maths import broadcast, fma, lowest_bit, sum_lanes
+from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_cycle, load_first, pointer, prefetch, store, store_first
 
-MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
-MAX_VISITS = 60000
-MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
+LANES = 16  # rows of coefficients, the three channels of one after those of the other, are read in groups of so many; the last may hold fewer
 AHEAD = 8  # voxels whose values are fetched before their turn
+
+
+def padded(width: int) -> int:
+    """Numbers of the groups that hold so many."""
+    return -(-width // LANES) * LANES
+
+
+def rows_of(basis: np.ndarray, terms: int) -> np.ndarray:
+    """(P, padded(3 terms)) float32 of harmonics (P, K): each of the first `terms` three times, as a row of coefficients has it."""
+    rows = np.zeros((len(basis), padded(3 * terms)), np.float32)
+    rows[:, : 3 * terms].reshape(len(basis), terms, 3)[:] = basis[:, :terms, None]
+    return rows
 
 
 @functools.lru_cache(maxsize=8)
@@ -41,17 +49,6 @@ def corrections(decay: float) -> np.ndarray:
     powers[0] = 0
     table = (1 / (1 - powers)).astype(np.float32)
     return table[: int((table != 1).nonzero()[0].max(initial=0)) + 2]
-
-
-class Moments(NamedTuple):
-    """Running means of the gradients by the logarithm of the optical thickness (N,) and by the coefficients (N, 3 K), without rows where there is no momentum;
-    of their squares (N,), (N,); and the number of steps that met a voxel (N,) int32."""
-
-    density: np.ndarray
-    sh: np.ndarray
-    square_density: np.ndarray
-    square_sh: np.ndarray
-    visits: np.ndarray
 
 
 class Values(NamedTuple):
@@ -167,20 +164,20 @@ def _take_voxels(some, met):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy")
 def _gather(number, p):  # type: ignore[no-untyped-def]
     """Sum of the records of a list into `p.row`; returns that by density, and the sum of the squares of the row."""
-    by_density, squares, n = 0.0, broadcast16(np.float32(0)), number
+    by_density, squares, n = 0.0, broadcast(np.float32(0), LANES), number
     while n >= 0:
         by_density += p.gradient[4 * p.following[2 * n] + 3]
         n = p.following[2 * n + 1]
     for j in range(0, p.padded, LANES):
-        total, n = broadcast16(np.float32(0)), number
+        total, n = broadcast(np.float32(0), LANES), number
         while n >= 0:
             at = p.following[2 * n]
-            basis = load16(p.bases, p.padded * np.int64(p.numbers[2 * at + 1]) + j)
-            total = multiply_add16(basis, channels_from(p.gradient, 4 * at, j), total)
+            basis = load(p.bases, p.padded * np.int64(p.numbers[2 * at + 1]) + j, LANES)
+            total = fma(basis, load_cycle(p.gradient, 4 * at, j, LANES), total)
             n = p.following[2 * n + 1]
-        squares = multiply_add16(total, total, squares)
-        store_lanes(p.row, j, total)
-    return by_density, np.float64(sum16(squares))
+        squares = fma(total, total, squares)
+        store(p.row, j, total)
+    return by_density, np.float64(sum_lanes(squares))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -221,11 +218,11 @@ def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     p.square_sh[v] = np.float32(square)
     scale = np.float32(-ahead / (np.sqrt(square * correction) + epsilon))
     for j in range(0, p.width, LANES):
-        by, at, count = load16(p.row, j), v * p.stride + j, p.width - j
+        by, at, count = load(p.row, j, LANES), v * p.stride + j, p.width - j
         if momentum > 0:
-            by = load_first16(p.mean_sh, at, count) * np.float32(momentum) + by * np.float32(1 - momentum)
-            store_first16(p.mean_sh, at, by, count)
-        store_first16(p.sh, at, multiply_add16(load16(p.rates, j) * scale, by, load_first16(p.sh, at, count)), count)
+            by = load_first(p.mean_sh, at, count, LANES) * np.float32(momentum) + by * np.float32(1 - momentum)
+            store_first(p.mean_sh, at, by, count)
+        store_first(p.sh, at, fma(load(p.rates, j, LANES) * scale, by, load_first(p.sh, at, count, LANES)), count)
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
@@ -237,7 +234,7 @@ def _fetch(v, number, p):  # type: ignore[no-untyped-def]
     prefetch(p.visits, v)
     prefetch(p.dense, p.places[v])
     prefetch(p.gradient, 4 * p.following[2 * number])
-    for j in range(0, p.stride, 16):
+    for j in range(0, p.stride, LANES):
         prefetch(p.sh, v * p.stride + j)
     prefetch(p.sh, v * p.stride + p.stride - 1)
 
@@ -259,7 +256,7 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
     bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
     met, some, row = np.empty(size, np.int64), np.zeros(size >> 6, np.int64), np.empty(rows.shape[1], np.float32)
     head, following = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64)
-    slab = take_next(pointer(task))
+    slab = fetch_add(pointer(task), 0, 1)
     while slab < bins:
         low = slab << BIN_BITS
         following = _link_all(low, slab, records, head, following, some)
@@ -274,7 +271,7 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
             by_density, squares = _gather(head[met[n]], p)
             head[met[n]] = -1
             _update(v, by_density, squares, p, h)
-        slab = take_next(pointer(task))
+        slab = fetch_add(pointer(task), 0, 1)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -287,13 +284,13 @@ def _step(workers, task, records, rows, values, moments, neighbours, h, rates, o
 def _copy_bins(task, records, values):  # type: ignore[no-untyped-def]
     """Copies the densities of voxels that have records to where rays find them, until no bin is left."""
     bins, chunks = records.begin.shape[1] - 1, records.begin.shape[0]
-    slab = take_next(pointer(task))
+    slab = fetch_add(pointer(task), 0, 1)
     while slab < bins:
         for chunk in range(chunks):
             for at in range(records.begin[chunk, slab], records.begin[chunk, slab + 1]):
                 v = records.numbers[at, 0]
                 values.dense[values.places[v]] = values.density[v]
-        slab = take_next(pointer(task))
+        slab = fetch_add(pointer(task), 0, 1)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -315,21 +312,17 @@ def _sum_gradients(records, grad_density, grad_sh):  # type: ignore[no-untyped-d
                         grad_sh[v, 3 * k + channel] += basis[k] * records.gradient[at, channel]
 
 
-def step(
-    records: Records, values: Values, moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS
-) -> None:
+def step(records: Records, values: Values, moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS) -> None:
     """A step for the voxels that the records name; the others stay. float32.
 
-        s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
-        p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
+    s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
+    p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
     """
     h, count = Hyperparameters._make([*map(float, hyperparameters[:-1]), hyperparameters.terms]), records.begin.shape[1] - 1
     terms, workers = min(h.terms, values.sh.shape[1] // 3), min(numba.get_num_threads(), count)
     rows, rates = rows_of(records.basis, terms), np.full(padded(3 * terms), h.sh_rate * h.view_share, np.float32)
     rates[:3] = h.sh_rate
-    _step(
-        workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum), 3 * terms
-    )
+    _step(workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum), 3 * terms)
     # Not before all bins are done: total variation is that of the densities before the step.
     _copy(workers, np.zeros(1, np.int64), records, values)
 

@@ -8,21 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import advanced
-from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
-from efficientnerf.backends.numba.tree.packets.lanes import (
-    bits_of,
-    broadcast32,
-    ceil_lanes,
-    floor_lanes,
-    lane_numbers,
-    load32,
-    max_lanes,
-    min_lanes,
-    select_lanes,
-    store_lanes,
-    to_floats,
-)
+from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP, most_samples
 from efficientnerf.backends.numba.tree.packets.layout import (
     ALONG_X,
     ALONG_Y,
@@ -50,7 +36,8 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     TRANSMITTANCE,
 )
 from efficientnerf.backends.numba.tree.ray_batch import PINHOLE, pinhole_direction, ray_at
-from efficientnerf.backends.numba.tree.walk import most_samples
+from efficientnerf.backends.numba.vector.maths import bits_of, broadcast, ceil, floor, lane_numbers, maximum, minimum, select, to_float32
+from efficientnerf.backends.numba.vector.memory import advanced, load, store
 
 MARGIN = 1 / 16  # voxels that rounding may put the ends of a ray outside of the grid
 
@@ -59,8 +46,8 @@ MARGIN = 1 / 16  # voxels that rounding may put the ends of a ray outside of the
 def _near_and_far(o, d, inverse, most, t0, t1):  # type: ignore[no-untyped-def]
     """Distances t0 and t1 between which rays are in a box, and between 0 and `most` along an axis too; exit before entry where they never are."""
     moves, low, high = (d != 0.0), o * -1.0 * inverse, (most - o) * inverse
-    within = select_lanes((o >= 0.0) & (o <= most), t1, -1.0)
-    return select_lanes(moves, max_lanes(t0, min_lanes(low, high)), t0), select_lanes(moves, min_lanes(t1, max_lanes(low, high)), within)
+    within = select((o >= 0.0) & (o <= most), t1, -1.0)
+    return select(moves, maximum(t0, minimum(low, high)), t0), select(moves, minimum(t1, maximum(low, high)), within)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -74,30 +61,30 @@ def _in_box(x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
 def _origins(ratio, shift_x, shift_y, shift_z, rays, places):  # type: ignore[no-untyped-def]
     """Where rays begin, voxel coordinates of a cascade."""
     if rays.kind == PINHOLE:
-        return broadcast32(rays.x / ratio + shift_x), broadcast32(rays.y / ratio + shift_y), broadcast32(rays.z / ratio + shift_z)
-    x, y, z = load32(places, ORIGIN), load32(places, ORIGIN + LANES), load32(places, ORIGIN + 2 * LANES)
+        return broadcast(rays.x / ratio + shift_x, LANES), broadcast(rays.y / ratio + shift_y, LANES), broadcast(rays.z / ratio + shift_z, LANES)
+    x, y, z = load(places, ORIGIN, LANES), load(places, ORIGIN + LANES, LANES), load(places, ORIGIN + 2 * LANES, LANES)
     return x / ratio + shift_x, y / ratio + shift_y, z / ratio + shift_z
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _lay_out_pinhole(tile, rays, floats, places):  # type: ignore[no-untyped-def]
     """Directions and cosines of a pinhole camera's rays."""
-    across, lane = np.float64(tile.last - tile.first), lane_numbers()
-    row = floor_lanes((lane + 0.5) / across)
+    across, lane = np.float64(tile.last - tile.first), lane_numbers(LANES)
+    row = floor((lane + 0.5) / across)
     x = (lane - row * across + np.float64(tile.first) + 0.5) * rays.pitch
     y = (row + np.float64(rays.first_row + tile.upper) + 0.5) * rays.pitch
     dx, dy, dz, cosine = pinhole_direction(x, y, rays)
-    store_lanes(places, DIRECTION, dx)
-    store_lanes(places, DIRECTION + LANES, dy)
-    store_lanes(places, DIRECTION + 2 * LANES, dz)
-    store_lanes(places, COSINE, cosine)
-    dx, dy, dz = to_floats(dx), to_floats(dy), to_floats(dz)
-    store_lanes(floats, ALONG_X, dx)
-    store_lanes(floats, ALONG_Y, dy)
-    store_lanes(floats, ALONG_Z, dz)
-    store_lanes(floats, SH_X, dx)
-    store_lanes(floats, SH_Y, dy)
-    store_lanes(floats, SH_Z, dz)
+    store(places, DIRECTION, dx)
+    store(places, DIRECTION + LANES, dy)
+    store(places, DIRECTION + 2 * LANES, dz)
+    store(places, COSINE, cosine)
+    dx, dy, dz = to_float32(dx), to_float32(dy), to_float32(dz)
+    store(floats, ALONG_X, dx)
+    store(floats, ALONG_Y, dy)
+    store(floats, ALONG_Z, dz)
+    store(floats, SH_X, dx)
+    store(floats, SH_Y, dy)
+    store(floats, SH_Z, dz)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -121,30 +108,30 @@ def _lay_out_rays(tile, rays, floats, places):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy")
 def begin_rays(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
     """Lays out the rays of a tile's subdivision, which have met nothing, and where they enter and leave each cascade; returns their number."""
-    floats, places, none = scratch.floats, scratch.rays, broadcast32(np.float32(0))
+    floats, places, none = scratch.floats, scratch.rays, broadcast(np.float32(0), LANES)
     for n in range(TRANSMITTANCE, BASIS, LANES):
-        store_lanes(floats, n, none)
+        store(floats, n, none)
     for n in range(0, CACHED, LANES):
-        store_lanes(scratch.ints, CACHE + n, broadcast32(np.int32(-1)))
+        store(scratch.ints, CACHE + n, broadcast(np.int32(-1), LANES))
     scratch.ints[HAS_BASIS] = 0
-    store_lanes(floats, TRANSMITTANCE, broadcast32(np.float32(1)))
-    store_lanes(floats, HALF_DISTANCE, broadcast32(np.float32(np.inf)))
-    store_lanes(floats, DEPTH, broadcast32(np.float32(np.inf)))
+    store(floats, TRANSMITTANCE, broadcast(np.float32(1), LANES))
+    store(floats, HALF_DISTANCE, broadcast(np.float32(np.inf), LANES))
+    store(floats, DEPTH, broadcast(np.float32(np.inf), LANES))
     if rays.kind == PINHOLE:
         _lay_out_pinhole(tile, rays, floats, places)
     else:
         _lay_out_rays(tile, rays, floats, places)
-    dx, dy, dz = load32(places, DIRECTION), load32(places, DIRECTION + LANES), load32(places, DIRECTION + 2 * LANES)
+    dx, dy, dz = load(places, DIRECTION, LANES), load(places, DIRECTION + LANES, LANES), load(places, DIRECTION + 2 * LANES, LANES)
     per_x, per_y, per_z = 1.0 / dx, 1.0 / dy, 1.0 / dz
     for n in range(scene.cascades):
         grid, place, brick = advanced(scene.grids, 4 * n), advanced(scene.places, 4 * n), scene.base.brick
         x, y, z = _origins(place[0], place[1], place[2], place[3], rays, places)
-        t0, t1 = broadcast32(0.0), broadcast32(np.inf)
+        t0, t1 = broadcast(0.0, LANES), broadcast(np.inf, LANES)
         t0, t1 = _near_and_far(x, dx, per_x, np.float64(grid[0] * brick), t0, t1)
         t0, t1 = _near_and_far(y, dy, per_y, np.float64(grid[1] * brick), t0, t1)
         t0, t1 = _near_and_far(z, dz, per_z, np.float64(grid[2] * brick), t0, t1)
-        store_lanes(places, ENDS + 2 * LANES * n, t0)
-        store_lanes(places, ENDS + 2 * LANES * n + LANES, t1)
+        store(places, ENDS + 2 * LANES * n, t0)
+        store(places, ENDS + 2 * LANES * n + LANES, t1)
     return (tile.lower - tile.upper) * (tile.last - tile.first)
 
 
@@ -152,14 +139,14 @@ def begin_rays(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
 def _part_of(part, places):  # type: ignore[no-untyped-def]
     """Distances at which rays' parts in a cascade begin and end, voxels of it: see `efficientnerf.asset.rendering.ray_parts`."""
     at = ENDS + 2 * LANES * abs(part)
-    t0, t1 = load32(places, at), load32(places, at + LANES)
+    t0, t1 = load(places, at, LANES), load(places, at + LANES, LANES)
     if part != 0:
         # Voxels of the cascade before are half as large.
-        enter, leave = load32(places, at - 2 * LANES), load32(places, at - LANES)
+        enter, leave = load(places, at - 2 * LANES, LANES), load(places, at - LANES, LANES)
         if part < 0:
-            t1 = select_lanes(leave > enter, enter / 2.0, t1)
+            t1 = select(leave > enter, enter / 2.0, t1)
         else:
-            t0 = select_lanes(leave > enter, leave / 2.0, t1)
+            t0 = select(leave > enter, leave / 2.0, t1)
     return t0, t1
 
 
@@ -169,21 +156,21 @@ def begin_part(part, count, clear, grid, step, rays, scratch):  # type: ignore[n
     floats, places, none = scratch.floats, scratch.rays, np.float32(0)
     nx, ny, nz = np.float64(grid.nx * grid.brick), np.float64(grid.ny * grid.brick), np.float64(grid.nz * grid.brick)
     t0, t1 = _part_of(part, places)
-    some = (lane_numbers() < np.float64(count)) & (load32(floats, TRANSMITTANCE) >= np.float32(PACKED_EARLY_STOP)) & (t1 > t0)
-    t0, t1 = select_lanes(some, t0, 0.0), select_lanes(some, t1, 0.0)
-    last = ceil_lanes(min_lanes((t1 - t0) / step - 0.5, np.float64(most_samples(grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick, step))))
-    dx, dy, dz = load32(places, DIRECTION), load32(places, DIRECTION + LANES), load32(places, DIRECTION + 2 * LANES)
+    some = (lane_numbers(LANES) < np.float64(count)) & (load(floats, TRANSMITTANCE, LANES) >= np.float32(PACKED_EARLY_STOP)) & (t1 > t0)
+    t0, t1 = select(some, t0, 0.0), select(some, t1, 0.0)
+    last = ceil(minimum((t1 - t0) / step - 0.5, np.float64(most_samples(grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick, step))))
+    dx, dy, dz = load(places, DIRECTION, LANES), load(places, DIRECTION + LANES, LANES), load(places, DIRECTION + 2 * LANES, LANES)
     ox, oy, oz = _origins(grid.ratio, grid.shift_x, grid.shift_y, grid.shift_z, rays, places)
     # From so far away that rounding hides the grid nothing is seen: samples, which go on from the first, would lie beside the bricks.
-    s = max_lanes(last - 0.5, 0.0) * step
+    s = maximum(last - 0.5, 0.0) * step
     x, y, z = ox + t0 * dx, oy + t0 * dy, oz + t0 * dz
     some = some & _in_box(x, y, z, nx, ny, nz) & _in_box(x + s * dx, y + s * dy, z + s * dz, nx, ny, nz)
-    begin, last = floor_lanes(min_lanes(max_lanes((clear - t0) / step - 0.5, 0.0), last)), select_lanes(some, last, 0.0)
-    begin = select_lanes(some, begin, 0.0)
-    store_lanes(floats, ENTRY_X, select_lanes(some, to_floats(x), none))
-    store_lanes(floats, ENTRY_Y, select_lanes(some, to_floats(y), none))
-    store_lanes(floats, ENTRY_Z, select_lanes(some, to_floats(z), none))
-    store_lanes(floats, FIRST, to_floats(begin))
-    store_lanes(floats, LAST, to_floats(last))
-    store_lanes(places, BEGIN, t0)
+    begin, last = floor(minimum(maximum((clear - t0) / step - 0.5, 0.0), last)), select(some, last, 0.0)
+    begin = select(some, begin, 0.0)
+    store(floats, ENTRY_X, select(some, to_float32(x), none))
+    store(floats, ENTRY_Y, select(some, to_float32(y), none))
+    store(floats, ENTRY_Z, select(some, to_float32(z), none))
+    store(floats, FIRST, to_float32(begin))
+    store(floats, LAST, to_float32(last))
+    store(places, BEGIN, t0)
     return bits_of(begin < last) != 0

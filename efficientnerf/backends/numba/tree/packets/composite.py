@@ -9,25 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import add_scaled4, advanced, load4, pack4, sigmoid, store4
-from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP, exp2_neg
-from efficientnerf.backends.numba.tree.packets.groups import channels, gather_fours, gather_pairs, prefetch_groups, store_channels, store_pairs
-from efficientnerf.backends.numba.tree.packets.halves import mix_pairs
-from efficientnerf.backends.numba.tree.packets.lanes import (
-    bits_of,
-    broadcast32,
-    exp2_neg_lanes,
-    floor_lanes,
-    load32,
-    lowest_bit,
-    mask32,
-    popcount_lanes,
-    select_lanes,
-    store_lanes,
-    to_ints,
-)
+from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP
 from efficientnerf.backends.numba.tree.packets.layout import (
     BASIS,
+    BATCH_VOXELS,
     BLUE,
     CACHE,
     CACHED_BITS,
@@ -52,6 +37,9 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     WEIGHT,
 )
 from efficientnerf.backends.numba.tree.view_colours import sh_basis, sh_colour
+from efficientnerf.backends.numba.vector.halves import mix_pairs
+from efficientnerf.backends.numba.vector.maths import bits_of, broadcast, exp2_neg, floor, fma, lowest_bit, mask_of, pack, popcount, select, sigmoid, to_int32
+from efficientnerf.backends.numba.vector.memory import advanced, gather_groups, load, load_groups, prefetch_groups, store, store_groups
 
 _HALF, _ONE, _NONE = np.float32(0.5), np.float32(1), np.float32(0)
 _LEAST = np.float32(1e-30)  # weight of stored voxels below which a sample has no colour
@@ -63,9 +51,9 @@ def _weigh(n, first, mask, edge, bit, fz, gz, floats, ints):  # type: ignore[no-
 
     bit  of the first voxel in the mask; voxels that are not stored have no weight, and what lies in their place is any voxel beside them
     """
-    store_lanes(ints, LANES * n, first + popcount_lanes(mask & ((bit << 1) - 1)) - 1)
-    here, next_ = select_lanes((mask & bit) != 0, edge * gz, _NONE), select_lanes((mask & (bit << 1)) != 0, edge * fz, _NONE)
-    store_pairs(floats, WEIGHT + 2 * LANES * n, here, next_)
+    store(ints, LANES * n, first + popcount(mask & ((bit << 1) - 1)) - 1)
+    here, next_ = select((mask & bit) != 0, edge * gz, _NONE), select((mask & (bit << 1)) != 0, edge * fz, _NONE)
+    store_groups(floats, WEIGHT + 2 * LANES * n, (here, next_))
     return here + next_
 
 
@@ -76,61 +64,61 @@ def locate(x, y, z, distance, owner, grid, colours, ints, batch, voxels):  # typ
     x, y, z  in the block of the brick `owner`
     batch    float32, see `layout`, and voxels int32
     """
-    i, j, k = floor_lanes(x), floor_lanes(y), floor_lanes(z)
+    i, j, k = floor(x), floor(y), floor(z)
     side = grid.brick + 2
-    row = owner * (side * side) + to_ints(i * np.float32(side) + j)
+    row = owner * (side * side) + to_int32(i * np.float32(side) + j)
     if grid.narrow:
-        store_lanes(ints, ROW, row)
-        mask, next_mask = gather_pairs(grid.rows, ints, ROW)
-        far_mask, last_mask = gather_pairs(advanced(grid.rows, side), ints, ROW)
+        store(ints, ROW, row)
+        mask, next_mask = gather_groups(grid.rows, ints, ROW, 2, LANES)
+        far_mask, last_mask = gather_groups(advanced(grid.rows, side), ints, ROW, 2, LANES)
         first, next_first, far_first, last_first = mask >> side, next_mask >> side, far_mask >> side, last_mask >> side
     else:
-        store_lanes(ints, ROW, row * 2)
-        first, mask, next_first, next_mask = gather_fours(grid.rows, ints, ROW)
-        far_first, far_mask, last_first, last_mask = gather_fours(advanced(grid.rows, 2 * side), ints, ROW)
+        store(ints, ROW, row * 2)
+        first, mask, next_first, next_mask = gather_groups(grid.rows, ints, ROW, 4, LANES)
+        far_first, far_mask, last_first, last_mask = gather_groups(advanced(grid.rows, 2 * side), ints, ROW, 4, LANES)
     fx, fy, fz = x - i, y - j, z - k
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
-    bit = broadcast32(np.int32(1)) << to_ints(k)
+    bit = broadcast(np.int32(1), LANES) << to_int32(k)
     weight = _weigh(0, first, mask, gx * gy, bit, fz, gz, batch, voxels) + _weigh(1, next_first, next_mask, gx * fy, bit, fz, gz, batch, voxels)
     far = _weigh(2, far_first, far_mask, fx * gy, bit, fz, gz, batch, voxels) + _weigh(3, last_first, last_mask, fx * fy, bit, fz, gz, batch, voxels)
-    store_lanes(batch, TOTAL, weight + far)
-    store_lanes(batch, DISTANCE, distance)
-    prefetch_groups(colours, voxels)
+    store(batch, TOTAL, weight + far)
+    store(batch, DISTANCE, distance)
+    prefetch_groups(colours, voxels, BATCH_VOXELS)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _evaluate_basis(view, floats, ints):  # type: ignore[no-untyped-def]
     """Harmonics of the rays' directions, once."""
     if ints[HAS_BASIS] == 0:
-        sh_basis(load32(floats, SH_X), load32(floats, SH_Y), load32(floats, SH_Z), view.degree, advanced(floats, BASIS))
+        sh_basis(load(floats, SH_X, LANES), load(floats, SH_Y, LANES), load(floats, SH_Z, LANES), view.degree, advanced(floats, BASIS))
         ints[HAS_BASIS] = 1
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _colours_along(voxel, entry, grid, view, floats):  # type: ignore[no-untyped-def]
     """Density, red, green and blue of a voxel along each of the rays, into an entry of the cache."""
-    y = load32(floats, BASIS)
+    y = load(floats, BASIS, LANES)
     if grid.coded:
         table, base, code = grid.base_table, 3 * voxel, voxel * grid.groups
         red, green = y * table[3 * np.int64(grid.base[base])], y * table[3 * np.int64(grid.base[base + 1]) + 1]
         blue = y * table[3 * np.int64(grid.base[base + 2]) + 2]
         for k in range(grid.terms - 1):
-            e, y = 4 * (k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])), load32(floats, BASIS + LANES * k + LANES)
+            e, y = 4 * (k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])), load(floats, BASIS + LANES * k + LANES, LANES)
             red, green, blue = red + y * grid.palette[e + 1], green + y * grid.palette[e + 2], blue + y * grid.palette[e + 3]
     else:
         e = 3 * grid.terms * np.int64(grid.voxel_of[voxel])
         red, green, blue = y * grid.sh[e], y * grid.sh[e + 1], y * grid.sh[e + 2]
         for k in range(1, grid.terms):
-            y = load32(floats, BASIS + LANES * k)
+            y = load(floats, BASIS + LANES * k, LANES)
             red, green, blue = red + y * grid.sh[e + 3 * k], green + y * grid.sh[e + 3 * k + 1], blue + y * grid.sh[e + 3 * k + 2]
-    density = broadcast32(grid.density[voxel] * view.density_scale)
-    store_channels(floats, COLOURS + 4 * LANES * entry, density, red, green, blue)
+    density = broadcast(grid.density[voxel] * view.density_scale, LANES)
+    store_groups(floats, COLOURS + 4 * LANES * entry, (density, red, green, blue))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _mix_cached(lane, grid, view, floats, ints, batch, voxels):  # type: ignore[no-untyped-def]
     """`_mix_view_colours` by the harmonics of voxels along the rays: those that rays which are neighbours share are summed once for all of them."""
-    total = pack4(_NONE, _NONE, _NONE, _NONE)
+    total = pack((_NONE, _NONE, _NONE, _NONE))
     for n in range(8):
         weight, voxel = batch[WEIGHT + 2 * LANES * (n >> 1) + 2 * lane + (n & 1)], np.int64(voxels[LANES * (n >> 1) + lane]) + (n & 1)
         if weight != 0:
@@ -138,8 +126,8 @@ def _mix_cached(lane, grid, view, floats, ints, batch, voxels):  # type: ignore[
             if ints[CACHE + entry] != voxel:
                 _colours_along(voxel, entry, grid, view, floats)
                 ints[CACHE + entry] = voxel
-            total = add_scaled4(total, weight, load4(floats, COLOURS + 4 * LANES * entry + 4 * lane))
-    store4(floats, SAMPLE + 4 * lane, total)
+            total = fma(weight, load(floats, COLOURS + 4 * LANES * entry + 4 * lane, 4), total)
+    store(floats, SAMPLE + 4 * lane, total)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -162,13 +150,13 @@ def _mix_harmonics(lane, grid, view, floats, batch, voxels):  # type: ignore[no-
             if weight != 0:
                 r, g, b = sh_colour(np.int64(voxels[LANES * (n >> 1) + lane]) + (n & 1), grid, advanced(floats, BASIS), lane, LANES)
                 red, green, blue = red + weight * r, green + weight * g, blue + weight * b
-    store4(floats, SAMPLE + 4 * lane, pack4(sigma, red, green, blue))
+    store(floats, SAMPLE + 4 * lane, pack((sigma, red, green, blue)))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _half_distances(lanes, sigma, view, floats, batch):  # type: ignore[no-untyped-def]
     """Distances at which the transmittance of some rays, given as bits, falls to one half, within their samples."""
-    store_lanes(floats, SAMPLE, sigma)
+    store(floats, SAMPLE, sigma)
     while lanes != 0:
         lane = lowest_bit(lanes)
         within = np.log2(2 * floats[TRANSMITTANCE + lane]) / floats[SAMPLE + lane] - _HALF
@@ -195,30 +183,30 @@ def blend(ready, near, shared, grid, view, colours, floats, ints, batch, voxels)
     shared         whether rays beside each other are neighbours, which share voxels
     batch, voxels  what `locate` left
     """
-    sigma = red = green = blue = broadcast32(_NONE)
+    sigma = red = green = blue = broadcast(_NONE, LANES)
     if ready & ~near != 0:
-        sigma, red, green, blue = mix_pairs(advanced(batch, WEIGHT), voxels, colours)
-    alone = broadcast32(_NONE) > _NONE
+        sigma, red, green, blue = mix_pairs(advanced(batch, WEIGHT), voxels, colours, LANES)
+    alone = broadcast(_NONE, LANES) > _NONE
     if near != 0:
         _mix_near(near, shared, grid, view, floats, ints, batch, voxels)
-        some, sums = mask32(near), channels(floats, SAMPLE)
-        sigma, red = select_lanes(some, sums[0], sigma), select_lanes(some, sums[1], red)
-        green, blue = select_lanes(some, sums[2], green), select_lanes(some, sums[3], blue)
+        some, sums = mask_of(near, LANES), load_groups(floats, SAMPLE, 4, LANES)
+        sigma, red = select(some, sums[0], sigma), select(some, sums[1], red)
+        green, blue = select(some, sums[2], green), select(some, sums[3], blue)
         if not shared:
             alone = some
-    some, before, weight = mask32(ready), load32(floats, TRANSMITTANCE), load32(batch, TOTAL)
-    after = before * exp2_neg_lanes(select_lanes(some, sigma, _NONE))
-    gain = select_lanes(alone, load32(floats, GAIN), before - after)
+    some, before, weight = mask_of(ready, LANES), load(floats, TRANSMITTANCE, LANES), load(batch, TOTAL, LANES)
+    after = before * exp2_neg(select(some, sigma, _NONE))
+    gain = select(alone, load(floats, GAIN, LANES), before - after)
     # A lane without a sample gains nothing, whatever an earlier one left in it.
-    share = _ONE / select_lanes(weight > _LEAST, weight, broadcast32(_ONE))
-    store_lanes(floats, RED, load32(floats, RED) + gain * sigmoid(red * share))
-    store_lanes(floats, GREEN, load32(floats, GREEN) + gain * sigmoid(green * share))
-    store_lanes(floats, BLUE, load32(floats, BLUE) + gain * sigmoid(blue * share))
-    used = select_lanes(some, broadcast32(_ONE), _NONE)
-    store_lanes(floats, INTERPOLATED, load32(floats, INTERPOLATED) + used)
-    store_lanes(floats, LOOKUPS, load32(floats, LOOKUPS) + select_lanes(alone, _NONE, used))
+    share = _ONE / select(weight > _LEAST, weight, _ONE)
+    store(floats, RED, load(floats, RED, LANES) + gain * sigmoid(red * share))
+    store(floats, GREEN, load(floats, GREEN, LANES) + gain * sigmoid(green * share))
+    store(floats, BLUE, load(floats, BLUE, LANES) + gain * sigmoid(blue * share))
+    used = select(some, _ONE, _NONE)
+    store(floats, INTERPOLATED, load(floats, INTERPOLATED, LANES) + used)
+    store(floats, LOOKUPS, load(floats, LOOKUPS, LANES) + select(alone, _NONE, used))
     halved = bits_of((after <= _HALF) & (before > _HALF))
     if halved != 0:
         _half_distances(halved, sigma, view, floats, batch)
-    store_lanes(floats, TRANSMITTANCE, after)
+    store(floats, TRANSMITTANCE, after)
     return bits_of(after < np.float32(PACKED_EARLY_STOP))

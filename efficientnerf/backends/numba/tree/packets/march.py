@@ -12,27 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import advanced, popcount
 from efficientnerf.backends.numba.tree.march import PARALLEL, SKIP_MARGIN
 from efficientnerf.backends.numba.tree.packets.composite import blend, locate
-from efficientnerf.backends.numba.tree.packets.lanes import (
-    abs_lanes,
-    bits_of,
-    broadcast32,
-    ceil_lanes,
-    floor_lanes,
-    gather_lanes,
-    load32,
-    lowest_bit,
-    mask32,
-    max_lanes,
-    min_lanes,
-    prefetch,
-    select_lanes,
-    store_lanes,
-    to_floats,
-    to_ints,
-)
 from efficientnerf.backends.numba.tree.packets.layout import (
     ALONG_X,
     ALONG_Y,
@@ -45,11 +26,28 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     ENTRY_Y,
     ENTRY_Z,
     FIRST,
+    LANES,
     LAST,
     OWNER,
     TESTED,
     VISITED,
 )
+from efficientnerf.backends.numba.vector.maths import (
+    absolute,
+    bits_of,
+    broadcast,
+    ceil,
+    floor,
+    lowest_bit,
+    mask_of,
+    maximum,
+    minimum,
+    popcount,
+    select,
+    to_float32,
+    to_int32,
+)
+from efficientnerf.backends.numba.vector.memory import advanced, gather, load, prefetch, store
 
 _HALF, _ONE, _NONE, _FAR = np.float32(0.5), np.float32(1), np.float32(0), np.float32(1e30)
 _SKIP = np.float32(0.5 + SKIP_MARGIN)
@@ -63,10 +61,10 @@ def _axis(d):  # type: ignore[no-untyped-def]
 
     Along an axis that a ray hardly moves on it never does; 1 / dx would be infinite, zero times that no number, and the ray would stay where it is.
     """
-    moves, ahead = abs_lanes(d) >= PARALLEL, d > _NONE
+    moves, ahead = absolute(d) >= PARALLEL, d > _NONE
     return (
-        select_lanes(moves, _ONE / d, _NONE), select_lanes(moves, broadcast32(_NONE), _FAR), select_lanes(ahead, broadcast32(_ONE), -_ONE),
-        select_lanes(ahead, broadcast32(_NONE), _ONE),
+        select(moves, _ONE / d, _NONE), select(moves, _NONE, _FAR), select(ahead, _ONE, -_ONE),
+        select(ahead, _NONE, _ONE),
     )  # fmt: skip
 
 
@@ -105,8 +103,8 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
     shared  whether rays beside each other are neighbours
     view    see `View`; its density scale is the step, in units of the frame, times log2(e)
     """
-    ex, ey, ez = load32(floats, ENTRY_X), load32(floats, ENTRY_Y), load32(floats, ENTRY_Z)
-    dx, dy, dz = load32(floats, ALONG_X), load32(floats, ALONG_Y), load32(floats, ALONG_Z)
+    ex, ey, ez = load(floats, ENTRY_X, LANES), load(floats, ENTRY_Y, LANES), load(floats, ENTRY_Z, LANES)
+    dx, dy, dz = load(floats, ALONG_X, LANES), load(floats, ALONG_Y, LANES), load(floats, ALONG_Z, LANES)
     side, words = grid.brick + 2, 2 * grid.mask_words
     width, per_brick = np.float32(grid.brick), np.float32(1 / grid.brick)
     row, layer = np.float32(side), np.float32(side * side)
@@ -117,56 +115,56 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
     most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)
     some_near = view.min_distance > -np.inf
     cells = np.int32(grid.nx * grid.ny * grid.nz if grid.directed else 0)
-    octant = select_lanes(dx > _NONE, broadcast32(cells), 0) + select_lanes(dy > _NONE, broadcast32(2 * cells), 0)
-    octant = octant + select_lanes(dz > _NONE, broadcast32(4 * cells), 0)
+    octant = select(dx > _NONE, cells, 0) + select(dy > _NONE, 2 * cells, 0)
+    octant = octant + select(dz > _NONE, 4 * cells, 0)
     # Integers are kept as float32: conversions would lengthen the dependency chain from step to step.
-    k, last = load32(floats, FIRST), load32(floats, LAST)
-    until, owner, visited, tested = k, broadcast32(np.int32(0)), broadcast32(_NONE), broadcast32(_NONE)
-    bx = by = bz = px = py = pz = distance = broadcast32(_NONE)
+    k, last = load(floats, FIRST, LANES), load(floats, LAST, LANES)
+    until, owner, visited, tested = k, broadcast(np.int32(0), LANES), broadcast(_NONE, LANES), broadcast(_NONE, LANES)
+    bx = by = bz = px = py = pz = distance = broadcast(_NONE, LANES)
     going, ready, close = bits_of(k < last), np.int64(0), np.int64(0)
     pending, near, at = np.int64(0), np.int64(0), 0  # the batch before, whose colours have been asked for; which of them are near the camera
     batches, voxels = advanced(floats, BATCHES), advanced(ints, BATCHES_OF_VOXELS)
     while going != 0:
-        lanes = mask32(going)
+        lanes = mask_of(going, LANES)
         enters = lanes & (k >= until)
         entering = bits_of(enters)
         if entering != 0:
             s = (k + _HALF) * step
-            a = min_lanes(max_lanes(floor_lanes((ex + s * dx) * per_brick), _NONE), most_x)
-            e = min_lanes(max_lanes(floor_lanes((ey + s * dy) * per_brick), _NONE), most_y)
-            c = min_lanes(max_lanes(floor_lanes((ez + s * dz) * per_brick), _NONE), most_z)
-            cell = select_lanes(enters, (to_ints(a) * grid.ny + to_ints(e)) * grid.nz + to_ints(c), 0)
-            leap = gather_lanes(grid.octants, cell + octant)
-            visited = visited + select_lanes(enters, broadcast32(_ONE), _NONE)
+            a = minimum(maximum(floor((ex + s * dx) * per_brick), _NONE), most_x)
+            e = minimum(maximum(floor((ey + s * dy) * per_brick), _NONE), most_y)
+            c = minimum(maximum(floor((ez + s * dz) * per_brick), _NONE), most_z)
+            cell = select(enters, (to_int32(a) * grid.ny + to_int32(e)) * grid.nz + to_int32(c), 0)
+            leap = gather(grid.octants, cell + octant)
+            visited = visited + select(enters, _ONE, _NONE)
             # A ray leaves the cell, or the empty cube of cells around it, at the nearest of three faces.
-            far = max_lanes(to_floats(leap), _ONE)
+            far = maximum(to_float32(leap), _ONE)
             tx = ((a + beside_x + far * ahead_x) * width - ex) * slope_x + never_x
             ty = ((e + beside_y + far * ahead_y) * width - ey) * slope_y + never_y
             tz = ((c + beside_z + far * ahead_z) * width - ez) * slope_z + never_z
-            then = min_lanes(max_lanes(ceil_lanes(min_lanes(tx, min_lanes(ty, tz)) * per_step - _SKIP), k + _ONE), last)
+            then = minimum(maximum(ceil(minimum(tx, minimum(ty, tz)) * per_step - _SKIP), k + _ONE), last)
             full = enters & (leap == 0)
-            until = select_lanes(enters, then, until)
-            k = select_lanes(enters & (leap > 0), then, k)
+            until = select(enters, then, until)
+            k = select(enters & (leap > 0), then, k)
             filled = bits_of(full)
             if filled != 0:
-                owner = select_lanes(full, gather_lanes(grid.brick_index, select_lanes(full, cell, 0)), owner)
-                store_lanes(ints, OWNER, owner)
+                owner = select(full, gather(grid.brick_index, select(full, cell, 0)), owner)
+                store(ints, OWNER, owner)
                 _prefetch_rows(filled, grid, ints)
-                bx = select_lanes(full, ex - a * width + _HALF, bx)
-                by = select_lanes(full, ey - e * width + _HALF, by)
-                bz = select_lanes(full, ez - c * width + _HALF, bz)
+                bx = select(full, ex - a * width + _HALF, bx)
+                by = select(full, ey - e * width + _HALF, by)
+                bz = select(full, ez - c * width + _HALF, bz)
                 if some_near:
                     close = (close & ~filled) | (filled & bits_of(_near(a, e, c, grid, view)))
         inside = lanes & (k < until)
         if bits_of(inside) != 0:
             s = (k + _HALF) * step
             x, y, z = bx + s * dx, by + s * dy, bz + s * dz
-            voxel = to_ints(floor_lanes(x) * layer + floor_lanes(y) * row + floor_lanes(z))
-            word = gather_lanes(grid.has_density, select_lanes(inside, owner * words + (voxel >> 5), 0))
+            voxel = to_int32(floor(x) * layer + floor(y) * row + floor(z))
+            word = gather(grid.has_density, select(inside, owner * words + (voxel >> 5), 0))
             found = inside & ((word >> (voxel & 31)) & 1 != 0)
-            tested = tested + select_lanes(inside, broadcast32(_ONE), _NONE)
-            k = select_lanes(inside, k + _ONE, k)
-            px, py, pz, distance = select_lanes(found, x, px), select_lanes(found, y, py), select_lanes(found, z, pz), select_lanes(found, s, distance)
+            tested = tested + select(inside, _ONE, _NONE)
+            k = select(inside, k + _ONE, k)
+            px, py, pz, distance = select(found, x, px), select(found, y, py), select(found, z, pz), select(found, s, distance)
             ready |= bits_of(found)
         going = bits_of(k < last) & ~ready & going
         if ready != 0 and popcount(ready) >= popcount(going):
@@ -182,5 +180,5 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
         at = 1 - at
         batch, of_batch = advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at)
         blend(pending, pending & near, shared, grid, view, colours, floats, ints, batch, of_batch)
-    store_lanes(floats, VISITED, load32(floats, VISITED) + visited)
-    store_lanes(floats, TESTED, load32(floats, TESTED) + tested)
+    store(floats, VISITED, load(floats, VISITED, LANES) + visited)
+    store(floats, TESTED, load(floats, TESTED, LANES) + tested)

@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.packets.groups import store_rows, store_rows_of_three
-from efficientnerf.backends.numba.tree.packets.lanes import load32, sum_lanes, to_doubles, to_floats, to_ints
 from efficientnerf.backends.numba.tree.packets.layout import (
     BLUE,
     DEPTH,
@@ -23,6 +21,8 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     VISITED,
 )
 from efficientnerf.backends.numba.tree.ray_batch import normal_in_world, world_depth
+from efficientnerf.backends.numba.vector.maths import sum_lanes, to_float32, to_float64, to_int32
+from efficientnerf.backends.numba.vector.memory import load, store_rows
 
 INTERPOLATION, LOOKUP = 8, 32  # work of a sample interpolated and of a colour looked up, in samples tested
 
@@ -60,12 +60,12 @@ def _unwarp_packet(tile, voxel, rays, scratch, with_normal):  # type: ignore[no-
 @numba.njit(cache=True, error_model="numpy")
 def _write_rows(tile, background, scale, floats, outputs):  # type: ignore[no-untyped-def]
     """Colours, opacities and depths of a packet of four rows of eight pixels, in lanes."""
-    first, width, transmittance = tile.upper * outputs.width + tile.first, outputs.width, load32(floats, TRANSMITTANCE)
-    red, green, blue = load32(floats, RED), load32(floats, GREEN), load32(floats, BLUE)
+    first, width, transmittance = tile.upper * outputs.width + tile.first, outputs.width, load(floats, TRANSMITTANCE, LANES)
+    red, green, blue = load(floats, RED, LANES), load(floats, GREEN, LANES), load(floats, BLUE, LANES)
     red, green, blue = red + transmittance * background[0], green + transmittance * background[1], blue + transmittance * background[2]
-    store_rows_of_three(outputs.colour, 3 * first, 3 * width, red, green, blue)
-    store_rows(outputs.opacity, first, width, _ONE - transmittance)
-    store_rows(outputs.depth, first, width, to_floats(to_doubles(load32(floats, DEPTH)) * scale))
+    store_rows(outputs.colour, 3 * first, 3 * width, (red, green, blue), 8)
+    store_rows(outputs.opacity, first, width, (_ONE - transmittance,), 8)
+    store_rows(outputs.depth, first, width, (to_float32(to_float64(load(floats, DEPTH, LANES)) * scale),), 8)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -111,5 +111,5 @@ def write_packet(tile, background, voxel, rays, scratch, outputs):  # type: igno
         _write_rows(tile, background, scale, floats, outputs)
     else:
         _write_pixels(tile, background, scale, floats, outputs)
-    work = to_ints(load32(floats, VISITED) + load32(floats, TESTED)) + to_ints(load32(floats, INTERPOLATED)) * INTERPOLATION
-    return count + sum_lanes(work + to_ints(load32(floats, LOOKUPS)) * LOOKUP)
+    work = to_int32(load(floats, VISITED, LANES) + load(floats, TESTED, LANES)) + to_int32(load(floats, INTERPOLATED, LANES)) * INTERPOLATION
+    return count + sum_lanes(work + to_int32(load(floats, LOOKUPS, LANES)) * LOOKUP)

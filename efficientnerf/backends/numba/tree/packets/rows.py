@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import popcount
+from efficientnerf.backends.numba.vector.maths import popcount
 
 MOST_SIDE = 32  # voxels of a row whose mask is an int32
 

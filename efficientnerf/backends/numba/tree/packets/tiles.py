@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import advanced
 from efficientnerf.backends.numba.tree.normals import add_normals
 from efficientnerf.backends.numba.tree.packets.beginnings import begin_part, begin_rays
 from efficientnerf.backends.numba.tree.packets.layout import (
@@ -30,6 +29,7 @@ from efficientnerf.backends.numba.tree.packets.march import march
 from efficientnerf.backends.numba.tree.packets.pixels import write_clear, write_packet
 from efficientnerf.backends.numba.tree.ray_batch import PINHOLE, clear_distance, tile_rays
 from efficientnerf.backends.numba.tree.view_colours import PackedPointers, View
+from efficientnerf.backends.numba.vector.memory import advanced
 
 
 class Scene(NamedTuple):

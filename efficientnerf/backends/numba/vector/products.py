@@ -23,7 +23,7 @@ from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic, overload
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import multiply_add, splat
+from efficientnerf.backends.numba.vector import emit
 
 LANES = 16
 # Features of the processor that numba compiles for.
@@ -46,38 +46,23 @@ class _BFloat(ir.Type):
         return hash(_BFloat)
 
 
-_FLOAT32 = ir.VectorType(ir.FloatType(), LANES)
-_INT32 = ir.VectorType(ir.IntType(32), LANES)
-_INT16 = ir.VectorType(ir.IntType(16), LANES)
+_FLOAT32, _INT32, _INT16 = (ir.VectorType(element, LANES) for element in (emit.F32, emit.I32, emit.I16))
 _BFLOAT16 = ir.VectorType(_BFloat(), 2 * LANES)
 
 float_pointer, pair_pointer, bfloat16_pointer = (types.CPointer(kind) for kind in (types.float32, types.int32, types.int16))
 
 
-def _constant(kind: Any, x: float) -> Any:
-    """A vector with one value in all lanes."""
-    return ir.Constant(kind, [x] * LANES)
-
-
-def _load(builder: Any, address: Any, index: Any, kind: Any) -> Any:
-    return builder.load(builder.bitcast(builder.gep(address, [index]), kind.as_pointer()), align=2 if kind is _INT16 else 4)
-
-
-def _store(builder: Any, value: Any, address: Any, index: Any) -> None:
-    builder.store(value, builder.bitcast(builder.gep(address, [index]), value.type.as_pointer()), align=2 if value.type is _INT16 else 4)
-
-
 def _unpack_pairs(builder: Any, pairs: Any) -> tuple[Any, Any]:
     """The two bfloat16 of each pair as float32."""
-    low = builder.shl(pairs, _constant(_INT32, 16))
-    high = builder.and_(pairs, _constant(_INT32, 0xFFFF0000))
+    low = builder.shl(pairs, emit.constant(_INT32, 16))
+    high = builder.and_(pairs, emit.constant(_INT32, 0xFFFF0000))
     return builder.bitcast(low, _FLOAT32), builder.bitcast(high, _FLOAT32)
 
 
 def _multiply_add(builder: Any, total: Any, a: Any, b: Any) -> Any:
     """total + a b of float32, or total + a_0 b_0 + a_1 b_1 of pairs."""
     if a.type == _FLOAT32:
-        return multiply_add(builder, a, b, total)
+        return emit.fma(builder, a, b, total)
     if DOTS:
         dots = ir.FunctionType(_FLOAT32, [_FLOAT32, _BFLOAT16, _BFLOAT16])
         dot = builder.module.declare_intrinsic("llvm.x86.avx512bf16.dpbf16ps.512", (), dots)
@@ -91,16 +76,16 @@ def _to_bfloat16(builder: Any, value: Any) -> Any:
     """float32 to bfloat16 as int16: round to nearest, ties to even; NaN stays NaN."""
     if DOTS:
         return builder.bitcast(builder.fptrunc(value, ir.VectorType(_BFloat(), LANES)), _INT16)
-    bits, sixteen = builder.bitcast(value, _INT32), _constant(_INT32, 16)
+    bits, sixteen = builder.bitcast(value, _INT32), emit.constant(_INT32, 16)
     high = builder.lshr(bits, sixteen)
-    odd = builder.and_(high, _constant(_INT32, 1))
-    rounded = builder.lshr(builder.add(builder.add(bits, _constant(_INT32, 0x7FFF)), odd), sixteen)
+    odd = builder.and_(high, emit.constant(_INT32, 1))
+    rounded = builder.lshr(builder.add(builder.add(bits, emit.constant(_INT32, 0x7FFF)), odd), sixteen)
     not_nan = builder.fcmp_ordered("ord", value, value)
-    return builder.trunc(builder.select(not_nan, rounded, builder.or_(high, _constant(_INT32, 0x40))), _INT16)
+    return builder.trunc(builder.select(not_nan, rounded, builder.or_(high, emit.constant(_INT32, 0x40))), _INT16)
 
 
 def _convert_and_store(builder: Any, value: Any, address: Any, index: Any) -> None:
-    _store(builder, _to_bfloat16(builder, value) if address.type.pointee == ir.IntType(16) else value, address, index)
+    emit.store(builder, address, index, _to_bfloat16(builder, value) if address.type.pointee == emit.I16 else value)
 
 
 def _identity(builder: Any, total: Any, load_other: Callable[[], Any]) -> Any:
@@ -112,16 +97,16 @@ def _accumulate(builder: Any, total: Any, load_other: Callable[[], Any]) -> Any:
 
 
 def _relu(builder: Any, total: Any, load_other: Callable[[], Any]) -> Any:
-    return builder.select(builder.fcmp_unordered(">", total, _constant(_FLOAT32, 0.0)), total, _constant(_FLOAT32, 0.0))  # NaN stays NaN
+    return builder.select(builder.fcmp_unordered(">", total, emit.constant(_FLOAT32, 0.0)), total, emit.constant(_FLOAT32, 0.0))  # NaN stays NaN
 
 
 def _mask(builder: Any, total: Any, load_other: Callable[[], Any]) -> Any:
     value = load_other()
     if value.type == _INT16:
-        nonzero = builder.icmp_unsigned("!=", value, _constant(_INT16, 0))
+        nonzero = builder.icmp_unsigned("!=", value, emit.constant(_INT16, 0))
     else:
-        nonzero = builder.fcmp_unordered("!=", value, _constant(_FLOAT32, 0.0))
-    return builder.select(nonzero, total, _constant(_FLOAT32, 0.0))
+        nonzero = builder.fcmp_unordered("!=", value, emit.constant(_FLOAT32, 0.0))
+    return builder.select(nonzero, total, emit.constant(_FLOAT32, 0.0))
 
 
 class Matrix(NamedTuple):
@@ -141,66 +126,70 @@ class Rows(NamedTuple):
     row: int
 
 
+def _sum_tile(builder: Any, a: Matrix, b: Rows, vector: Any, count: Any, row: Any, column: Any, vectors: int) -> list[list[Any]]:
+    """Sums of ROWS rows of so many vectors of the product, from a row and a column on, in registers."""
+    sums = [[cgutils.alloca_once(builder, _FLOAT32) for _ in range(vectors)] for _ in range(ROWS)]
+    for accumulators in sums:
+        for accumulator in accumulators:
+            builder.store(emit.constant(_FLOAT32, 0.0), accumulator)
+    data = builder.bitcast(a.data, vector.element.as_pointer())
+    starts = [builder.gep(data, [builder.add(a.start, builder.mul(builder.add(row, emit.index(r)), a.row))]) for r in range(ROWS)]
+    begin = builder.add(b.start, column)
+    with cgutils.for_range(builder, count) as loop:
+        step, line = builder.mul(loop.index, a.column), builder.add(begin, builder.mul(loop.index, b.row))
+        lines = [emit.load(builder, b.data, builder.add(line, emit.index(LANES * v)), vector) for v in range(vectors)]
+        for start, accumulators in zip(starts, sums, strict=True):
+            factor = emit.splat(builder, builder.load(builder.gep(start, [step]), align=4), LANES)
+            for accumulator, value in zip(accumulators, lines, strict=True):
+                builder.store(_multiply_add(builder, builder.load(accumulator), factor, value), accumulator)
+    return sums
+
+
+def _for_tiles(builder: Any, rows: Any, columns: Any, tile: Callable[[Any, Any, int], None]) -> None:
+    """Emits the loops over tiles of rows and columns; tile: (first row, first column, vectors)."""
+    width = LANES * VECTORS
+    tiles = builder.udiv(columns, emit.index(width))
+    with cgutils.for_range(builder, builder.udiv(rows, emit.index(ROWS))) as down:
+        row = builder.mul(down.index, emit.index(ROWS))
+        with cgutils.for_range(builder, tiles) as along_row:
+            tile(row, builder.mul(along_row.index, emit.index(width)), VECTORS)
+        if VECTORS > 1:
+            last = builder.mul(tiles, emit.index(width))
+            with builder.if_then(builder.icmp_unsigned("<", last, columns)):
+                tile(row, last, 1)
+
+
 def _product(finish: Callable[..., Any]) -> Any:
     """An intrinsic that computes tiles of the product and applies `finish` to each vector of sums before it is stored."""
 
     @intrinsic
     def product(typing_context: Any, a: Any, b: Any, c: Any, count: Any, rows: Any, columns: Any, other: Any, other_start: Any) -> Any:
         a_data, b_data = a.types[0], b.types[0]
-        element = ir.FloatType() if b_data == float_pointer else ir.IntType(32)
         if b_data not in (float_pointer, pair_pointer) or a_data not in ((float_pointer,) if b_data == float_pointer else (pair_pointer, bfloat16_pointer)):
             raise TypeError(f"product of {a_data} and {b_data}: expected float32, or pairs of bfloat16")
-        vector = ir.VectorType(element, LANES)
+        vector, held = _FLOAT32 if b_data == float_pointer else _INT32, _INT16 if other == bfloat16_pointer else _FLOAT32
 
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            index = ir.IntType(64)
-
             def fields(n: int) -> list[Any]:
                 kinds = signature.args[n].types
                 values = cgutils.unpack_tuple(builder, args[n], len(kinds))
                 return [values[0], *(context.cast(builder, value, kind, types.int64) for value, kind in zip(values[1:], kinds[1:], strict=True))]
 
-            (a, a_start, a_row, a_column), (b, b_start, b_row), (c, c_start, c_row) = fields(0), fields(1), fields(2)
+            a, b, c = Matrix(*fields(0)), Rows(*fields(1)), Rows(*fields(2))
             count, rows, columns, other, other_start = args[3:]
-            a = builder.bitcast(a, element.as_pointer())
-
-            def number(n: int) -> Any:
-                return ir.Constant(index, n)
 
             def tile(row: Any, column: Any, vectors: int) -> None:
-                sums = [[cgutils.alloca_once(builder, _FLOAT32) for _ in range(vectors)] for _ in range(ROWS)]
-                for accumulators in sums:
-                    for accumulator in accumulators:
-                        builder.store(_constant(_FLOAT32, 0.0), accumulator)
-                starts = [builder.gep(a, [builder.add(a_start, builder.mul(builder.add(row, number(r)), a_row))]) for r in range(ROWS)]
-                begin = builder.add(b_start, column)
-                with cgutils.for_range(builder, count) as loop:
-                    step, line = builder.mul(loop.index, a_column), builder.add(begin, builder.mul(loop.index, b_row))
-                    lines = [_load(builder, b, builder.add(line, number(LANES * v)), vector) for v in range(vectors)]
-                    for start, accumulators in zip(starts, sums, strict=True):
-                        factor = splat(builder, builder.load(builder.gep(start, [step]), align=4), LANES)
-                        for accumulator, value in zip(accumulators, lines, strict=True):
-                            builder.store(_multiply_add(builder, builder.load(accumulator), factor, value), accumulator)
-                for r, accumulators in enumerate(sums):
-                    line = builder.add(builder.mul(builder.add(row, number(r)), c_row), column)
+                for r, accumulators in enumerate(_sum_tile(builder, a, b, vector, count, row, column, vectors)):
+                    line = builder.add(builder.mul(builder.add(row, emit.index(r)), c.row), column)
                     for v, accumulator in enumerate(accumulators):
-                        ahead = builder.add(line, number(LANES * v))
+                        ahead = builder.add(line, emit.index(LANES * v))
 
                         def load_other(ahead: Any = ahead) -> Any:
-                            return _load(builder, other, builder.add(other_start, ahead), _INT16 if signature.args[6] == bfloat16_pointer else _FLOAT32)
+                            return emit.load(builder, other, builder.add(other_start, ahead), held)
 
-                        _convert_and_store(builder, finish(builder, builder.load(accumulator), load_other), c, builder.add(c_start, ahead))
+                        _convert_and_store(builder, finish(builder, builder.load(accumulator), load_other), c.data, builder.add(c.start, ahead))
 
-            width = LANES * VECTORS
-            tiles = builder.udiv(columns, number(width))
-            with cgutils.for_range(builder, builder.udiv(rows, number(ROWS))) as down:
-                row = builder.mul(down.index, number(ROWS))
-                with cgutils.for_range(builder, tiles) as along_row:
-                    tile(row, builder.mul(along_row.index, number(width)), VECTORS)
-                if VECTORS > 1:
-                    last = builder.mul(tiles, number(width))
-                    with builder.if_then(builder.icmp_unsigned("<", last, columns)):
-                        tile(row, last, 1)
+            _for_tiles(builder, rows, columns, tile)
             return context.get_dummy_value()
 
         n = types.int64
@@ -244,7 +233,7 @@ def copy16(typing_context: Any, source: Any, at: Any, count: Any, target: Any, t
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         source, at, count, target, to = args
-        _convert_and_store(builder, _first_lanes(builder, _load(builder, source, at, _FLOAT32), count), target, to)
+        _convert_and_store(builder, _first_lanes(builder, emit.load(builder, source, at, _FLOAT32), count), target, to)
         return context.get_dummy_value()
 
     return types.void(float_pointer, types.int64, types.int64, target, types.int64), codegen
@@ -257,11 +246,11 @@ def store_pairs16(typing_context: Any, source: Any, low: Any, high: Any, count: 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         source, low, high, count, target, to = args
         kind = _FLOAT32 if signature.args[0] == float_pointer else _INT16
-        halves = [_load(builder, source, at, kind) for at in (low, high)]
+        halves = [emit.load(builder, source, at, kind) for at in (low, high)]
         if kind is _FLOAT32:
             halves = [_to_bfloat16(builder, value) for value in halves]
         first, second = (builder.zext(value, _INT32) for value in halves)
-        _store(builder, _first_lanes(builder, builder.or_(first, builder.shl(second, _constant(_INT32, 16))), count), target, to)
+        emit.store(builder, target, to, _first_lanes(builder, builder.or_(first, builder.shl(second, emit.constant(_INT32, 16))), count))
         return context.get_dummy_value()
 
     return types.void(source, types.int64, types.int64, types.int64, pair_pointer, types.int64), codegen
@@ -269,9 +258,7 @@ def store_pairs16(typing_context: Any, source: Any, low: Any, high: Any, count: 
 
 def _first_lanes(builder: Any, value: Any, count: Any) -> Any:
     """The first `count` of sixteen lanes, then zeros."""
-    lanes = ir.Constant(_INT32, list(range(LANES)))
-    inside = builder.icmp_signed("<", lanes, splat(builder, builder.trunc(count, ir.IntType(32)), LANES))
-    return builder.select(inside, value, ir.Constant(value.type, None))
+    return builder.select(emit.first_lanes(builder, count, LANES), value, ir.Constant(value.type, None))
 
 
 @intrinsic
@@ -282,17 +269,15 @@ def transpose16(typing_context: Any, source: Any, at: Any, row: Any, target: Any
         source, at, row, target, to, column = args
         kind = _FLOAT32 if signature.args[3] == float_pointer else _INT32
         source = builder.bitcast(source, kind.element.as_pointer())
-        steps = [ir.Constant(ir.IntType(64), n) for n in range(LANES)]
-        lines = [_load(builder, source, builder.add(at, builder.mul(n, row)), kind) for n in steps]
+        lines = [emit.load(builder, source, builder.add(at, builder.mul(emit.index(n), row)), kind) for n in range(LANES)]
         for far in (1, 2, 4, 8):  # swap off-diagonal blocks of that side in blocks twice as large
-            upper = ir.Constant(_INT32, [n if not n & far else LANES + n - far for n in range(LANES)])
-            lower = ir.Constant(_INT32, [n + far if not n & far else LANES + n for n in range(LANES)])
+            upper, lower = [n if not n & far else LANES + n - far for n in range(LANES)], [n + far if not n & far else LANES + n for n in range(LANES)]
             for n in range(LANES):
                 if not n & far:
                     first, second = lines[n], lines[n + far]
-                    lines[n], lines[n + far] = (builder.shuffle_vector(first, second, lanes) for lanes in (upper, lower))
-        for n, line in zip(steps, lines, strict=True):
-            _store(builder, line, target, builder.add(to, builder.mul(n, column)))
+                    lines[n], lines[n + far] = (emit.shuffle(builder, first, second, lanes) for lanes in (upper, lower))
+        for n, line in enumerate(lines):
+            emit.store(builder, target, builder.add(to, builder.mul(emit.index(n), column)), line)
         return context.get_dummy_value()
 
     n = types.int64

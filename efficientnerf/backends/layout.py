@@ -1,0 +1,89 @@
+"""What the kernels of numba and of Triton agree on: structures that both take, and limits that both keep. Imports nothing heavy.
+
+A field that says Any is an array on the CPU, a tensor on a device.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+EARLY_STOP = 1e-3  # transmittance at which a ray may end
+MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
+MAX_VISITS = 60000  # steps that met a voxel, counted up to here
+MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
+
+
+class RayBundle(NamedTuple):
+    """Rays that are sampled: origins and directions (R, 3); near, far and offset (R,)."""
+
+    origins: Any
+    directions: Any
+    near: Any
+    far: Any
+    offset: Any
+
+
+class SampleColumns(NamedTuple):
+    """start, extent, length (N,) and point (N, 3) of Samples."""
+
+    start: Any
+    extent: Any
+    length: Any
+    point: Any
+
+
+class RayTargets(NamedTuple):
+    """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
+
+        sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
+
+    colour          (R, 3) of the photograph, less the colour of what lies in front of the box
+    background      (R, 3) colour of what lies behind the box
+    transmittance   (R,)   of what lies in front of the box
+    opacity         (R,)   of the photograph
+    opacity_weight  of the opacity's error
+    """
+
+    colour: Any
+    background: Any
+    transmittance: Any
+    opacity: Any
+    opacity_weight: float
+
+
+class Moments(NamedTuple):
+    """Running means of the gradients by the logarithm of the optical thickness (N,) and by the coefficients (N, 3 K), without rows where there is no momentum;
+    of their squares (N,), (N,); and the number of steps that met a voxel (N,) int32."""
+
+    density: Any
+    sh: Any
+    square_density: Any
+    square_sh: Any
+    visits: Any
+
+
+class Hyperparameters(NamedTuple):
+    """Of a step.
+
+    density_rate     learning rate of the logarithm of the optical thickness
+    sh_rate          learning rate of the harmonics
+    view_share       of that for harmonics of degree 1 and above
+    decay            of the running mean of the squared gradient
+    epsilon          added to its root
+    momentum         of the running mean of the gradient; 0: RMSprop
+    total_variation  weights of the terms of `efficientnerf.backends.numba.tree_training.steps`
+    sparsity
+    entropy
+    terms            coefficients that have gradients, of each channel: the first ones; those beyond stay as they are
+    """
+
+    density_rate: float
+    sh_rate: float
+    view_share: float
+    decay: float
+    epsilon: float
+    momentum: float = 0.0
+    total_variation: float = 0.0
+    sparsity: float = 0.0
+    entropy: float = 0.0
+    terms: int = 25
