@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import statistics
 from collections.abc import Mapping, Sequence
@@ -9,7 +10,9 @@ from typing import Any
 
 from pipeline.files import Unreadable, read_json, write_json
 from pipeline.stage import Job
-from stages.artifacts import EvaluateOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
+from stages.bake.refine.refinement import usual_steps
+from stages.bake.settings import BakeSettings
 from stages.evaluate import sparse_points
 from stages.evaluate.asset import EvaluatedAsset, render_asset
 from stages.evaluate.comparison import as_shown, compare, counting, trivial
@@ -81,3 +84,12 @@ def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: Re
     depth = asset.render(view.camera, normals=False).depth
     pixels, kinds, _ = sparse_points.judged(points, scene.views.index(view), view.camera, depth, counting(truth))
     write_png(sparse_points.picture(truth.colour, depth, pixels, kinds), EvaluateOutputs(job.out).sparse_points)
+
+
+def refinement_of(bake: BakeOutputs) -> dict[str, int]:
+    """Steps that were taken, and the least that are usual for so many voxels and rays a step: a figure that is poor for want of steps asks for no other
+    remedy."""
+    report = read_json(bake.report)
+    last = json.loads(bake.log.read_text(encoding="utf-8").splitlines()[-1])
+    rays = last["rays"] or BakeSettings().refine_rays_per_batch  # 0: there was no step
+    return {"steps": report["optimisation"]["steps"], "usual_steps": usual_steps(report["voxels"], rays, 0 if "cascades" in report else None)}

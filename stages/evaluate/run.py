@@ -38,10 +38,9 @@ from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, Trai
 from stages.compiling import compiling_kernels
 from stages.evaluate.asset import EvaluatedAsset, evaluated
 from stages.evaluate.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view, load_lpips
-from stages.evaluate.judging import judge, training_figures
+from stages.evaluate.judging import judge, refinement_of, training_figures
 from stages.evaluate.memory import needed
 from stages.evaluate.mesh import FIGURES, EvaluatedMesh, load_mesh
-from stages.evaluate.refinement import refinement_of
 from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, MAX_FIELD_RAYS, EvaluateSettings, networks_of
 from stages.evaluate.sparse_points import COUNTS, observed_points
 from stages.evaluate.splats import FIGURES as SPLATS_FIGURES

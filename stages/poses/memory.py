@@ -97,7 +97,7 @@ def memory_needed(known: Known) -> Need:
     needs = [features_needed([largest] * count, own.feature_image_size, features, count_cores(), networks=own.features_model != "off"), video_needed(films)]
     if own.mask_from == FOREGROUND:
         from stages.masking.first_training import FIRST, RAYS, SIDE  # without it the stage needs no torch
-        from stages.train.memory import first_training_needed
+        from stages.train.memory import first_training_needed  # likewise
 
         needs.append(first_training_needed(count, SIDE, FIRST, RAYS))
     return max(needs, key=lambda need: need.total)
