@@ -91,7 +91,7 @@ def test_a_texture_may_be_left_out_of_it(run: Path) -> None:
 )  # fmt: skip
 def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     if not change and not more:  # what the stage has made is stale
-        monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: SimpleNamespace(fresh=False, manifest=None))
+        monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: SimpleNamespace(fresh=False, manifest=None))
     with pytest.raises(pytest.fail.Exception, match="made again"):
         export(run, "mesh.glb", chosen=settings(**change), **more)
 

@@ -8,8 +8,8 @@ import numba
 import numpy as np
 import pytest
 
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.queries import density_block
-from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, packed_pointers, sh_basis
