@@ -20,7 +20,7 @@ from efficientnerf.rendering.harmonics import basis, harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples
 from efficientnerf.sampling.strategies import Efficient, Hierarchical, Intervals, SamplingRequest, Strategy, Uniform, Valid
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.settings import TrainSettings
 
 SKY_DEGREE = 2
@@ -67,13 +67,13 @@ class Model:
     @property
     def distortion(self) -> float:
         """Weight of the distortion loss."""
-        stated = given(self.settings.distortion_loss_weight)
+        stated = resolved(self.settings.distortion_loss_weight)
         return self.space.distortion_loss_weight if stated is None else stated
 
     @property
     def num_coarse_samples(self) -> int:
         """N_c, which `model` settles."""
-        count = given(self.settings.num_coarse_samples)
+        count = resolved(self.settings.num_coarse_samples)
         assert count is not None
         return count
 
@@ -83,7 +83,7 @@ class Model:
 
     def snapped_points(self, points: Tensor) -> Tensor:
         """Points (N, 3) in grid coordinates at which the fields are queried: these, or with `train.discretise` the centres of their voxels."""
-        side = given(self.settings.discretise)
+        side = resolved(self.settings.discretise)
         return points if side is None else voxel_centres(self.space, points, side)
 
     def parameters(self) -> list[tuple[str, nn.Parameter]]:
@@ -131,7 +131,7 @@ def model(
 
     span  near and far along the view axis, world units, for `train.near_plane` and `train.far_plane`
     """
-    coarse_samples = given(settings.num_coarse_samples) or space.num_coarse_samples
+    coarse_samples = resolved(settings.num_coarse_samples) or space.num_coarse_samples
     settings = replace(settings, num_coarse_samples=coarse_samples)
     generator = torch.Generator().manual_seed(settings.seed)
     coarse, fine = _fields(settings, generator)
@@ -153,10 +153,10 @@ def _fields(settings: TrainSettings, generator: torch.Generator) -> tuple[Field,
 
 def _voxels(s: TrainSettings, space: Space, step: float, device: str) -> DensityVoxels:
     """Fresh density voxels; under the rule "maximum", valid are those whose density has an alpha above the threshold over one coarse interval."""
-    stated = given(s.occupancy_alpha_threshold)
+    stated = resolved(s.occupancy_alpha_threshold)
     alpha = space.occupancy_alpha_threshold if stated is None else stated
     return density_voxels(
-        given(s.occupancy_resolution) or space.occupancy_resolution,
+        resolved(s.occupancy_resolution) or space.occupancy_resolution,
         s.occupancy_rule,
         initial=s.occupancy_initial_density,
         beta=s.occupancy_beta,

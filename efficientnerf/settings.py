@@ -37,6 +37,6 @@ def setting(default: Any, doc: str, *, unit: str | None = None, advanced: bool =
     return dataclasses.field(default=default, metadata={"doc": doc, "unit": unit, "advanced": advanced})
 
 
-def given(value: T | Literal["auto", "off"]) -> T | None:
+def resolved(value: T | Literal["auto", "off"]) -> T | None:
     """The value, or None where it is `auto` or `off`."""
     return None if value in ("auto", "off") else value  # type: ignore[return-value]

@@ -52,7 +52,7 @@ class Foreground:
     planes: tuple[Plane, ...] = ()
 
 
-NOBODY = np.zeros((0, 3))
+NO_POINTS = np.zeros((0, 3))
 
 
 def find_foreground(
@@ -95,7 +95,7 @@ def find_subject(
     if trusted.sum() < 10:
         return None
     if not converging:
-        return Foreground(_region_of(cells.centres[trusted & (cells.distance <= PATH_FARTHEST * reach)], cells.side), cells.side, NOBODY)
+        return Foreground(_region_of(cells.centres[trusted & (cells.distance <= PATH_FARTHEST * reach)], cells.side), cells.side, NO_POINTS)
     share = cells.in_view / max(1.0, float(np.quantile(cells.in_view[trusted], 0.95)))
     centres = np.array([camera.centre for camera in cameras])
     ring = np.linalg.norm(centres[:, :2] - focus[:2], axis=1)
@@ -104,7 +104,7 @@ def find_subject(
     close = trusted & (cells.distance <= FARTHEST * reach) & (cells.nearest >= 0.1 * reach) & (inside | (not round_it))
     observed = close & (share >= OBSERVED)
     if not observed.any():
-        return Foreground(_region_of(cells.centres[trusted], cells.side), cells.side, NOBODY)
+        return Foreground(_region_of(cells.centres[trusted], cells.side), cells.side, NO_POINTS)
     planes, support, hidden = find_supports(cells, observed, close, rays_that_end(points, views, pixels, cameras), centres, reach)
     level = any(normal[2] > 0.8 for normal, _ in planes)
     candidates = close & ~support & ~hidden & (share >= REACHED)
@@ -114,7 +114,7 @@ def find_subject(
         central |= _ending_in_view(cells, subject & ~central, central, cells.trusted & ~candidates)
         subject = central if _volume(cells.centres[subject]) > MAX_BESIDE * _volume(cells.centres[central]) else subject
     if cells.central[subject].sum() < MIN_SHARE * cells.central[close].sum():
-        return Foreground(_region_of(cells.centres[observed], cells.side, level=level), cells.side, NOBODY)
+        return Foreground(_region_of(cells.centres[observed], cells.side, level=level), cells.side, NO_POINTS)
     found = with_feet(cells.centres[subject], planes)
     if not planes:
         region = _region_of(found, cells.side, level=round_it, margin=WIDE_MARGIN)

@@ -28,7 +28,7 @@ ROUND_IT = 1.3  # times the outline: what is round a wall
 MIN_UNDER = 0.5  # of what the middles of the photographs show before a plane, that stands on it
 LEVEL = 0.995  # least height of the normal of a floor or table
 FARTHEST = 1.6  # distance at which rays meet a plane over the usual distance
-FEET = 0.3  # of the subject's size, that a part of it stands above a support at most
+MAX_FOOT_HEIGHT = 0.3  # of the subject's size, that a part of it stands above a support at most
 
 Plane = tuple[np.ndarray, float]
 
@@ -181,6 +181,6 @@ def with_feet(subject: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
     feet = [subject]
     for normal, offset in planes:
         height = along(subject, normal) - offset
-        near = height <= FEET * size
+        near = height <= MAX_FOOT_HEIGHT * size
         feet.append(subject[near] - height[near, None] * normal)
     return np.concatenate(feet)

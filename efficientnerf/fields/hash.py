@@ -19,7 +19,7 @@ from efficientnerf.backends.torch.linear_chain import precision_of
 from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.rendering.harmonics import harmonics_count
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 
 COARSEST = 16  # resolution of the coarsest level
@@ -88,7 +88,7 @@ class HashField(BakeableField):
 
 def grids(s: TrainSettings) -> tuple[dict[str, int], dict[str, int]]:
     """The arguments of `level_sizes` for the coarse field and the fine one."""
-    log2_table, finest = given(s.log2_hashmap_size) or LOG2_TABLE, given(s.finest_resolution) or FINEST
+    log2_table, finest = resolved(s.log2_hashmap_size) or LOG2_TABLE, resolved(s.finest_resolution) or FINEST
     return {
         "levels": max(1, s.num_levels // 2), "log2_table": max(8, log2_table - 2), "coarsest": COARSEST, "finest": max(COARSEST, finest // 4),
     }, {"levels": s.num_levels, "log2_table": log2_table, "coarsest": COARSEST, "finest": finest}  # fmt: skip

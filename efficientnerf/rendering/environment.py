@@ -60,7 +60,7 @@ def texels_of(directions: np.ndarray, height: int) -> np.ndarray:
     return np.asarray(row * 2 * height + column)
 
 
-SURE = 4.0  # weight of a texel at which half of its colour is its own
+HALF_WEIGHT = 4.0  # weight of a texel at which half of its colour is its own
 
 
 def filled(total: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def filled(total: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> np.ndarra
 
         around = np.maximum(blurred(weight) * max(1.0, 2 * np.pi * sigma**2), 0)
         colour = np.stack([blurred(total[..., channel]) for channel in range(3)], axis=-1) * max(1.0, 2 * np.pi * sigma**2)
-        share = (around / (around + SURE))[..., None]
+        share = (around / (around + HALF_WEIGHT))[..., None]
         out = np.where(around[..., None] > 1e-9, share * colour / np.maximum(around, 1e-9)[..., None] + (1 - share) * out, out)
         if sigma < 0.5:
             return np.clip(out, 0, 1).astype(np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.settings import TrainSettings
 
 RAMP_STEPS = 100  # steps in which the learning rate rises, or the first tenth of a shorter run
@@ -81,7 +81,7 @@ def schedule_of(settings: TrainSettings, state: dict[str, Any] | None = None) ->
         tuple((int(iterations), int(step)) for iterations, step in state["aims"]),
         settings.learning_rate,
         settings.lr_final_ratio,
-        given(settings.lr_decay_steps) or 0,
+        resolved(settings.lr_decay_steps) or 0,
         settings.samples_per_pivot,
-        given(settings.early_samples_per_pivot) or 0,
+        resolved(settings.early_samples_per_pivot) or 0,
     )

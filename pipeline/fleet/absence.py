@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 LONGEST = 300.0  # seconds that a fleet waits while it has no worker; for jobs of a queue as long as it takes
-SAID = 30.0  # seconds before that is said
+REPORT_SECONDS = 30.0  # seconds before that is said
 
 
 class Absence:
@@ -16,7 +16,7 @@ class Absence:
     def note(self, *, anyone: bool, now: float) -> str | None:
         """What to say now, if anything. now: seconds, of any clock."""
         self._since = None if anyone else now if self._since is None else self._since
-        if self._since is None or now - self._since < SAID:
+        if self._since is None or now - self._since < REPORT_SECONDS:
             return None
         return f"no worker is there; one is waited for, {'as long as it takes' if self.queued else f'{LONGEST / 60:.0f} minutes'}"
 

@@ -26,8 +26,8 @@ from pipeline.text import printable
 
 Report = Callable[[dict[str, Any]], None]
 
-WRITE_SECONDS = 1.0  # between two writings of fleet.json, and TIMES as long as one takes
-TIMES = 20.0
+WRITE_SECONDS = 1.0  # between two writings of fleet.json, and WRITE_INTERVAL_RATIO as long as one takes
+WRITE_INTERVAL_RATIO = 20.0
 LOOK_SECONDS = 1.0  # between two looks for requests, and for workers that came or went
 
 
@@ -349,7 +349,7 @@ class Scheduler:
         if self._written is not None:
             self._written(self.state)
         self._changed = False
-        self._next_write = now + max(WRITE_SECONDS, TIMES * (time.monotonic() - now))
+        self._next_write = now + max(WRITE_SECONDS, WRITE_INTERVAL_RATIO * (time.monotonic() - now))
 
     def _tell(self, each: Progress, event: str, **facts: Any) -> None:
         if self._report is not None:

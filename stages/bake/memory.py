@@ -12,7 +12,7 @@ from efficientnerf.asset.file.serialisation import bytes_per_voxel, most_voxels
 from efficientnerf.asset.refinement.error_map import MAX_CELLS
 from efficientnerf.asset.refinement.fit import PATCH_SIDE
 from efficientnerf.model import Model
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import PixelRows, Pixels
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
@@ -84,7 +84,7 @@ def needed(
         "the grid": CELL * cells + BRICK_VOXEL * settings.brick_size**3 * bricks,
         "rays": (SCENE_RAY if whole else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
         "the error map": ERROR_CELL * min(MAX_CELLS, count_pixels(tuple(views)) // PATCH_SIDE),
-        "the field": 3 * 4 * parameters(m.settings) + DENSITY_VOXEL * (given(m.settings.occupancy_resolution) or 192) ** 3 // 4,
+        "the field": 3 * 4 * parameters(m.settings) + DENSITY_VOXEL * (resolved(m.settings.occupancy_resolution) or 192) ** 3 // 4,
         "libraries": libraries(device),
     })  # fmt: skip
 
@@ -125,13 +125,13 @@ def most_needed(
 
 def _finest_cells(settings: BakeSettings, m: Model, s: Scene, *, whole: bool) -> tuple[int, int]:
     """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
-    bounds, discretise = m.space.bounds, given(m.settings.discretise)
+    bounds, discretise = m.space.bounds, resolved(m.settings.discretise)
     finest = finest_choice(settings, m.settings, s).resolution
     if not whole:
         return finest, math.prod(grid_of(bounds, finest, settings.brick_size)[0])
-    count = given(settings.cascades) or MAX_CASCADES
+    count = resolved(settings.cascades) or MAX_CASCADES
     cells = sum(math.prod(shape) for shape, _, _ in grids_of(bounds, finest, settings.brick_size, count, None))
-    stated = given(settings.resolution) or given(settings.max_resolution) or discretise
+    stated = resolved(settings.resolution) or resolved(settings.max_resolution) or discretise
     return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
@@ -168,6 +168,6 @@ def _before(known: Known) -> tuple[int, bool, float, int, int, Need]:
     own, inputs = known.settings["bake"], known.inputs(BakeInputs)
     m, s = load_renderer(inputs.train.folder).model, load_scene(inputs.poses.folder, inputs.train.folder)
     views, whole = views_of(s, "train"), constant_background(s) is None
-    mib = size_limits(own, s, known.device, count_cores(), whole=whole, discretise=given(m.settings.discretise))[1]
+    mib = size_limits(own, s, known.device, count_cores(), whole=whole, discretise=resolved(m.settings.discretise))[1]
     _, voxels, at_most = most_needed(own, m, s, views, channels_of(inputs.poses.folder, views), mib, whole, known.device)
     return m.fine.degree, whole, mib, min(own.visibility_rays, count_pixels(views)), voxels, at_most(voxels, stored=False)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.capture.forward_facing import ForwardFacing
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.errors import UsageError
 from stages.bake.settings import BakeSettings
 from stages.io.scene import Scene
@@ -120,9 +120,9 @@ def size_limits(settings: BakeSettings, s: Scene, device: str, cores: int, *, wh
     """MiB that an asset may have; and those that its voxels are chosen by: where the size is left to us, no more than can be refined in bake.time_budget. A
     packed asset has no more voxels than the default size would give it, unless bake.resolution or train.discretise is stated: bytes beyond
     that go into finer codes. See docs/experiments/packed.md."""
-    packed, seconds = settings.layout == "packed", given(settings.time_budget)
-    mib = budget_of(s, given(settings.max_mib), packed=packed)
-    if settings.max_mib != "auto" and packed and (given(settings.resolution) or discretise) is None:
+    packed, seconds = settings.layout == "packed", resolved(settings.time_budget)
+    mib = budget_of(s, resolved(settings.max_mib), packed=packed)
+    if settings.max_mib != "auto" and packed and (resolved(settings.resolution) or discretise) is None:
         return mib, min(mib, budget_of(s, None, packed=True))
     if seconds is None or settings.max_mib != "auto" or device != "cpu":
         return mib, mib

@@ -25,7 +25,7 @@ from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.asset.components import foreground_bricks
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.model import Model
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import Pixels
 from pipeline.errors import StageFailed
 from pipeline.stage import Job
@@ -65,8 +65,8 @@ def run(job: Job) -> None:
     refuse_nerf(m.settings)
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
-    mib, views = _size_limit(job, s, whole=whole, discretise=given(m.settings.discretise)), scene.views_of(s, "train")
-    most = given(settings.max_mib) or mib  # of the file
+    mib, views = _size_limit(job, s, whole=whole, discretise=resolved(m.settings.discretise)), scene.views_of(s, "train")
+    most = resolved(settings.max_mib) or mib  # of the file
     pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, whole=whole), job.inputs["train"])
     plan = _plan(job, m, s, pixels, mib, whole=whole)
     capacity = room_of(settings, m, plan.grids, mib, environment=whole)
@@ -98,7 +98,7 @@ def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> f
     """MiB that voxels are chosen by; where the size is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other
     cores."""
     settings: BakeSettings = job.settings
-    seconds = given(settings.time_budget)
+    seconds = resolved(settings.time_budget)
     mib, timed = size_limits(settings, s, job.device, count_cores(), whole=whole, discretise=discretise)
     if seconds is None or settings.max_mib != "auto" or job.device != "cpu":
         return timed

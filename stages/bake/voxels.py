@@ -15,7 +15,7 @@ from efficientnerf.asset.file import serialisation
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import NdcSpace, Space
 from efficientnerf.model import Model
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job
@@ -42,7 +42,7 @@ def well_seen_views(count: int) -> int:
 
 def voxel_space(job: Job, m: Model) -> Space:
     """The field's space, in a frame where voxels are cubes."""
-    depth, discretise, space = given(job.settings.ndc_voxel_depth), given(m.settings.discretise), m.space
+    depth, discretise, space = resolved(job.settings.ndc_voxel_depth), resolved(m.settings.discretise), m.space
     if not isinstance(space, NdcSpace):
         if depth is not None:
             job.warn("bake.ndc_voxel_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes")
@@ -64,7 +64,7 @@ def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mi
         return serialisation.most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, shape, brick)
 
     finest = choice = finest_choice(settings, m.settings, s)
-    fixed = (given(settings.resolution) or given(m.settings.discretise)) is not None
+    fixed = (resolved(settings.resolution) or resolved(m.settings.discretise)) is not None
     least = finest.resolution if fixed else MIN_RESOLUTION
     refuse_without_room(settings, mib, least, room(least), environment=False)
     if fixed:
@@ -119,11 +119,11 @@ def seen_by_few(job: Job, s: Scene, ndc: Ndc, points: np.ndarray) -> np.ndarray:
 
 def finest_choice(settings: BakeSettings, trained: TrainSettings, s: Scene) -> Choice:
     """The resolution that is stated, or else the finest in question."""
-    stated: int | None = given(settings.resolution)
-    discretise: int | None = given(trained.discretise)
+    stated: int | None = resolved(settings.resolution)
+    discretise: int | None = resolved(trained.discretise)
     if (fixed := stated or discretise) is not None:
         return Choice(fixed, "bake.resolution" if stated else "train.discretise")
-    return finest_resolution(s, given(settings.max_resolution))
+    return finest_resolution(s, resolved(settings.max_resolution))
 
 
 def _visibility(job: Job, m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visibility:

@@ -34,7 +34,7 @@ from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_foreground
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import Pixels
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.stage import Job
@@ -78,7 +78,7 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
 def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float) -> Plan:
     """The cascades, their voxels, the region and the environment."""
     settings: BakeSettings = job.settings
-    stated, discretise = given(settings.resolution), given(m.settings.discretise)
+    stated, discretise = resolved(settings.resolution), resolved(m.settings.discretise)
     fixed = stated or discretise
     least = fixed or MIN_RESOLUTION
     # Before the field is rendered the region is not known: only that its longest side has so many voxels.
@@ -89,7 +89,7 @@ def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Spa
     region = region_of(samples, pixels, s, job.inputs["poses"])
     # A field that was trained on the voxels of its box is baked on these.
     bounds = np.asarray(m.space.bounds if discretise else region.bounds, np.float64)
-    count = cascades_needed(samples, bounds, given(settings.cascades))
+    count = cascades_needed(samples, bounds, resolved(settings.cascades))
     last: tuple[int, list[Grid], list[Visibility], list[np.ndarray]] | None = None
 
     def grids_at(resolution: int) -> list[Grid]:
@@ -112,7 +112,7 @@ def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Spa
     if fixed is not None:
         choice = Choice(fixed, "bake.resolution" if stated else "train.discretise")
     else:
-        finest = finest_of_cascades(s, bounds, count, settings.brick_size, given(settings.max_resolution))
+        finest = finest_of_cascades(s, bounds, count, settings.brick_size, resolved(settings.max_resolution))
         choice = affordable_resolution(finest, lambda at: sum(map(len, at_resolution(at)[3])), lambda at: int(OVERSHOOT * room(at)))
     _, grids, seen, indices = at_resolution(choice.resolution)
     indices = heaviest_of(job, seen, grids, indices, MAX_OVERSHOOT * room(choice.resolution))
@@ -210,7 +210,7 @@ def keep_clear(job: Job, m: Model, s: Scene, indices: np.ndarray, grid: Grid) ->
     cameras, near = [view.camera for view in views], [view.near for view in views]
     refuted = filled is not None and len(filled) > 0 and close_to_path(filled, cameras, near, BAKED_CLEARANCE, filled).mean() > MAX_CONTRADICTED
     _, voxel, low = grid
-    min_views = given(m.settings.min_views) if m.space.contracted else None
+    min_views = resolved(m.settings.min_views) if m.space.contracted else None
     kept = []
     for at in range(0, len(indices), CENTRES_PER_BLOCK):
         job.safe_point()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.surface.shading import AT_ONCE
 from stages.artifacts import EvaluateInputs
 from stages.evaluate.mesh import mesh_bytes
@@ -29,7 +29,7 @@ FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose 
 def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
     """What the stage evaluate takes."""
     cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
-    scale = given(settings.field_image_scale)
+    scale = resolved(settings.field_image_scale)
     most = max(camera.width * camera.height for camera in cameras)
     rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
     if settings.strips == "on":
@@ -54,4 +54,4 @@ def space_needed(known: Known) -> int:
     own = known.settings["evaluate"]
     pixels = [view.camera.width * view.camera.height for view in evaluation_views(load(known.inputs(EvaluateInputs).poses.folder))[0]]
     strips, thumbnails = STRIPS * max(pixels), sum(min(each, THUMBNAIL) for each in pixels)
-    return SHEET + WRITTEN * (strips + PICTURES * thumbnails) + (given(own.captured_path_frames) or 0) * max(pixels) // 4
+    return SHEET + WRITTEN * (strips + PICTURES * thumbnails) + (resolved(own.captured_path_frames) or 0) * max(pixels) // 4

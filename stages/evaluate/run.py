@@ -31,7 +31,7 @@ import numpy as np
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.field_renderer import FieldRenderer
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.files import read_json, write_json
 from pipeline.stage import Job
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of
@@ -98,11 +98,11 @@ def evaluate(
         job.warn("the scene has no test or validation views: the metrics are of views that training saw")
     load_field, warn = cache(load_field), once(job.warn)
     drawn = evenly_spaced(len(views), None if settings.field_views == "all" else settings.field_views)
-    stride = _field_stride([views[k] for k in drawn], given(settings.field_image_scale))
+    stride = _field_stride([views[k] for k in drawn], resolved(settings.field_image_scale))
     surrounded = constant_background(scene) is not None or asset.inner is not None
     rest = None if surrounded else stride_for([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
     composited = surrounded and constant_background(scene) is None
-    perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in networks_of(settings)}
+    perceptual = {f"lpips_{network}": load_lpips(network, resolved(settings.lpips_weights)) for network in networks_of(settings)}
     points = observed_points(job.inputs[PosesOutputs.stage], scene, asset.reach)
     taken = as_taken(job.inputs[TrainOutputs.stage])
     figures, others = [], [name for name, known in (("splats", splats), ("sparse_points", points)) if known is not None]
@@ -127,7 +127,7 @@ def evaluate(
                       splats=None if splats is None else splats.facts, refinement=refinement, train=train)  # fmt: skip
     write_json(EvaluateOutputs(job.out).metrics, metrics)
     _write_sheet(metrics, drawn, job)
-    frames = given(settings.captured_path_frames)
+    frames = resolved(settings.captured_path_frames)
     if frames is not None:
         write_captured_path(asset, tree, scene, frames, job)
     job.say(in_words(metrics))

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Off, PositiveInt, given, setting
+from efficientnerf.settings import Auto, Off, PositiveInt, resolved, setting
 from pipeline.stage import ByName, Stage
 from stages.artifacts import EvaluateInputs, needs_of
 from stages.evaluate.lpips_weights import find_weights
@@ -53,7 +53,7 @@ def check(settings: Mapping[str, Any]) -> None:
     """UsageError where weights of LPIPS are missing."""
     own: EvaluateSettings = settings["evaluate"]
     for network in networks_of(own):
-        find_weights(network, given(own.lpips_weights))
+        find_weights(network, resolved(own.lpips_weights))
 
 
 STAGE = Stage(

@@ -19,7 +19,7 @@ from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import Space, space_from
 from efficientnerf.model import Model, model, restore, state_of
 from efficientnerf.rendering.field_renderer import FieldRenderer
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.exposure.model import Exposure
 from efficientnerf.training.schedule import Schedule
 from efficientnerf.training.settings import TrainSettings
@@ -169,7 +169,7 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
 
 def _check_sizes(tensors: dict[str, Tensor], settings: TrainSettings, space: Space) -> None:
     """ValueError where the large tensors are not of the sizes that the settings state: the model would take that memory before it is filled."""
-    side = given(settings.occupancy_resolution) or space.occupancy_resolution
+    side = resolved(settings.occupancy_resolution) or space.occupancy_resolution
     expected: dict[str, tuple[int, ...]] = {"voxels": (side, side, side)}
     if settings.field == "hash":
         for name, grid in zip(("coarse", "fine"), grids(settings), strict=True):

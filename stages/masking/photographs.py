@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.cores import count_cores
@@ -20,7 +20,7 @@ from stages.io.pictures import UnreadableImage, read_header
 from stages.io.silhouettes import SmallPictures
 from stages.masking.background import silhouettes_with_surroundings
 from stages.masking.made import made_masks, masks_by_network
-from stages.masking.polarity import SAID, kept_white
+from stages.masking.polarity import INVERTED_NOTICE, kept_white
 from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
 from stages.sfm.gps import STATED, with_gps, with_stated_cameras
@@ -91,7 +91,7 @@ def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[st
         other = replace(capture, photos=tuple(replace(photo, mask=inverted.get(photo.camera.name)) for photo in capture.photos))
         if not _fit(other):
             return capture
-    job.say(SAID)
+    job.say(INVERTED_NOTICE)
     return other
 
 
@@ -120,7 +120,7 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
     source, settings = job.source, job.settings
     assert source is not None
     networks = given_networks(settings.features_model, settings.matcher_model)
-    features, sizes = given(settings.max_features) or features_for(len(paths)), []
+    features, sizes = resolved(settings.max_features) or features_for(len(paths)), []
     for path in paths.values():
         job.safe_point()
         with contextlib.suppress(UnreadableImage):  # said where it is read

@@ -23,7 +23,7 @@ from stages.io.working_images import mask_levels
 from stages.masking.background import photo_without_camera
 
 INVERTED = "masks keep what is black: what is white in them is left out"
-SAID = INVERTED + "; --set poses.mask_polarity=white takes them the other way round"
+INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white takes them the other way round"
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def capture_kept_white(job: Job, capture: Capture) -> Capture:
         flipped = replace(capture, photos=tuple(replace(photo, mask_ignore="white") for photo in photos))
         if share_that_fits(flipped, Silhouettes(masks=True), SmallPictures()) < MIN_AGREEING:
             return capture
-    job.say(SAID if polarity == "auto" else INVERTED)
+    job.say(INVERTED_NOTICE if polarity == "auto" else INVERTED)
     masks = _turned_round(job, photos)
     return replace(capture, photos=tuple(replace(photo, mask=masks.get(photo.camera.name, photo.mask)) for photo in capture.photos))
 

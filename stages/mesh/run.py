@@ -10,7 +10,7 @@ import numpy as np
 
 from efficientnerf.asset.format import load
 from efficientnerf.asset.tree import NerfTree, Region
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.surface.agreement import AssetView
 from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import Mesh, face_areas, face_volumes, moved, topology
@@ -54,7 +54,7 @@ def mesh_of(
     seen, fused = asset_views(tree, progress)
     if views is not None:
         views += seen
-    threshold = given(settings.density_threshold)
+    threshold = resolved(settings.density_threshold)
 
     def tick() -> None:
         progress(1, 1, PARTS[0])

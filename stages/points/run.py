@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from efficientnerf.asset.format import load
 from efficientnerf.asset.tree import NerfTree, Region
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import PointCloud
 from efficientnerf.surface.nested import scene_points
@@ -41,19 +41,19 @@ def points_of(
         cloud = scene_points(
             tree,
             settings.num_points,
-            level_of(tree, given(settings.density_threshold), views, tick),
+            level_of(tree, resolved(settings.density_threshold), views, tick),
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             seed=settings.seed,
             viewpoints=orbit_points(tree.metadata),
             shown=shown_by(views, float(tree.voxel), tick),
-            views=fused if given(settings.density_threshold) is None else (),
+            views=fused if resolved(settings.density_threshold) is None else (),
             region=region,
             progress=progress,
         )
     except NoSurface as error:
         failure = StageFailed if settings.density_threshold == "auto" else UsageError
-        raise failure(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
+        raise failure(f"points: {error}. {remedy('points', resolved(settings.density_threshold))}") from error
     back = frame.world_from_capture.inverse()
     return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
 

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.errors import PipelineError
 from pipeline.stage import Job
 from stages.cores import count_cores
@@ -93,7 +93,7 @@ def memory_needed(known: Known) -> Need:
     films = [] if pictures else _films(known.sources)
     count = len(pictures) or own.frames
     largest = max([*sizes, *films], key=lambda size: size[0] * size[1], default=(0, 0))
-    features = given(own.max_features) or features_for(count)
+    features = resolved(own.max_features) or features_for(count)
     needs = [features_needed([largest] * count, own.feature_image_size, features, count_cores(), networks=own.features_model != "off"), video_needed(films)]
     if own.mask_from == FOREGROUND:
         from stages.masking.first_training import FIRST, RAYS, SIDE  # without it the stage needs no torch
@@ -114,7 +114,7 @@ def space_needed(known: Known) -> int:
     images = WRITTEN * mean * count
     if pictures:
         images = min(images, len(sides) * AS_PNG * sum(sizes_below(pictures)))
-    return int(images) + (FEATURE * (given(own.max_features) or features_for(count)) * count if found else 0)
+    return int(images) + (FEATURE * (resolved(own.max_features) or features_for(count)) * count if found else 0)
 
 
 def _pictures(sources: Sequence[Path]) -> tuple[list[Path], list[tuple[int, int]]]:

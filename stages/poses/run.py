@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import resized
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
@@ -63,7 +63,7 @@ def run(job: Job) -> None:
     judged = capture  # by all sparse points that its cameras were found with
     capture = with_points_of_object(capture, small)
     framed = training_frame.find_training_frame(
-        capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
+        capture, up=settings.up, box=resolved(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
     )
     _say_what_is_cut(framed.facts.get("silhouettes_cut", ()), warn)
     splits = assign_splits(capture.photos, settings.test_every, warn)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, PositiveInt, given, setting
+from efficientnerf.settings import Auto, PositiveInt, resolved, setting
 from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
 from stages.formats import importers
@@ -116,7 +116,7 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
 
 def check(settings: Mapping[str, Any]) -> None:
     """UsageError where a crop box is stated that has no volume."""
-    box = given(settings["poses"].crop_box)
+    box = resolved(settings["poses"].crop_box)
     if box is not None and min(abs(low - high) for low, high in zip(box[:3], box[3:], strict=True)) < LEAST_SIDE:
         raise UsageError(f"poses.crop_box={list(box)}: has no volume; expected x y z of one corner, and of the opposite one.")
 

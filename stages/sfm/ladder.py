@@ -46,7 +46,7 @@ KEPT = 0.02  # of the matches, that fewer may agree when sub-models are merged: 
 SPREAD = 1.08  # between the focal lengths of single photographs, from which they may have been zoomed
 APART = 0.009  # of the longest side, between the principal points of single photographs, from which they may have been cropped
 CLOSER, SAME = 0.85, 0.995  # times the reprojection error, to which principal points of their own must lower it; and the score, which is hardly lower then
-LEFT = 0.5  # of the matches that disagreed, that may disagree with a focal length each: more parameters fit anything a little better
+MAX_STILL_DISAGREEING = 0.5  # of the matches that disagreed, that may disagree with a focal length each: more parameters fit anything a little better
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> Non
     copy_with_own_cameras(climb.found.work, place, climb.images)
     models = mapping.sub_models(place, climb.images, seed, mapping.DEFAULTS, **quiet)
     if zoomed:
-        climb.tried(EACH, place, models, least=1 - LEFT * (1 - climb.agreement))
+        climb.tried(EACH, place, models, least=1 - MAX_STILL_DISAGREEING * (1 - climb.agreement))
     if cropped and models and climb.found.rung != EACH:
         models[0] = zoom.with_principal_points(models[0], quiet["safe_point"])
         closer = models[0].compute_mean_reprojection_error() < CLOSER * best.compute_mean_reprojection_error()

@@ -18,7 +18,7 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, attached, copy_rows, database_path, pair_id_of, record
 
 GUIDED_RATIO = 0.88  # of the distances of the two best; COLMAP's own is 0.8
-LOOK = 0.1  # seconds between two looks at the workers
+POLL_SECONDS = 0.1  # seconds between two looks at the workers
 Block = Sequence[tuple[int, int]]  # of image ids, the smaller first
 
 
@@ -67,7 +67,7 @@ def match(work: Path, blocks: Mapping[str, Block], *, seed: int, guided: bool, w
         for thread in threads:
             while thread.is_alive():
                 safe_point()
-                thread.join(LOOK)
+                thread.join(POLL_SECONDS)
                 while counts:
                     more(counts.pop(0))
     finally:

@@ -34,7 +34,7 @@ _BOOTSTRAP = "import sys; sys.path[:] = sys.argv[1:]; from stages.sfm.child impo
 _HANDLED = (signal.SIGINT, signal.SIGTERM)
 _TAIL_BYTES = 16384  # of the child's standard error that are kept
 _SHOWN_LINES, _SHOWN_CHARACTERS = 3, 240
-LOOK = 0.2  # seconds between two looks whether to stop, while the child says nothing
+POLL_SECONDS = 0.2  # seconds between two looks whether to stop, while the child says nothing
 GRACE = 1.2  # seconds that the child has to come to a safe point, once it was asked to stop
 _FRAMES = (" ", "\t", "*** ", "PC: @", "Current thread", "Thread 0x", "Stack (most", "Extension modules")  # beginnings of lines of a stack trace
 
@@ -103,7 +103,7 @@ class _Child:
         """The next message; None once the child has ended. `idle` is called again and again until then."""
         while (end := self._said.find(b"\n", self._looked)) < 0:
             self._looked = len(self._said)
-            while not self._is_readable(LOOK):
+            while not self._is_readable(POLL_SECONDS):
                 idle()
             if not (some := self._read()):
                 return None  # with half a line, or none

@@ -15,7 +15,7 @@ import numpy as np
 from efficientnerf.asset.format import load
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.splats import rendering
 from efficientnerf.splats.build import Budget, NothingToShow, gaussians_of_asset
 from efficientnerf.splats.gaussians import Gaussians
@@ -63,7 +63,7 @@ def gaussians_of(
 
 def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
     """What Gaussians are made and fitted with, for pictures of so many pixels each."""
-    steps = given(settings.iterations)
+    steps = resolved(settings.iterations)
     if steps is None:
         steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, MOST_STEPS))
     return Budget(most_gaussians(settings, pixels), settings.sh_degree, steps, settings.seed)

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.settings import TrainSettings
 from stages.scratch import Warn, note, noted, unusable
@@ -144,5 +144,5 @@ def training_budget(
         found = None
     state = msgspec.to_builtins(found) if found else {"iterations": UNKNOWN, "hold": warmup + TIMED, "aims": []}
     return Budget(
-        given(settings.time_budget) or 0.0, schedule_of(settings, state), warmup, spent, clock, lambda schedule: note(path, schedule.state())
+        resolved(settings.time_budget) or 0.0, schedule_of(settings, state), warmup, spent, clock, lambda schedule: note(path, schedule.state())
     )  # fmt: skip

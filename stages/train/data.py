@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import SparseDepthRays
@@ -78,7 +78,7 @@ def stated_planes(s: Scene, settings: TrainSettings) -> tuple[float, float]:
     if s.contracted:
         raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
     refuse_planes_out_of_order(settings)
-    near, far = given(settings.near_plane), given(settings.far_plane)
+    near, far = resolved(settings.near_plane), resolved(settings.far_plane)
     assert near is not None
     assert far is not None
     return near * float(s.world_from_capture.scale), far * float(s.world_from_capture.scale)

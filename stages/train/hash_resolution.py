@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 from stages.bake.resolution import ndc_pixel
 from stages.io.field_file import space_of
@@ -38,7 +38,7 @@ def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSett
     log2_table = int(np.clip(round(entries), LOG2_TABLE, MAX_LOG2_TABLE))
     return replace(
         settings,
-        log2_hashmap_size=given(settings.log2_hashmap_size) or log2_table,
-        finest_resolution=given(settings.finest_resolution) or finest,
-        num_coarse_samples=given(settings.num_coarse_samples) or space_of(s).num_coarse_samples,
+        log2_hashmap_size=resolved(settings.log2_hashmap_size) or log2_table,
+        finest_resolution=resolved(settings.finest_resolution) or finest,
+        num_coarse_samples=resolved(settings.num_coarse_samples) or space_of(s).num_coarse_samples,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from efficientnerf.fields.hash import FEATURES, grids, level_sizes
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.spaces import Space, space_from
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE, PixelRows
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
@@ -93,12 +93,12 @@ def needed(settings: TrainSettings, views: Sequence[View], channels: int, space:
     """
     pixels = pixels_needed(views, channels, stored=stored)
     reading = pixels["reading images"] + pixels["directions of pixels"]
-    intervals = space.max_intervals(space.sampled_length(None) / (given(settings.num_coarse_samples) or space.num_coarse_samples))
+    intervals = space.max_intervals(space.sampled_length(None) / (resolved(settings.num_coarse_samples) or space.num_coarse_samples))
     return Need({
         PIXELS: pixels[PIXELS],
         "a step's samples, or reading images": max(samples_of(settings, intervals) * sample_bytes(settings), reading),
         "parameters and checkpoints": 4 * (TABLES + SAVED) * parameters(settings),
-        "density voxels": DENSITY_VOXEL * (given(settings.occupancy_resolution) or space.occupancy_resolution) ** 3,
+        "density voxels": DENSITY_VOXEL * (resolved(settings.occupancy_resolution) or space.occupancy_resolution) ** 3,
         "sparse points": POINTS * points + OBSERVATION * min(MOST_OBSERVATIONS, points // 8),
         "libraries": libraries(device),
     })  # fmt: skip
@@ -149,7 +149,7 @@ def space_needed(known: Known) -> int:
     views, own, space = _before(known)
     pixels = CHANNELS * count_pixels(views)
     saved = KEPT if own.time_budget != "off" else min(KEPT, 1 + (own.iterations - 1) // own.checkpoint_every)
-    voxels = WRITTEN_VOXEL * (given(own.occupancy_resolution) or space.occupancy_resolution) ** 3
+    voxels = WRITTEN_VOXEL * (resolved(own.occupancy_resolution) or space.occupancy_resolution) ** 3
     stored = pixels if known.memory is not None and pixels > known.memory // 2 else 0
     return (WRITTEN + saved * CHECKPOINT) * parameters(own) + (1 + saved) * voxels + stored + known.pictures()
 

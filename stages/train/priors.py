@@ -20,7 +20,7 @@ import torch
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import Model
 from efficientnerf.sampling.occupancy import mask_cells
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.framing.near_planes import reliable_points
@@ -80,7 +80,7 @@ def _cells_of_priors(
     m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None
 ) -> Iterator[tuple[str, np.ndarray]]:
     """The names of the priors that a scene calls for, and the density voxels (D, D, D) bool that each masks."""
-    few, side = given(m.settings.min_views) if m.space.contracted else None, m.voxels.side
+    few, side = resolved(m.settings.min_views) if m.space.contracted else None, m.voxels.side
     if few is not None:
         yield MIN_VIEWS, cells_below_min_views(m.space, cameras, few, side, masks)
     if m.space.contracted:

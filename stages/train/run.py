@@ -25,7 +25,7 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import model
 from efficientnerf.rendering.field_renderer import FieldRenderer
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training import loop
 from efficientnerf.training.loop import Trainer
 from efficientnerf.training.readback import AsyncOccupancy
@@ -77,7 +77,7 @@ def trained(job: Job) -> bool:
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
     render = partial(colours_seen, FieldRenderer(m, near, far))
-    previews = Previews(render, m.background, folder, s, job.work, given(settings.preview_every))
+    previews = Previews(render, m.background, folder, s, job.work, resolved(settings.preview_every))
     previews.draw_when_due(t.step)
     budget = begin_budget(job, t, watch.seconds + spent + clock() - began)
     fails = partial(watch.begins_again, render, pixels, partial(checkpoints.save, t, log))

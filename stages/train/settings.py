@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
@@ -15,7 +15,7 @@ from stages.artifacts import TrainInputs, TrainOutputs, needs_of
 def refuse_planes_out_of_order(settings: TrainSettings) -> None:
     """UsageError where one of train.near_plane and train.far_plane is stated without the other, for N_c samples lie between both; or where they are not in
     order."""
-    near, far = given(settings.near_plane), given(settings.far_plane)
+    near, far = resolved(settings.near_plane), resolved(settings.far_plane)
     if near is None and far is None:
         return
     if near is None or far is None or near >= far:

@@ -9,7 +9,7 @@ from typing import Any
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.stage import Job
 from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of
 from stages.compiling import compiling_kernels
@@ -37,7 +37,8 @@ def cameras_of(tree: NerfTree, s: TurntableSettings, warn: Warn = lambda text: N
     """The cameras of the turntable's frames; `tree` has the interface of a NerfTree, with its region. A warning for each setting that their path has no use
     for."""
     return turntable_cameras(
-        tree, frames=s.frames, width=s.width, height=s.height, elevation=given(s.elevation), radius=given(s.radius), fov=given(s.fov), sway=given(s.sway),
+        tree, frames=s.frames, width=s.width, height=s.height, elevation=resolved(s.elevation), radius=resolved(s.radius), fov=resolved(s.fov),
+        sway=resolved(s.sway),
         path=s.path, surroundings=s.region == "all" and tree.region is not None,
         unused=lambda name, path: warn(f"turntable.{name}={getattr(s, name):g} has no effect: the camera's path is {path} (turntable.path={s.path})"),
     )  # fmt: skip

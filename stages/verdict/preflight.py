@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from pipeline.errors import BadInput
 from stages.formats import importers
 from stages.formats.importers.photographs import photographs
@@ -34,7 +34,7 @@ from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
 from stages.train.memory import first_training_needed
 from stages.verdict import looks, run_forecast
 from stages.verdict.grades import GRADES
-from stages.verdict.verdict import FEW, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, worded, zooms
+from stages.verdict.verdict import FEW, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, plural, zooms
 
 SIDE = 560  # px, longest side of the pictures that overlap is told on
 FEATURES = 800  # of a picture
@@ -219,7 +219,7 @@ def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) ->
     found = []
     lost = tuple(names[i] for group in groups[1:] for i in group)
     if lost:
-        words = worded(len(lost), "overlap with no other, or only among themselves", "overlaps with no other")
+        words = plural(len(lost), "overlap with no other, or only among themselves", "overlaps with no other")
         sentence = f"{len(lost)} of {len(names)} photographs that were looked at {words}: {abbreviated(list(lost))}."
         grade = "failed" if len(groups[0]) < MIN_IMAGES else "poor" if share < 0.5 else "usable" if share < 0.9 else "good"
         found.append(Problem("overlap", grade, sentence, MORE_PHOTOGRAPHS, lost))
@@ -260,11 +260,11 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
     if unreadable:
         which = abbreviated([f"{name} {why}" for name, why in unreadable])
         grade = "usable" if len(unreadable) > 0.1 * (len(small) + len(unreadable)) else "good"
-        sentence = f"{len(unreadable)} {worded(len(unreadable), 'photographs', 'photograph')} cannot be read: {which}."
+        sentence = f"{len(unreadable)} {plural(len(unreadable), 'photographs', 'photograph')} cannot be read: {which}."
         found.append(Problem("unreadable", grade, sentence, "Copy or convert them again.", tuple(dict(unreadable))))
     if count < FEW:
         grade = "failed" if count < MIN_IMAGES else "poor" if count < 6 else "usable"
-        sentence = f"There {worded(count, 'are', 'is')} only {count} {worded(count, 'photographs', 'photograph')}."
+        sentence = f"There {plural(count, 'are', 'is')} only {count} {plural(count, 'photographs', 'photograph')}."
         found.append(Problem("few", grade, sentence, "20 or more all round a subject are better."))
     reduced = tuple(name for name, each in small.items() if TINY <= max(each.size) < SMALL)
     if len(reduced) > 0.5 * len(small):
@@ -288,7 +288,7 @@ def forecast(
     joined  share of the photographs that overlap, in the largest component
     """
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
-    features = given(settings.max_features) or ladder.features_for(count)
+    features = resolved(settings.max_features) or ladder.features_for(count)
     before, rgb = time.thread_time(), np.zeros((1, 1, 3), np.uint8)
     with contextlib.suppress(UnreadableImage):
         rgb = read_photo(files[first], side).rgb

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from stages.bake.refine.refinement import usual_steps
 from stages.bake.resolution import MAX_MIB
 from stages.memory.need import libraries
 
 SLOWER = 1.5  # by `preflight.REFERENCE`, of the machine that the processor seconds below were taken on
-ALONE = 0.28  # of a stage's processor seconds, on one core
+SERIAL_SHARE = 0.28  # of a stage's processor seconds, on one core
 
 A_TRAIN_STEP = 0.062  # of 65,536 samples
 A_REFINE_STEP, RAYS_A_STEP = 0.33, 32768
@@ -41,7 +41,7 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
     train, bake, turntable = settings["train"], settings["bake"], settings["turntable"]
     if train.field != "hash" or train.sample_batch_size == "off":
         return {}
-    steps = given(bake.refine_steps)
+    steps = resolved(bake.refine_steps)
     if steps is None:
         steps = usual_steps(_voxels(bake), bake.refine_rays_per_batch, int((1 - TEST_SHARE) * 1e6 * megapixels) if whole else None)
     frames = turntable.frames * turntable.width * turntable.height * turntable.supersample**2 / 1e6
@@ -54,10 +54,10 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
         "turntable": A_TURNTABLE + A_TURNTABLE_MEGAPIXEL * frames,
         "points": POINTS,
     }
-    scale = (ALONE + (1 - ALONE) / threads) * slower / SLOWER
+    scale = (SERIAL_SHARE + (1 - SERIAL_SHARE) / threads) * slower / SLOWER
     found = {stage: scale * seconds for stage, seconds in processor.items()}
     for stage in ("train", "bake"):
-        budget = given(settings[stage].time_budget)
+        budget = resolved(settings[stage].time_budget)
         found[stage] = found[stage] if budget is None else budget
     return {stage: round(seconds, 1) for stage, seconds in found.items()}
 
@@ -69,7 +69,7 @@ def bytes_of(settings: Mapping[str, Any]) -> int:
 
 def _voxels(bake: Any) -> int:
     """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.budget_of`)."""
-    packed, stated = bake.layout == "packed", given(bake.max_mib)
+    packed, stated = bake.layout == "packed", resolved(bake.max_mib)
     usual = MAX_MIB / 3 if packed else MAX_MIB
     mib = usual if stated is None else min(stated, usual) if packed and bake.resolution == "auto" else stated
     return int(mib * 2**20 / (PACKED_BYTES_A_VOXEL if packed else BYTES_A_VOXEL))

@@ -94,7 +94,7 @@ class Verdict:
         return f"Cameras: {self.grade}; {', '.join(words)}."
 
 
-def worded(count: int, many: str, one: str) -> str:
+def plural(count: int, many: str, one: str) -> str:
     """The words that go with a number."""
     return one if count == 1 else many
 
@@ -165,7 +165,7 @@ def _of_registration(capture: Capture, registered: int, total: int, in_folder: i
             sentence = f"The model that was read has cameras of {registered} of the {in_folder} photographs in the folder."
             found.append(Problem("few of the folder", "poor" if share < 0.5 else "usable", sentence, remedy, lost))
     elif lost:
-        sentence = f"{len(lost)} of {total} photographs {worded(len(lost), 'have', 'has')} no camera: {abbreviated(list(lost))}."
+        sentence = f"{len(lost)} of {total} photographs {plural(len(lost), 'have', 'has')} no camera: {abbreviated(list(lost))}."
         grade = "poor" if share < 0.5 else "usable" if share < 0.95 else "good"
         found.append(Problem("not registered", grade, sentence, MORE_PHOTOGRAPHS, lost))
     found += _of_parts(capture)
@@ -180,7 +180,7 @@ def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
     found = []
     bare = tuple(name for name, reason in capture.rejected if WITHOUT_TEXTURE in reason)
     if len(bare) > SHARE * (len(capture.photos) + len(capture.rejected)):
-        words = worded(len(bare), "photographs show hardly a feature; they are", "photograph shows hardly a feature; it is")
+        words = plural(len(bare), "photographs show hardly a feature; they are", "photograph shows hardly a feature; it is")
         sentence = f"{len(bare)} {words} {WITHOUT_TEXTURE}: {abbreviated(list(bare))}."
         remedy = "Photograph a subject with texture in good light; put a patterned cloth or newspaper under a plain one."
         found.append(Problem("without texture", "poor", sentence, remedy, bare))
@@ -200,11 +200,11 @@ def _of_lens(capture: Capture) -> list[Problem]:
         groups = zooms({camera.name: 1000.0 * camera.intrinsics["fx"] / max(camera.width, camera.height) for camera in cameras})
         rest = tuple(sorted(name for _, names in groups[1:] for name in names))
         words = ", ".join(f"{len(names)} at {focal:.0f} px" for focal, names in groups)
-        sentence = f"The zoom changed between photographs (of a longest side of 1000 px {words}); another than most {worded(len(rest), 'have', 'has')}"
+        sentence = f"The zoom changed between photographs (of a longest side of 1000 px {words}); another than most {plural(len(rest), 'have', 'has')}"
         found = Problem("zoom", "good", f"{sentence} {abbreviated(list(rest))}.", "Use one lens at one zoom, and keep EXIF data.", rest)
     elif capture.facts.get(LENS) == CROPPED:
         rest = tuple(camera.name for camera in cameras if _off_middle(camera) > OFF_MIDDLE)
-        sentence = f"{len(rest)} {worded(len(rest), 'photographs were', 'photograph was')} cropped: what the lens looks at is not in the middle of"
+        sentence = f"{len(rest)} {plural(len(rest), 'photographs were', 'photograph was')} cropped: what the lens looks at is not in the middle of"
         found = Problem("cropped", "good", f"{sentence} {abbreviated(list(rest))}.", "Give the photographs as they were taken.", rest)
     else:
         return []
@@ -293,7 +293,7 @@ def _of_geometry(capture: Capture, seen: Parallax | None, counts: np.ndarray | N
         few = tuple(photo.camera.name for photo, count in zip(capture.photos, counts, strict=True) if count < FEW_POINTS)
         if few:
             grade = "usable" if len(few) > SHARE * len(counts) else "good"
-            seeing, unsure = worded(len(few), "photographs see", "photograph sees"), worded(len(few), "their cameras are", "its camera is")
+            seeing, unsure = plural(len(few), "photographs see", "photograph sees"), plural(len(few), "their cameras are", "its camera is")
             sentence = f"{len(few)} {seeing} fewer than {FEW_POINTS} sparse points; {unsure} less sure: {abbreviated(list(few))}."
             found.append(Problem("few points", grade, sentence, "Texture helps: leave more of the surroundings in view.", few))
     return found
@@ -304,7 +304,7 @@ def _of_gps(capture: Capture) -> list[Problem]:
     gps = capture.facts.get("gps")
     if not isinstance(gps, dict) or gps["used"] != "nothing":
         return []
-    words = f"{gps['photographs']} of {len(capture.photos)} photographs {worded(gps['photographs'], 'have', 'has')} a GPS position"
+    words = f"{gps['photographs']} of {len(capture.photos)} photographs {plural(gps['photographs'], 'have', 'has')} a GPS position"
     if "distance" in gps:
         words += f", {gps['distance']:.2g} m from the cameras found in the median: too far for an extent of {gps['extent']:.2g} m, and not used."
     else:
@@ -330,11 +330,11 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
     ):
         if names:
             share = len(names) / len(looks)
-            sentence = f"{len(names)} of {len(looks)} photographs ({share:.0%}) {worded(len(names), 'are', 'is')} {words}: {abbreviated(names)}."
+            sentence = f"{len(names)} of {len(looks)} photographs ({share:.0%}) {plural(len(names), 'are', 'is')} {words}: {abbreviated(names)}."
             found.append(Problem(what, "usable" if share > SHARE else "good", sentence, remedy, tuple(names)))
     same = looks_of.duplicates(looks)
     if same:
-        words = worded(len(same), "photographs look", "photograph looks")
+        words = plural(len(same), "photographs look", "photograph looks")
         sentence = f"{len(same)} {words} the same as another: {abbreviated([f'{name} as {first}' for name, first in same.items()])}."
         grade = "poor" if len(looks) - len(same) < 3 else "usable" if len(same) > 0.4 * len(looks) else "good"
         found.append(Problem("duplicates", grade, sentence, "They add nothing; photographs from other places would.", tuple(same)))
@@ -348,7 +348,7 @@ def of_sizes(looks: Mapping[str, Look]) -> list[Problem]:
         return []
     low, high = min(tiny.values()), max(tiny.values())
     side = f"{low} px" if low == high else f"{low} to {high} px"
-    sentence = f"{len(tiny)} of {len(looks)} photographs {worded(len(tiny), 'are', 'is')} too small, {side} on the longest side: {abbreviated(list(tiny))}."
+    sentence = f"{len(tiny)} of {len(looks)} photographs {plural(len(tiny), 'are', 'is')} too small, {side} on the longest side: {abbreviated(list(tiny))}."
     share = len(tiny) / len(looks)
     return [Problem("tiny", "poor" if share > 0.5 else "usable" if share > SHARE else "good", sentence, "Give the originals, of 1000 px or more.", tuple(tiny))]
 

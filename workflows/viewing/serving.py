@@ -21,7 +21,7 @@ from workflows.viewing.page import make_page, present_page
 from workflows.viewing.server import LOOPBACK, Server
 from workflows.viewing.sites import AssetSite, RunSite
 
-LOOK = 0.2  # seconds between two looks whether a signal came
+POLL_SECONDS = 0.2  # seconds between two looks whether a signal came
 
 
 def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
@@ -73,10 +73,10 @@ def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, r
             make_page(what, asset, folder / NAME)
             site = AssetSite(folder / NAME)
         with Server(site, address or LOOPBACK, port) as server:
-            threading.Thread(target=server.serve_forever, kwargs={"poll_interval": LOOK}, daemon=True).start()
+            threading.Thread(target=server.serve_forever, kwargs={"poll_interval": POLL_SECONDS}, daemon=True).start()
             try:
                 ready(server.url)
                 while stop() is None:
-                    time.sleep(LOOK)
+                    time.sleep(POLL_SECONDS)
             finally:
                 server.shutdown()

@@ -14,7 +14,7 @@ from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.whole_scene import environment_rows, grids_of
 from efficientnerf.rendering.harmonics import harmonics_count
 
-TIMES, PACKED_TIMES, BESIDES = 8, 24, 200_000_000  # of the file's size, of an entropy-coded one's, and bytes
+MAX_RATIO, MAX_PACKED_RATIO, FIXED_BYTES = 8, 24, 200_000_000  # of the file's size, of an entropy-coded one's, and bytes
 CELL = 6  # its brick, how far a ray may leap from it, and whether it is full
 BRICK, SLOT = 72, 5  # where it lies, and which of its voxels are stored; for each of its voxels which of the stored ones it is
 VOXEL = 20  # its density, and its colour for a view
@@ -48,7 +48,7 @@ def needed(layout: str, meta: dict[str, Any], shapes: dict[str, tuple[int, ...]]
 
 def check_memory(name: str, layout: str, size: int, needed_bytes: int) -> None:
     """Raises FormatError where a file of `size` bytes needs more than the rule allows."""
-    times = PACKED_TIMES if layout == "packed" else TIMES
-    if needed_bytes > times * size + BESIDES:
-        found = f"{size / 1e6:.1f} MB that take {needed_bytes / 1e6:.0f} MB of memory; expected at most {times} times the size and {BESIDES / 1e6:.0f} MB"
+    times = MAX_PACKED_RATIO if layout == "packed" else MAX_RATIO
+    if needed_bytes > times * size + FIXED_BYTES:
+        found = f"{size / 1e6:.1f} MB that take {needed_bytes / 1e6:.0f} MB of memory; expected at most {times} times the size and {FIXED_BYTES / 1e6:.0f} MB"
         raise FormatError(f"{name}: {found}. {_REASONS[layout == 'packed']}")

@@ -27,7 +27,7 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.settings import given
+from efficientnerf.settings import resolved
 from efficientnerf.training.patches import PatchGrid
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs
@@ -118,7 +118,7 @@ class Refinement:
         phase, end = PHASES[number].name, point.schedule.begin(number + 1)
         if state.step >= end:
             return
-        ratio, share = given(settings.view_dependent_lr_ratio), given(settings.error_map)
+        ratio, share = resolved(settings.view_dependent_lr_ratio), resolved(settings.error_map)
         if ratio is None:
             ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if state.tree.background is None else 1.0
         if share is None:
@@ -176,7 +176,7 @@ def refined(
     """
     settings = job.settings
     most = min(len(tree.density_values), capacity)
-    steps, seconds = refinement_steps(settings, most, len(targets.pixels) if _is_whole(tree) else None), given(settings.time_budget)
+    steps, seconds = refinement_steps(settings, most, len(targets.pixels) if _is_whole(tree) else None), resolved(settings.time_budget)
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets)
@@ -285,7 +285,7 @@ def _is_whole(tree: NerfTree) -> bool:
 
 def refinement_steps(settings: BakeSettings, voxels: int, pixels: int | None) -> int:
     """Steps of the refinement; the usual ones where bake.time_budget stands in place of a number of them. Arguments as of `usual_steps`."""
-    if settings.time_budget == "off" and (stated := given(settings.refine_steps)) is not None:
+    if settings.time_budget == "off" and (stated := resolved(settings.refine_steps)) is not None:
         return stated
     return usual_steps(voxels, settings.refine_rays_per_batch, pixels)
 

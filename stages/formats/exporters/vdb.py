@@ -37,7 +37,7 @@ ACTIVE_VALUES = 2  # compression: of nodes the values of their active voxels alo
 LEAF, LOWER, UPPER = 3, 4, 5  # binary logarithms of the nodes' sides, in children
 ROOT = LEAF + LOWER + UPPER
 AT_ONCE = 1 << 16  # voxels whose colours are looked up
-EYES = 16  # captured cameras that colours are seen from
+COLOUR_VIEWS = 16  # captured cameras that colours are seen from
 _INACTIVE_ARE_BACKGROUND = b"\0"
 
 
@@ -117,7 +117,7 @@ def _eyes(tree: NerfTree) -> np.ndarray | None:
     if found is None:
         return None
     eyes = found.centres
-    return np.asarray(eyes[np.unique(np.linspace(0, len(eyes) - 1, EYES).round().astype(int))])
+    return np.asarray(eyes[np.unique(np.linspace(0, len(eyes) - 1, COLOUR_VIEWS).round().astype(int))])
 
 
 def _towards(points: np.ndarray, eye: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ OPTION = "--features-model"
 LONGEST = 1024  # px of a picture that a detector is given, where it takes any size: as LightGlue's authors have it
 DIVISOR = 32  # of the sides of that picture: ALIKED halves it five times
 MIN_SCORE = 0.2  # of a feature, COLMAP's default
-SURE = 0.1  # score of a match, at least: LightGlue's own and COLMAP's default
+MIN_SCORE = 0.1  # score of a match, at least: LightGlue's own and COLMAP's default
 FEWEST = 15  # features of a picture and matches of a pair: fewer verify nothing, as the mapper has it
 _IN_BOUNDS = 1.001  # of key points from -1 to 1
 
@@ -126,7 +126,7 @@ class Matcher:
         pairs, scores = self._pairs(matches, len(one.xy)), scores.reshape(-1)
         if len(pairs) != len(scores):
             raise self._refused(f"it gives matches {matches.shape} and scores {scores.shape}")
-        pairs = pairs[(scores >= SURE) & (pairs >= 0).all(1)]
+        pairs = pairs[(scores >= MIN_SCORE) & (pairs >= 0).all(1)]
         if (pairs >= (len(one.xy), len(other.xy))).any():
             raise self._refused("it matches features that there are not")
         return np.asarray(pairs, np.uint32)

@@ -107,7 +107,7 @@ def scenes(count: int) -> list[Scene]:
 
 def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     """The scheduler looks at its workers and writes its file whenever it may."""
-    for name in ("LOOK_SECONDS", "WRITE_SECONDS", "TIMES", "LOCKED_PAUSE"):
+    for name in ("LOOK_SECONDS", "WRITE_SECONDS", "WRITE_INTERVAL_RATIO", "LOCKED_PAUSE"):
         monkeypatch.setattr(scheduler, name, 0.0)
 
 

@@ -238,7 +238,7 @@ def test_without_a_worker_it_waits_and_then_gives_up(tmp_path: Path, monkeypatch
     workers.between = lambda: workers.workers.append(Worker("late", 1)) if next(calls) == 5 else None
     assert run(tmp_path, workers, scenes(2)).state == "done"
     monkeypatch.setattr(absence, "LONGEST", 0.0)
-    monkeypatch.setattr(absence, "SAID", 0.0)
+    monkeypatch.setattr(absence, "REPORT_SECONDS", 0.0)
     told: list[dict[str, Any]] = []
     nobody = Simulated([])
     with pytest.raises(StageFailed, match="2 scenes wait"):
@@ -266,7 +266,7 @@ def test_jobs_of_a_queue_are_waited_for_and_so_are_those_after_them(tmp_path: Pa
             assert "as long as it takes" in (read_fleet(tmp_path).note or "")
             workers.workers = [Worker("next", 1)]
 
-    monkeypatch.setattr(absence, "SAID", 0.0)
+    monkeypatch.setattr(absence, "REPORT_SECONDS", 0.0)
     workers = Simulated([], between=between, queued=True)
     assert run(tmp_path, workers, scenes(6)).state == "done"
     assert next(calls) > 60

@@ -109,7 +109,7 @@ def test_resolution_and_degree(enerf: Enerf, asset: Path, tmp_path: Path) -> Non
 
 def test_what_a_layout_has_no_place_for_is_refused(enerf: Enerf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """20 million voxels of one value are a valid `compact` file, and no `packed` one, which is nearly nothing; here fewer voxels, and less than 200 MB."""
-    monkeypatch.setattr("efficientnerf.asset.file.memory.BESIDES", 100_000)
+    monkeypatch.setattr("efficientnerf.asset.file.memory.FIXED_BYTES", 100_000)
     tree = random_tree(0, shape=(6, 6, 6), brick=4, degree=1, share=1.0)
     constant = replace(tree, density_values=np.ones_like(tree.density_values), harmonics=np.ones_like(tree.harmonics))
     save(constant, tmp_path / "a.nerftree", "compact")
@@ -123,8 +123,8 @@ def test_security_and_format_state_the_memory_of_an_asset_alike() -> None:
     """In the numbers that are checked."""
     for name in ("SECURITY.md", "efficientnerf/asset/FORMAT.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
-        assert re.search(rf"{memory.TIMES} times.*{memory.PACKED_TIMES} times", text, re.DOTALL)
-        assert f"{memory.BESIDES // 10**6} MB" in text or f"{memory.BESIDES:,}" in text
+        assert re.search(rf"{memory.MAX_RATIO} times.*{memory.MAX_PACKED_RATIO} times", text, re.DOTALL)
+        assert f"{memory.FIXED_BYTES // 10**6} MB" in text or f"{memory.FIXED_BYTES:,}" in text
 
 
 def test_inspect_tells_what_a_coded_asset_holds(enerf: Enerf, asset: Path, tmp_path: Path) -> None:

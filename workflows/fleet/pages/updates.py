@@ -18,8 +18,8 @@ from workflows.report.page import NAME as REPORT
 from workflows.report.signature import is_own
 
 FILES = (index.NAME, index.THUMBNAILS, spreadsheet.NAME, comparison.NAME, comparison.FOLDER)  # what pages consist of
-SECONDS = 5.0  # between two writings, and TIMES as long as one takes
-TIMES = 20.0
+SECONDS = 5.0  # between two writings, and WRITE_INTERVAL_RATIO as long as one takes
+WRITE_INTERVAL_RATIO = 20.0
 THUMBNAIL_SECONDS = 1.0  # of work on thumbnails in one writing, while the fleet runs
 
 
@@ -57,7 +57,7 @@ class Pages:
             self.trouble = None
         except OSError as error:
             self.trouble = f"{error.filename or self.fleet}: {error.strerror or error}"
-        self._next = time.monotonic() + max(SECONDS, TIMES * (time.monotonic() - began))
+        self._next = time.monotonic() + max(SECONDS, WRITE_INTERVAL_RATIO * (time.monotonic() - began))
 
     def _write(self, state: FleetState) -> None:
         self._make_thumbnails(state)
