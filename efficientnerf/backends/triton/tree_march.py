@@ -268,7 +268,7 @@ def density_at(grid, density, point, live, BRICK: tl.constexpr, NEAREST: tl.cons
     inside = live & (point.x >= 0) & (point.y >= 0) & (point.z >= 0) & (point.x < n.x * BRICK) & (point.y < n.y * BRICK) & (point.z < n.z * BRICK)
     cell = _cells_of(grid, point, BRICK)
     owner = _owner(grid, cell, inside)
-    corner, _, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
+    corner, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
     return interpolate_density(density, corner, fraction, owner >= 0, BRICK, NEAREST)
 
 
