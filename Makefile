@@ -3,7 +3,7 @@
 # make test-slow install, then run the tests marked slow
 # make test-all  both in one go, as .ci/run does: the long ones first, and what one of them compiles is there for the others
 # make torture   kill runs at N moments (30; by night 1000: make torture N=1000 JOBS=2) and compare their artifacts with those of undisturbed runs
-# make faults    let each file operation of a run fail, by five errors: half an hour on two cores (make faults JOBS=2)
+# make faults    let a file operation of each kind and place of a run fail, by five errors: half an hour on two cores (make faults JOBS=2)
 # make fuzz      100,000 damaged inputs to each reader; FUZZ_OPTIONS go to benchmarks/fuzz; `pip install -e '.[fuzz]'` guides it by coverage
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
 # make gpu-packages   wheels that `make gpu` needs besides torch, Triton and numba, into build/gpu-packages: for a machine without a package index

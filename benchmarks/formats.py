@@ -239,8 +239,8 @@ def viewer_row(case: Case, extension: str) -> Row:
 def pictures_row(case: Case, extension: str) -> Row:
     """What `enerf render` writes, against our own renderer's picture, which the reader never saw."""
     from efficientnerf.asset.rendering import render
-    from stages.turntable.run import TurntableSettings
     from stages.turntable.run import cameras_of as turntable_cameras_of
+    from stages.turntable.settings import TurntableSettings
 
     out, tree, film = case.folder / "frames", case.tree, case.folder / "film.mp4"
     options = {".png": (), ".exr": ("--exr", "all"), ".mp4": ("--video", str(film))}[extension]

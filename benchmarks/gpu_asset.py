@@ -18,7 +18,6 @@ from gpu_kernels import BOUNDS, ball, orbit
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.refinement import fit
-from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render
@@ -64,7 +63,7 @@ def asset_rates(
     clock.lap("bake")
     targets = Targets(scene, WHITE).to(device)
     state = initial_state(tree, MAX_INITIAL_THICKNESS)
-    options: dict[str, Any] = {"rays": rays, "density_lr": 0.3, "sh_lr": 0.03, "fall": exponential_fall(0.3, refine_steps), "seed": 0}
+    options: dict[str, Any] = {"rays": rays, "density_lr": 0.3, "sh_lr": 0.03, "fall": lambda step: 0.3 ** (step / refine_steps), "seed": 0}
     for _ in fit.optimise(state, targets, until=refine_steps // 4, **options):
         pass
     clock.lap("refine_first_quarter")

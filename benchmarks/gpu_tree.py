@@ -1,4 +1,4 @@
-"""The part *trees* of benchmarks/gpu.py: losses and gradients of a tree's rays, one by one and in packets. Sizes are arguments."""
+"""The part *trees* of benchmarks/gpu.py: losses and gradients of a tree's rays, and a step. Sizes are arguments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import Hyperparameters, Moments, RayTargets
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients
-from efficientnerf.backends.triton import tree_gradients, tree_packets, tree_steps
+from efficientnerf.backends.triton import tree_gradients, tree_steps
 from efficientnerf.geometry.cameras import rays
 
 PATCH_SIDE = 4
@@ -51,30 +51,27 @@ def voxels_met(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targ
 
 
 def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int, repeats: int, mebibytes: int) -> dict[str, Any]:
-    """Rays a second of losses with gradients, ray by ray and in packets, and of a step; beside what a copy within the device's memory allows.
+    """Rays a second of losses with gradients, and with a step; beside what a copy within the device's memory allows.
 
-    The floor counts bytes: of each voxel that a packet meets its density and harmonics are read and its sums read and written; of each that is met at all a
+    The floor counts bytes: of each voxel that a patch meets its density and harmonics are read and its sums read and written; of each that is met at all a
     step reads and writes values and sums. mebibytes: of the copy.
     """
     origins, directions = patch_rays(tree, side, views, patches)
     count, rng = len(origins), np.random.default_rng(1)
     first = np.arange(0, count + 1, PATCH_SIDE**2)
     host = RayTargets(*(rng.random(shape).astype(np.float32) for shape in ((count, 3), (count, 3), count, count)), 0.25)
-    there = [torch.from_numpy(a).to(device) for a in (origins, directions, first, *host[:4])]
-    sent, targets = refinement.rays_in_voxels(tree, there[0], there[1]), RayTargets(*there[3:], 0.25)
+    there = [torch.from_numpy(a).to(device) for a in (origins, directions, *host[:4])]
+    sent, targets = refinement.rays_in_voxels(tree, there[0], there[1]), RayTargets(*there[2:], 0.25)
     grid, density, sh = refinement.values_of(tree, torch.device(device))
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp, none = torch.zeros(len(density), dtype=torch.int32, device=device), torch.zeros(0, device=device)
     moments = Moments(none, none, torch.zeros_like(density), torch.zeros_like(density), torch.zeros_like(stamp))
     neighbours = tree_steps.Neighbours(none, torch.zeros(0, 6, dtype=torch.int32, device=device))
 
-    def ray_by_ray() -> None:
+    def loss_gradients() -> None:
         outputs = tree_gradients.forward(grid, sent, density, sh)
         _, *by = tree_gradients.loss_and_gradients(*outputs, targets)
         tree_gradients.backward(grid, sent, density, sh, outputs, (by[0], by[1]), sums, stamp, 1)
-
-    def in_packets() -> None:
-        tree_packets.loss_and_gradients(grid, there[2], sent, density, sh, targets, sums, stamp, 1)
 
     def step() -> None:  # of no length, so that every repetition does the same
         rule = Hyperparameters(0.0, 0.0, 1.0, DECAY, EPSILON)
@@ -83,12 +80,12 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
     of_packets, of_all = voxels_met(tree, origins, directions, host, first)
     width, rate = 3 * grid.terms, copy_rate(device, mebibytes, repeats)
     each = {"gradients": of_packets * (4 * (width + 1) + 16 * (width + 1)), "step": of_all * (8 * (width + 4) + 16 * (width + 1))}
-    jobs: list[tuple[str, Callable[[], None]]] = [("ray_by_ray", ray_by_ray), ("packets", in_packets), ("step", step)]
+    jobs: list[tuple[str, Callable[[], None]]] = [("gradients", loss_gradients), ("step", step)]
     took = {name: milliseconds(job, device, repeats) for name, job in jobs}
     floor = {name: some / rate / 1e6 for name, some in each.items()}  # milliseconds
     return {
-        "voxels": len(density), "rays": count, "voxels_of_packets_per_ray": round(of_packets / count, 2), "voxels_met": of_all,
+        "voxels": len(density), "rays": count, "voxels_of_patches_per_ray": round(of_packets / count, 2), "voxels_met": of_all,
         "ms": {name: round(some, 4) for name, some in took.items()}, "floor_ms": {name: round(some, 4) for name, some in floor.items()},
-        "rays_per_second": {name: round(1e3 * count / took[name]) for name in ("ray_by_ray", "packets")},
-        "rays_per_second_with_step": round(1e3 * count / (took["packets"] + took["step"])), "floor_rays_per_second": round(1e3 * count / sum(floor.values())),
+        "rays_per_second": round(1e3 * count / took["gradients"]), "rays_per_second_with_step": round(1e3 * count / sum(took.values())),
+        "floor_rays_per_second": round(1e3 * count / sum(floor.values())),
     }  # fmt: skip

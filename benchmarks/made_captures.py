@@ -25,8 +25,8 @@ from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_atomically
 from pipeline.stage import Job
 from stages.io import scene
-from stages.poses.run import PosesSettings
 from stages.poses.run import run as find_poses
+from stages.poses.settings import PosesSettings
 from stages.train.priors import Prior, mask_uncovered_cells
 
 ROOT = Path(__file__).resolve().parents[1]

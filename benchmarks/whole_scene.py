@@ -61,9 +61,9 @@ def _bands(p: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
 
 def whole_scene(side: int = 320, count: int = 5, brick: int = 4) -> Any:
     """A tree of `count` cascades of `side` voxels along each axis."""
-    from efficientnerf.asset.cascades import Cascade, cascade_grids, check_cascades
+    from efficientnerf.asset.cascades import cascade_grids, check_cascades
     from efficientnerf.asset.palettes import PaletteHarmonics
-    from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+    from efficientnerf.asset.tree import Cascade, NerfTree, tree_from_voxels
     from efficientnerf.rendering.environment import directions_of
 
     grids = cascade_grids(np.array([[-HALF] * 3, [HALF] * 3]), 2 * HALF / side, brick, count)

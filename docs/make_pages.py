@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 
-from stages.renamed_settings import REMOVED, RENAMED
 from stages.settings import SettingInfo, describe_settings
 from workflows.asset import STAGES
 from workflows.cli.main import enerf
@@ -47,16 +46,7 @@ def settings_page() -> str:
         if any(info.advanced for info in infos):
             lines += ["", f"### {stage}", "", "| setting | default | may be | meaning |", "|---|---|---|---|"]
             lines += [row(stage, info) for info in infos if info.advanced]
-    return "\n".join(lines + renamed_section()) + "\n"
-
-
-def renamed_section() -> list[str]:
-    """Names of settings before 0.1.0, and what became of them."""
-    lines = ["", "## Renamed settings", "", "Before 0.1.0 some settings had other names. An old name is answered with the new one; old runs are read.", ""]
-    lines += ["| before | now |", "|---|---|"]
-    lines += [f"| `{stage}.{old}` | `{stage}.{new}` |" for stage, names in RENAMED.items() for old, new in names.items()]
-    lines += [f"| `{stage}.{old}` | removed: {why} |" for stage, names in REMOVED.items() for old, why in names.items()]
-    return lines
+    return "\n".join(lines) + "\n"
 
 
 def row(stage: str, info: SettingInfo) -> str:

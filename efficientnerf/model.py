@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from efficientnerf.backends import dispatch
-from efficientnerf.fields import Field
+from efficientnerf.fields.field import Field
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import RayBundle, Space, voxel_centres
 from efficientnerf.rendering.compositing import Composite

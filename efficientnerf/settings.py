@@ -1,7 +1,7 @@
 """Fields of settings dataclasses: their types with limits, and their descriptions.
 
 `auto` leaves a value to be chosen, `off` switches something off. A limit is a `msgspec.Meta` in the annotation, which the engine checks when it decodes
-settings (`pipeline.stage.settings_from`). Imports nothing heavy.
+settings (`pipeline.stage.settings_from`). Every number has a lowest and a highest value, and a stage can work with both. Imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ LEAST_RESOLUTION = 8  # voxels along the longest side of what is baked: two coar
 
 Auto = Literal["auto"]
 Off = Literal["off"]
-Count = Annotated[int, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=0, le=10**9)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-PositiveInt = Annotated[int, Meta(ge=1)]
-NonNegative = Annotated[float, Meta(ge=0.0)]
+PositiveInt = Annotated[int, Meta(ge=1, le=10**9)]
+NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
+Seconds = Annotated[float, Meta(ge=0.001, le=1e7)]
+Density = Annotated[float, Meta(ge=1e-6, le=1e6)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 

@@ -188,7 +188,7 @@ def is_published(run: Path, stage: str, place: Workplace) -> bool:
     return made is not None and made.request.digest == place.request and not files.exists(place.out)
 
 
-def clear_published(run: Path, stage: str, place: Workplace) -> None:
+def clear_published(run: Path, place: Workplace) -> None:
     """Delete the work on what is published: an interrupted run that was forced left it, and nobody asks for it any more."""
     files.discard(place.folder, run / WORK)
     if files.is_folder(place.root) and files.is_empty(place.root):

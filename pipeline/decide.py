@@ -53,14 +53,6 @@ class Decision:
         return self.state == "fresh"
 
 
-def why_run(stage: Stage, run: Run) -> str | None:
-    """The reason why the stage has to run on what the run has now, or None. No side effects.
-
-    Stages before it are taken as they are on disk; survey() also considers whether they have to run.
-    """
-    return decide(stage, run).reason
-
-
 def survey(stages: Sequence[Stage], run: Run, *, forced: Collection[str] = (), hashes: Hashes | None = None) -> list[Decision]:
     """A decision for each stage, in order. One that needs a stage which has to run is stale, too; it may yet turn out fresh.
 

@@ -221,7 +221,7 @@ class _Runner:
         place = artifact.workplace(self.run.path, stage.name, made.request)
         with contextlib.suppress(OSError):  # else the next start does
             if files.exists(place.folder):
-                artifact.clear_published(self.run.path, stage.name, place)
+                artifact.clear_published(self.run.path, place)
 
     def _interrupted(self, error: BaseException, stage: str, go_on: str) -> Interrupted:
         number = error.number if isinstance(error, Interrupted) else signal.SIGINT

@@ -11,6 +11,7 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,6 +30,17 @@ PROGRESS_SECONDS = 0.1  # progress closer together than this is not reported: a 
 
 
 @dataclass(frozen=True)
+class ByName:
+    """A function by its name, `package.module:function`, whose module is imported when it is called: stages are described by modules that import little."""
+
+    name: str
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        module, _, function = self.name.partition(":")
+        return getattr(import_module(module), function)(*arguments, **named)
+
+
+@dataclass(frozen=True)
 class Stage:
     """One step of a workflow: a function from folders to a folder.
 
@@ -36,7 +48,7 @@ class Stage:
     version       raise it whenever the same request gives other bytes
     settings      a frozen dataclass, every field with a default
     needs         names of the stages whose artifacts it reads
-    run           writes its outputs into job.out
+    run           writes its outputs into job.out; a `ByName` where its module imports what takes time
     reads_source  whether it is handed the source; then the files of the source are part of its request
     source_files  (source, settings) -> the files of the source that matter (cheap: they are hashed, not read); None: every file in it
     uses_device   whether it computes on job.device

@@ -1,7 +1,7 @@
 """The files of each stage's artifact; each file name is stated here, once.
 
 A stage writes `XOutputs(job.out)`, reads `inputs_of(XInputs, job.inputs)` and needs `needs_of(XInputs)`; a workflow reads `XOutputs.of_run(run)`.
-A new stage states its pair in its own module, or here if an earlier stage or `stages.io` has to know its files. The poses stage reads the source alone.
+A new stage states its pair in its own `settings.py`, or here if an earlier stage or `stages.io` has to know its files. The poses stage reads the source alone.
 """
 
 from __future__ import annotations

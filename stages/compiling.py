@@ -5,12 +5,9 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
+from efficientnerf.backends.kernel_cache import Compilation, compilation
 from pipeline.stage import Job
-
-if TYPE_CHECKING:
-    from efficientnerf.backends.kernel_cache import Compilation
 
 _compilations: list[Compilation] = []  # of the stages that ran in this process
 
@@ -20,8 +17,6 @@ def compiling_kernels(run: Callable[[Job], None]) -> Callable[[Job], None]:
 
     @functools.wraps(run)
     def telling(job: Job) -> None:
-        from efficientnerf.backends.kernel_cache import compilation
-
         with compilation(lambda: job.say("compiling kernels, once")) as found:
             _compilations.append(found)
             run(job)

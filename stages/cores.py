@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 def use_all_cores() -> None:
     """Let torch compute on all cores that this process may use (`OMP_NUM_THREADS`, or its affinity): results repeat with the same number alone."""
-    import torch
+    import torch  # who counts cores alone needs none
 
     torch.set_num_threads(count_cores())
 

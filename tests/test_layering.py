@@ -1,4 +1,5 @@
-"""Who may import whom, how large folders, functions and signatures may be, over the syntax trees; and that what must start quickly imports nothing heavy."""
+"""Who may import whom and where, how large folders, functions and signatures may be, over the syntax trees; and that what must start quickly imports
+nothing heavy."""
 
 from __future__ import annotations
 
@@ -11,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from stages.formats.importers import IMPORTERS
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("pipeline", "efficientnerf", "stages", "workflows")
@@ -35,6 +38,37 @@ MANY_ARGUMENTS = {
     _KERNELS + "tree.packets.tiles:render_tile": "those of `_render_blocks` that a tile needs",
 }
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
+DOOR = (
+    "stages.artifacts", "efficientnerf.settings", "efficientnerf.training.settings", "workflows.asset", "workflows.budget", "workflows.cli.main",
+    "workflows.cli.run", "workflows.cli.status", "workflows.cli.verify", "workflows.cli.presets", "workflows.fleet.child", "stages.sfm.pair_workers",
+)  # fmt: skip
+# Imports within functions, each with its reason beside it: of extras, of Triton, of pycolmap, which other libraries must precede, of what most runs need not.
+LATE = {
+    "efficientnerf/asset/rendering.py": 1,
+    "efficientnerf/backends/dispatch.py": 1,
+    "efficientnerf/geometry/ndc.py": 3,
+    "pipeline/executors/dask.py": 2,
+    "pipeline/executors/local.py": 2,
+    "pipeline/executors/memory.py": 1,
+    "pipeline/locks/lock.py": 1,
+    "stages/cores.py": 1,
+    "stages/figures/drawing.py": 3,
+    "stages/formats/exporters/las.py": 1,
+    "stages/formats/exporters/usd.py": 3,
+    "stages/formats/importers/depth.py": 1,
+    "stages/io/decoders/raw.py": 2,
+    "stages/io/network_file.py": 1,
+    "stages/io/photo.py": 1,
+    "stages/io/pictures.py": 1,
+    "stages/poses/memory.py": 2,
+    "stages/poses/run.py": 1,
+    "stages/sfm/colmap.py": 5,
+    "workflows/cli/device.py": 1,
+    "workflows/cli/progress.py": 2,
+    "workflows/cli/verify.py": 1,
+    "workflows/paper/runs.py": 1,
+    "workflows/report/pages.py": 2,
+}
 
 
 def modules(package: str) -> list[Path]:
@@ -79,22 +113,13 @@ def dotted(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def at_run_time(node: ast.AST) -> Iterator[ast.AST]:
-    """A node and all below it, but what stands under `if TYPE_CHECKING`."""
-    yield node
-    for child in ast.iter_child_nodes(node):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and child in node.body:
-            continue
-        yield from at_run_time(child)
-
-
 def import_graph() -> dict[str, set[str]]:
-    """Module -> the modules of ours that it imports at run time, on top or within functions."""
+    """Module -> the modules of ours that it imports, anywhere in it: those within functions and of types alone count."""
     paths = {dotted(path): path for package in OURS for path in modules(package)}
     graph: dict[str, set[str]] = {}
     for name, path in paths.items():
         found = graph.setdefault(name, set())
-        for node in at_run_time(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 found |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -177,21 +202,43 @@ def test_nothing_unpickles_or_evaluates() -> None:
     assert wrong == []
 
 
-def test_light_modules_import_nothing_heavy() -> None:
-    """Every __init__, and every module of pipeline, stages and workflows: the heavy things are imported inside of functions."""
-    names = []
-    for package in OURS:
-        for path in modules(package):
-            if path.name == "__init__.py" or (package != "efficientnerf" and path.name != "__main__.py"):
-                names.append(dotted(path))
+def within_functions(path: Path) -> Iterator[tuple[int, str]]:
+    """(line, what is imported there, as it is written) of the imports of a file that stand in functions."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    tree = ast.parse("\n".join(lines))
+    inside = {
+        node.lineno
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        for node in ast.walk(function)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    }
+    yield from ((line, lines[line - 1].strip()) for line in sorted(inside))
+
+
+def test_imports_are_at_the_top_but_a_few_with_a_reason() -> None:
+    found = {str(path.relative_to(ROOT)): [*within_functions(path)] for package in OURS for path in modules(package)}
+    assert {path: lines for path, lines in found.items() if lines and path not in LATE} == {}
+    assert {path: (len(lines), LATE[path]) for path, lines in found.items() if path in LATE and len(lines) != LATE[path]} == {}
+    assert [f"{path}:{line}: {text}" for path, lines in found.items() for line, text in lines if "  # " not in text] == []
+
+
+def test_types_are_imported_as_all_else() -> None:
+    found = [str(path.relative_to(ROOT)) for package in OURS for path in modules(package) if "TYPE_CHECKING" in path.read_text(encoding="utf-8")]
+    assert found == ["stages/poses/settings.py"]  # mypy takes no Literal of a tuple that is computed
+
+
+def test_modules_at_the_door_import_nothing_heavy() -> None:
+    """What is imported before there is anything to do; `tests/workflows/cli/test_cli.py` has the commands."""
+    names = [dotted(path) for package in OURS for path in modules(package) if path.name == "__init__.py" or path.is_relative_to(ROOT / "pipeline")]
+    names += [dotted(path) for path in modules("stages") if path.name == "settings.py"]
+    names += [f"stages.formats.importers.{importer.module}" for importer in IMPORTERS.values()]  # the engine asks them for a source's files
+    names += DOOR
     script = f"""
 import importlib, sys
 guilty = []
-for name in {sorted(names)!r}:
-    try:
-        importlib.import_module(name)
-    except ImportError as error:
-        guilty.append(f"{{name}} cannot be imported: {{error}}")
+for name in {sorted(set(names))!r}:
+    importlib.import_module(name)
     found = [heavy for heavy in {HEAVY!r} if heavy in sys.modules]
     if found:
         guilty.append(f"{{name}} pulls in {{', '.join(found)}}")

@@ -2,34 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-from pipeline.stage import Stage
-from stages.memory.disk import space_needed
-from stages.memory.plan import memory_needed
-
-
-@dataclass(frozen=True)
-class Workflow:
-    """Stages and presets of a command line.
-
-    stages   in order
-    presets  the folder of its presets, TOML files
-    child    the module that runs its stages in processes of their own; see `pipeline.executors.serving`
-    space    (stage, run, its sources, settings by stage, bytes of memory or None) -> bytes that the stage writes
-    memory   (stage, run, its sources, settings by stage, device) -> bytes that the stage takes; None: not known, it has a share of its worker's
-    """
-
-    stages: tuple[Stage, ...]
-    presets: Path
-    child: str = "workflows.fleet.child"
-    space: Callable[[str, Path, Sequence[Path], Mapping[str, Any], int | None], int] = lambda *_: 0
-    memory: Callable[[str, Path, Sequence[Path], Mapping[str, Any], str], int | None] = lambda *_: None
-
+from pipeline.stage import ByName, Stage
+from workflows.workflow import Workflow
 
 # Folders of `stages`, in order.
 NAMES = (
@@ -42,5 +19,10 @@ NAMES = (
     "turntable",  # bake -> frames, video, EXR
     "points",  # bake -> PLY
 )
-STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}.run").STAGE for name in NAMES)
-WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets", space=space_needed, memory=memory_needed)
+STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}.settings").STAGE for name in NAMES)
+WORKFLOW = Workflow(
+    STAGES,
+    Path(__file__).parent / "presets",
+    space=ByName("stages.memory.forecast:space_needed"),
+    memory=ByName("stages.memory.forecast:memory_needed"),
+)

@@ -6,21 +6,37 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pipeline.errors import BadInput, UsageError
-from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format
+import numpy as np
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.surface.mesh import Mesh
-    from pipeline.executors.memory import Limit
-    from stages.formats.exporters.writing import SourceFrame
-    from stages.mesh.run import MeshSettings
-    from workflows.cli.resolve import Settings
+from efficientnerf.asset.format import FormatError, describe, serialize
+from efficientnerf.asset.tree import NerfTree, Region
+from efficientnerf.surface.mesh import Mesh
+from pipeline.decide import decide
+from pipeline.errors import BadInput, CorruptArtifact, UsageError
+from pipeline.executors.memory import Limit
+from pipeline.files import write_atomically
+from pipeline.stage import settings_dict, settings_from
+from stages.artifacts import BakeOutputs, MeshInputs, MeshOutputs, PosesOutputs, TrainOutputs
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format, cameras
+from stages.formats.exporters.writing import SourceFrame, source_frame
+from stages.framing.restriction import restricted
+from stages.io import scene
+from stages.memory.need import Need, libraries, refuse_more_than
+from stages.memory.tree import tree_bytes
+from stages.mesh.files import read_mesh
+from stages.mesh.memory import surface_needed
+from stages.mesh.run import SURFACE_SHARE, in_capture, mesh_of
+from stages.mesh.settings import STAGE, MeshSettings
+from stages.mesh.texture import largest_photograph, textured, with_relief
+from stages.points.run import points_of
+from stages.viewer.page import compact_bytes, viewer_page
+from workflows.cli.resolve import Settings
+from workflows.cli.target import asset_of, is_run, open_run
+from workflows.destination import check_files, check_free, writing
+from workflows.loading import load_asset
+from workflows.report.viewer import captured
 
 CAMERAS, VIEWER = ".json", ".html"
 VOLUME_VOXEL = 250  # bytes of a voxel while its grids are sorted into nodes
@@ -100,9 +116,6 @@ class Export:
 
     @property
     def has_photographs(self) -> bool:
-        from stages.artifacts import PosesOutputs
-        from workflows.cli.target import is_run
-
         return is_run(self.what) and PosesOutputs.of_run(self.what).scene.is_file()
 
 
@@ -122,8 +135,6 @@ def faces_from_text(text: str) -> int:
 
 def check(export: Export) -> None:
     """Raise UsageError for what cannot be written, before anything is done."""
-    from workflows.destination import check_files
-
     if export.as_points and export.as_splats:
         raise UsageError("--points and --splats: one of the two at a time, for .ply is either.")
     known = [*export.formats, CAMERAS, VIEWER]
@@ -145,12 +156,6 @@ def check(export: Export) -> None:
 
 def export_cameras(export: Export) -> list[Written]:
     """The cameras of a run."""
-    from stages.artifacts import PosesOutputs
-    from stages.formats.exporters import cameras
-    from stages.io import scene
-    from workflows.cli.target import is_run, open_run
-    from workflows.destination import writing
-
     written, what = [], export.what
     for path in export.cameras:
         poses = PosesOutputs(open_run(what).folder("poses")) if is_run(what) else PosesOutputs(what)
@@ -165,11 +170,6 @@ def export_cameras(export: Export) -> list[Written]:
 
 def export_surface(export: Export, settings: Settings, progress: Progress) -> list[Written]:
     """The surface as points or as a mesh. `settings` holds those of the stages mesh and points, with which it is made."""
-    from stages.formats.exporters.writing import source_frame
-    from stages.framing.restriction import restricted
-    from workflows.cli.target import load_asset
-    from workflows.destination import writing
-
     if not export.surfaces:
         return []
     resolved = settings.resolved()
@@ -189,7 +189,6 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
     frame = source_frame(tree.metadata)
     if not export.as_points:
         return _write_mesh(export, _meshed(export, tree, border, frame, wanted, progress), frame)
-    from stages.points.run import points_of
 
     _refuse_what_does_not_fit(export, tree, f"Lower points.num_points ({wanted.num_points}).", points=wanted.num_points)
     cloud = points_of(tree, wanted, frame, progress, border)
@@ -201,13 +200,6 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
 
 def export_volumes(export: Export, settings: Settings) -> list[Written]:
     """The asset's voxels as volumes; what of it, the settings of the stage mesh say where --region does not."""
-    from stages.formats.exporters.writing import source_frame
-    from stages.framing.restriction import restricted
-    from stages.memory.need import Need, libraries, refuse_more_than
-    from stages.memory.rendering import tree_bytes
-    from workflows.cli.target import load_asset
-    from workflows.destination import writing
-
     if not export.volumes:
         return []
     region = export.region or (settings.resolved()["mesh"].region if export.crop is None else "all")
@@ -224,15 +216,6 @@ def export_volumes(export: Export, settings: Settings) -> list[Written]:
 
 def export_viewers(export: Export) -> list[Written]:
     """The asset as a page for browsers: all of it, unless --region or --crop say what; with the cameras and photographs of a run."""
-    from efficientnerf.asset.format import FormatError, serialize
-    from pipeline.errors import CorruptArtifact
-    from pipeline.files import write_atomically
-    from stages.framing.restriction import restricted
-    from stages.viewer.page import compact_bytes, viewer_page
-    from workflows.cli.target import asset_of, is_run, load_asset
-    from workflows.destination import writing
-    from workflows.report.viewer import captured
-
     if not export.viewers:
         return []
     try:
@@ -251,23 +234,11 @@ def export_viewers(export: Export) -> list[Written]:
 
 
 def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: Any) -> None:
-    from stages.memory.need import refuse_more_than
-    from stages.mesh.memory import surface_needed
-
     refuse_more_than(export.limit, str(export.what), surface_needed(tree, **needed), remedy)
 
 
 def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -> tuple[Mesh, SourceFrame] | None:
     """The mesh that the run's stage `mesh` has made, if that is what is wanted; its texture may be left out."""
-    from efficientnerf.asset.format import describe
-    from pipeline.decide import decide
-    from pipeline.stage import settings_dict, settings_from
-    from stages.artifacts import BakeOutputs, MeshOutputs
-    from stages.formats.exporters.writing import source_frame
-    from stages.mesh.files import read_mesh
-    from stages.mesh.run import STAGE, MeshSettings
-    from workflows.cli.target import is_run, open_run
-
     if not is_run(what):
         return None
     run = open_run(what)
@@ -289,10 +260,6 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
 
 def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: SourceFrame, wanted: MeshSettings, progress: Progress) -> Mesh:
     """The mesh of a tree, clipped to a region, in the capture's frame, textured as its settings say."""
-    from stages.artifacts import BakeOutputs, MeshInputs, PosesOutputs, TrainOutputs
-    from stages.mesh.run import SURFACE_SHARE, in_capture, mesh_of
-    from stages.mesh.texture import largest_photograph, textured, with_relief
-
     if wanted.texture == "photographs" and not export.has_photographs:
         raise UsageError(f"{export.what}: holds no photographs. Give a run with its cameras, or --texture asset.")
     choice = "asset" if wanted.texture == "auto" and not export.has_photographs else wanted.texture
@@ -314,8 +281,6 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
 
 
 def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:
-    from workflows.destination import check_free, writing
-
     written: list[Written] = []
     beside: set[Path] = set()
     normal_map = mesh.texture is not None and mesh.texture.normals is not None

@@ -4,21 +4,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from efficientnerf.asset.format import describe
+from efficientnerf.splats.gaussians import Gaussians
+from pipeline.decide import decide
+from pipeline.stage import settings_from
+from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
+from stages.formats.exporters.splats.frames import in_capture
+from stages.formats.exporters.splats.ply import read_splats
+from stages.formats.exporters.writing import SourceFrame, source_frame
+from stages.framing.restriction import restricted
+from stages.memory.need import refuse_more_than
+from stages.splats.memory import needed
+from stages.splats.run import gaussians_of
+from stages.splats.settings import STAGE, SplatsSettings
+from workflows.cli.resolve import Settings
+from workflows.cli.target import is_run, open_run
+from workflows.destination import writing
 from workflows.exporting import Export, Progress, Written
-
-if TYPE_CHECKING:
-    from efficientnerf.splats.gaussians import Gaussians
-    from stages.formats.exporters.writing import SourceFrame
-    from stages.splats.run import SplatsSettings
-    from workflows.cli.resolve import Settings
+from workflows.loading import load_asset
 
 
 def export_splats(export: Export, settings: Settings, progress: Progress) -> list[Written]:
     """The asset as 3D Gaussians. `settings` holds those of the stage splats."""
-    from workflows.destination import writing
-
     if not export.splats:
         return []
     wanted = replace(settings.resolved()["splats"], make="on")
@@ -34,14 +43,6 @@ def export_splats(export: Export, settings: Settings, progress: Progress) -> lis
 
 def _made(export: Export, wanted: SplatsSettings, progress: Progress) -> tuple[Gaussians, SourceFrame]:
     """In the capture's frame."""
-    from stages.artifacts import PosesOutputs, TrainOutputs
-    from stages.formats.exporters.splats.frames import in_capture
-    from stages.formats.exporters.writing import source_frame
-    from stages.framing.restriction import restricted
-    from stages.memory.need import refuse_more_than
-    from stages.splats.run import gaussians_of, needed
-    from workflows.cli.target import load_asset
-
     tree = restricted(load_asset(export.what), wanted.region, export.crop)
     frame = source_frame(tree.metadata)
     captured = None
@@ -53,15 +54,6 @@ def _made(export: Export, wanted: SplatsSettings, progress: Progress) -> tuple[G
 
 def _made_by_the_stage(what: Path, wanted: SplatsSettings) -> tuple[Gaussians, SourceFrame] | None:
     """The Gaussians that the run's stage `splats` has made, if those are what is wanted."""
-    from efficientnerf.asset.format import describe
-    from pipeline.decide import decide
-    from pipeline.stage import settings_from
-    from stages.artifacts import BakeOutputs, SplatsOutputs
-    from stages.formats.exporters.splats.ply import read_splats
-    from stages.formats.exporters.writing import source_frame
-    from stages.splats.run import STAGE, SplatsSettings
-    from workflows.cli.target import is_run, open_run
-
     if not is_run(what):
         return None
     decision = decide(STAGE, open_run(what))

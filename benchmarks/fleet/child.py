@@ -15,7 +15,7 @@ from pipeline.files import write_atomically
 from pipeline.links import WORK
 from pipeline.run import NAME, Run
 from pipeline.stage import Job, Stage, settings_dict
-from workflows.asset import Workflow
+from workflows.workflow import Workflow
 
 CHILD = "benchmarks.fleet.child"
 JOURNAL = "journal"  # in a run: a line for each step that was done, each stage that was begun or ended
@@ -68,7 +68,7 @@ class Sleepers:
     def stages(self) -> Sequence[Stage]:
         return STAGES
 
-    def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
+    def prepare(self, run: Path, scene: dict[str, Any], memory: int | None) -> list[str]:
         settings = {stage.name: settings_dict(SleepSettings(**{"word": scene["name"], **scene["settings"].get(stage.name, {})})) for stage in STAGES}
         if not (run / NAME).is_file():
             Run.create(run, None, settings)

@@ -127,18 +127,20 @@ def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: boo
         except importlib.metadata.PackageNotFoundError:
             continue
     asset = json.loads(FORMAT_RESULT.read_text(encoding="utf-8")) if FORMAT_RESULT.exists() else {}
-    former = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"readers": {}, "seeds": []}
+    former = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"readers": {}, "seeds": [], "versions": {}}
+    now = {
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "guided_by": f"coverage (atheris): {campaign.GUIDED:.0%} of the inputs" if coverage else "outcomes",
+    }
     readers = dict(former["readers"])
     for name, each in found.items():
-        now = {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]]}
-        readers[name] = campaign.added(readers[name], now) if name in readers else now
+        entry = {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]], **now}
+        readers[name] = campaign.added(readers[name], entry) if name in readers else entry
     result = {
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "machine": processor(),
         "python": platform.python_version(),
-        "versions": versions,
+        "versions": {**former["versions"], **versions},
         "seeds": sorted({*former["seeds"], seed}),
-        "guided_by": f"coverage (atheris): {campaign.GUIDED:.0%} of the inputs; outcomes: the rest" if coverage else "outcomes",
         "inputs": sum(each["inputs"] for each in readers.values()),
         "findings": sum(len(each["findings"]) for each in readers.values()),
         "limit_s": 5.0,

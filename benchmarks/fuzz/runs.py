@@ -86,11 +86,9 @@ def opened(name: str, call: Callable[[Path], object], *commands: tuple[str, ...]
 
 
 def _open_run(run: Path) -> None:
-    from workflows.cli.target import check_names, open_run
+    from workflows.cli.target import open_run
 
-    found = open_run(run)
-    check_names(found)
-    found.plain()
+    open_run(run).plain()
 
 
 def _status(run: Path) -> None:

@@ -259,13 +259,13 @@ def _refinement() -> tuple[Any, Any]:
 
 
 def refinement_seeds() -> list[bytes]:
-    from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
+    from efficientnerf.asset.refinement.schedule import stated_schedule
     from pipeline.stage import Job
     from stages.bake.refine import checkpoint
 
     with tempfile.TemporaryDirectory() as folder:
         job = Job(settings=None, out=Path(folder) / "out", work=Path(folder) / "work")
-        checkpoint.save(job, checkpoint.Point(_refinement()[1], stated_schedule(PHASES, 2 * STEP)))
+        checkpoint.save(job, checkpoint.Point(_refinement()[1], stated_schedule(2 * STEP)))
         return [(job.work / checkpoint.CHECKPOINT).read_bytes()]
 
 
@@ -286,7 +286,7 @@ def refinement_changed(rng: Random, data: bytes) -> bytes:
 
 def open_refinement(folder: Path) -> Opened:
     """The state that a refinement goes on from."""
-    from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
+    from efficientnerf.asset.refinement.schedule import stated_schedule
     from pipeline.stage import Job
     from stages.bake.refine import checkpoint
 
@@ -295,7 +295,7 @@ def open_refinement(folder: Path) -> Opened:
 
     def read(data: bytes) -> None:
         (job.work / checkpoint.CHECKPOINT).write_bytes(data)
-        found = checkpoint.restored(job, tree, stated_schedule(PHASES, 2 * STEP), cells=CELLS)
+        found = checkpoint.restored(job, tree, stated_schedule(2 * STEP), cells=CELLS)
         assert found is None or 0 <= found.state.step <= 2 * STEP, "a step out of range"
 
     return Opened(read)

@@ -12,9 +12,10 @@ older artifact; those before and after it are there. Then
     every artifact that is there verifies
     the next run, without faults, ends with the artifacts of an undisturbed run and an empty .work
 
-Every operation of every stage of the Blender set but reading meets one error once and one lasting. Reading, and the stage poses of the other sources, whose
-later stages do the same, meet the two in turns. Of more than 24 writes to one file, as to COLMAP's database, it is the first 3, the last 3 and each 40th in
-between. The errors change from operation to operation, so that all five meet every kind of operation in every stage.
+A place is a kind of operation on a path, without numbers and random parts: all previews are one place, and so are all photographs of a source. Each place
+meets one error: in turns at its first operation, once, and at its last, lasting. What the engine does, and what the stage poses of the other sources does, is
+met where it occurs first; their later stages do the same as those of the Blender set. The errors change from place to place, and all five meet every kind of
+operation in every stage.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import errno
 import itertools
 import json
 import random
+import re
 import shutil
 import sys
 import tempfile
@@ -44,7 +46,6 @@ from benchmarks.torture.trap import Armed, Operation, Trap, operations
 RESULT = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EACCES, errno.EMFILE)
 OF_READING = (errno.EIO, errno.EACCES, errno.EMFILE)
-MANY, ENDS, EACH = 24, 3, 40
 CASE = tuple(field.name for field in fields(Case))
 OPERATION = CASE[: CASE.index("errno")]
 DEADLY = (1, 2, 3, 5)  # the failing operation at which a run on a full disk is killed
@@ -111,46 +112,44 @@ def _log_all(prepared: Sequence[Prepared], stages: Sequence[str], logs: Path) ->
 
 
 def planned(prepared: Sequence[Prepared], stages: Sequence[str], logs: Path) -> tuple[list[Case], dict[str, dict[str, int]]]:
-    """(all cases, scenario -> "stage kind" -> number of operations that an undisturbed run makes)."""
+    """(all cases, scenario -> "stage kind" -> number of places that an undisturbed run has)."""
     cases: list[Case] = []
+    known: set[tuple[str, str, str]] = set()
     seen = {}  # of a new run, up to its second stage: later ones are met where a stage is replaced
     for each, stage in _scenarios(prepared, stages):
-        of_kind: dict[tuple[str, str], list[Operation]] = defaultdict(list)
+        of_kind: dict[tuple[str, str], dict[str, list[Operation]]] = defaultdict(lambda: defaultdict(list))
         found = operations(logs / f"{each.source.kind}_{stage}")
         second = next((index for index, operation in enumerate(found) if operation.stage == STAGES[1] and operation.kind == "mkdir"), len(found))
         for operation in found[:second] if stage == NEW else found:
-            of_kind[operation.stage, operation.kind].append(operation)
+            of_kind[operation.stage, operation.kind][place_of(operation, logs / "run", each.source.folder)].append(operation)
         seen[f"{each.source.kind} {stage}"] = {" ".join(which): len(some) for which, some in sorted(of_kind.items())}
         for (where, kind), some in sorted(of_kind.items()):
-            if where == stage or (where == "engine" and (kind != "read" or stage == NEW)) or (where == "source" and stage == "poses"):
-                cases += _of_kind(each, stage, kind, _thinned(some))
+            if where not in (stage, "engine") and (where != "source" or stage != "poses"):
+                continue
+            new = {place: some[place] for place in some if (where, kind, place) not in known}
+            known |= {(where, kind, place) for place in new}
+            cases += _of_kind(each.source.kind, stage, kind, list(new.values()))
         if stage != NEW:
             cases += [Case(each.source.kind, stage, stage, "write", 1, errno.ENOSPC, True, deadly) for deadly in DEADLY]
     return cases, seen
 
 
-def _of_kind(each: Prepared, stage: str, kind: str, found: Sequence[Operation]) -> list[Case]:
-    """Each operation once and lasting; errors in turn, and all of them where there are fewer operations than errors."""
+def place_of(operation: Operation, run: Path, source: Path) -> str:
+    """The path of an operation without what differs between files of one sort, and between stages where it is the engine's."""
+    path = operation.path.removeprefix(f"{run}/").removeprefix(f"{source}/")
+    path = re.sub(r"[0-9a-f]{8,}|[0-9]+", "#", path)
+    return re.sub(rf"\b(?:{'|'.join(STAGES)})\b", "STAGE", path) if operation.stage == "engine" else path
+
+
+def _of_kind(source: str, stage: str, kind: str, places: Sequence[Sequence[Operation]]) -> list[Case]:
+    """A case for each place; errors in turn, and all of them where there are fewer places than errors."""
     errors = OF_READING if kind == "read" else ERRORS
-    in_turns = kind == "read" or each.source.kind != "blender"
     cases = []
-    for index in range(max(len(found), len(errors) * (1 + in_turns))):
-        operation = found[index % len(found)]
-        for lasting, shift in ((False, 0), (True, 2)):
-            if in_turns and index % 2 != lasting:
-                continue
-            number = errors[(index + shift) % len(errors)]
-            cases.append(Case(each.source.kind, stage, operation.stage, kind, operation.number, number, lasting))
+    for index in range(max(len(places), len(errors)) if places else 0):
+        lasting, place = bool(index % 2), places[index % len(places)]
+        operation = place[-1] if lasting else place[0]
+        cases.append(Case(source, stage, operation.stage, kind, operation.number, errors[index % len(errors)], lasting))
     return cases
-
-
-def _thinned(found: Sequence[Operation]) -> list[Operation]:
-    """Without most of the many operations of one kind on one file."""
-    of_path: dict[str, list[Operation]] = defaultdict(list)
-    for operation in found:
-        of_path[operation.path].append(operation)
-    kept = [operation for many in of_path.values() for operation in (many if len(many) <= MANY else [*many[:ENDS], *many[ENDS:-ENDS:EACH], *many[-ENDS:]])]
-    return sorted(kept, key=lambda operation: operation.number)
 
 
 def _all(cases: Sequence[Case], prepared: Sequence[Prepared], folder: Path, jobs: int, minutes: float) -> list[dict[str, Any]]:
@@ -190,7 +189,7 @@ def summary(lines: Iterable[dict[str, Any]], seen: dict[str, dict[str, int]], pl
         "not_reached": len(cases) - len(reached),
         "wrong": [line for line in lines if line["wrong"]],
         "operations_covered": len({(case["source"], case["scenario"], case["where"], case["kind"], case["number"]) for case in reached}),
-        "operations_of_undisturbed_runs": seen,
+        "places_of_undisturbed_runs": seen,
         "cases_per_scenario": counted("source", "scenario"),
         "cases_per_kind_and_error": counted("kind", "error"),
         "stages_kinds_and_errors_that_did_not_meet": sorted(" ".join(map(str, which)) for which in wanted - met),

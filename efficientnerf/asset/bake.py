@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from efficientnerf.backends.numba.bricks import flat_indices, resample_weights, threshold_and_dilate
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
@@ -102,8 +103,6 @@ def coarsened(
 ) -> Visibility:
     """The visibility of a grid of larger voxels with the same corner: each has the greatest weight of the voxels whose centres lie in it.
     Weights that do not exceed `threshold` are left out."""
-    from efficientnerf.backends.numba.bricks import resample_weights
-
     row_of = np.full(math.prod(to_shape), -1, np.int32)
     given = visibility.cells, visibility.greatest, float(np.float32(threshold)), shape, to_shape, voxel / to_voxel, brick, row_of
     rows = resample_weights(*given, np.zeros((0, brick**3), np.float32), 0)
@@ -118,8 +117,6 @@ def chosen_voxels(visibility: Visibility, shape: tuple[int, int, int], brick: in
 
     They are marked in the cells that they reach, so that memory grows with the result, and neither with the grid nor with the number of neighbours.
     """
-    from efficientnerf.backends.numba.bricks import flat_indices, threshold_and_dilate
-
     threshold = float(np.float32(threshold))
     reached = np.zeros(shape, bool)
     reached.reshape(-1)[visibility.cells[(visibility.greatest > threshold).any(axis=1)]] = True

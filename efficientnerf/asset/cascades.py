@@ -12,38 +12,15 @@ B bricks, N stored voxels of all cascades, R rays, L cascades.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from efficientnerf.asset.palettes import PaletteHarmonics
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import Cascade, NerfTree
 
 MAX_CASCADES = 16
 ALIGNED_CELLS = 4  # coarse cells of cascade 0 along an axis are a multiple of this, so that a box of twice the size has its cells on this one's faces
-
-
-@dataclass(frozen=True, eq=False)
-class Cascade:
-    """A grid of a tree, in the tree's frame.
-
-    shape        coarse cells along x, y, z
-    voxel        side of a voxel
-    bounds_min   (3,) float64 corner
-    brick_index  shape int32: rows of the tree's `voxel_index`, -1 where a cell is empty
-    """
-
-    shape: tuple[int, int, int]
-    voxel: float
-    bounds_min: np.ndarray
-    brick_index: np.ndarray
-
-    def bounds(self, brick: int) -> np.ndarray:
-        """(2, 3) corners, for so many voxels along a coarse cell."""
-        return np.stack([self.bounds_min, self.bounds_min + np.asarray(self.shape) * brick * self.voxel])
 
 
 def cascade_grids(bounds: np.ndarray, voxel: float, brick: int, count: int) -> list[tuple[tuple[int, int, int], float, np.ndarray]]:
@@ -217,3 +194,17 @@ def subset(tree: NerfTree, keep: np.ndarray) -> NerfTree:
         tree, brick_index=renumbered(tree.brick_index), voxel_index=rows[used], density_values=tree.density_values[keep], harmonics=harmonics,
         outer=tuple(replace(cascade, brick_index=renumbered(cascade.brick_index)) for cascade in tree.outer), region=region,
     )  # fmt: skip
+
+
+def voxel_coordinates(tree: NerfTree) -> np.ndarray:
+    """Coordinates (N, 3) int32 of the stored voxels in their own cascade, in their order."""
+    out = np.empty((len(tree.density_values), 3), np.int32)
+    for cascade, (first, end) in zip(cascades_of(tree), brick_ranges(tree) if tree.outer else [(0, len(tree.voxel_index))], strict=True):
+        owner = np.zeros(end - first, np.int64)
+        cells = np.flatnonzero(cascade.brick_index.reshape(-1) >= 0)
+        owner[cascade.brick_index.reshape(-1)[cells] - first] = cells
+        rows = tree.voxel_index[first:end]
+        brick, local = np.nonzero(rows >= 0)
+        cell = np.stack(np.unravel_index(owner[brick], cascade.shape), axis=-1)
+        out[rows[brick, local]] = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
+    return out

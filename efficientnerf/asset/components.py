@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from scipy import ndimage
 
 from efficientnerf.asset.cascades import cascades_of, point_cascades, voxel_sides
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.field_samples import FieldSamples
-    from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.field_samples import FieldSamples
+from efficientnerf.asset.region import inside_share, voxel_centres
+from efficientnerf.asset.tree import NerfTree
 
 INTERIOR_RATIO = 0.01  # of `share`: the limit of components that reach no face of the grid
 
@@ -22,8 +20,6 @@ def small_components(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarr
     one's voxels if it reaches a face of the grid, where the box may have cut it off, and with less than INTERIOR_RATIO of that elsewhere. In
     normalised device coordinates nothing lies beyond the far face, so that reaching a face means nothing.
     """
-    from scipy import ndimage
-
     stored = tree.voxel_index >= 0
     stored[stored] = keep[tree.voxel_index[stored]]
     count_of = stored.sum(axis=1)
@@ -56,10 +52,6 @@ MIN_THICKNESS = 0.05  # optical thickness of a voxel from which it joins its nei
 def foreground_bricks(tree: NerfTree) -> np.ndarray:
     """Which bricks belong to the foreground, (B,) bool, for `Region.bricks`: in the innermost cascade those of its components, of what is thick enough to show
     in the region, that are not small, and the bricks around them; of the other cascades all."""
-    from scipy import ndimage
-
-    from efficientnerf.asset.region import inside_share, voxel_centres
-
     if tree.region is None:
         return np.ones(len(tree.voxel_index), bool)
     keep = (inside_share(tree.region, voxel_centres(tree)) > 0) & (tree.density_values * voxel_sides(tree) > MIN_THICKNESS)
@@ -101,8 +93,6 @@ def unsupported_components(tree: NerfTree, keep: np.ndarray, share: float, sampl
 
 def _label(tree: NerfTree, brick_index: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of a cascade the component of each coarse cell, 0 where it holds no voxel that is kept; the number of voxels of each component; and the cells of any."""
-    from scipy import ndimage
-
     brick = brick_index.reshape(-1)
     cells = np.flatnonzero(brick >= 0)
     rows = tree.voxel_index[brick[cells]]

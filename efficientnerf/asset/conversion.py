@@ -10,10 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascade_tree, cascades_of, nested, subset, voxel_cascades
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, nested, subset, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.rendering.harmonics import harmonics_count
 
 SAMPLES_AT_ONCE = 2**20

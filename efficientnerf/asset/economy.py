@@ -19,8 +19,10 @@ import numpy as np
 from efficientnerf.asset.cascades import bricks_of, cascades_of, order_of, voxel_sides
 from efficientnerf.asset.file import packed, streams
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.quantisation import ENTRIES, LIMIT, base_codes, clustered, quantised_density
+from efficientnerf.asset.quantisation import ENTRIES, LIMIT, base_codes, clustered, compacted, quantised_density
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.entropy import choices, walks
+from efficientnerf.backends.pieces import pieces
 from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0
 
@@ -48,8 +50,6 @@ class _Voxels:
 
     def pieces(self) -> Any:
         """Slices of the voxels of the longest slice of the file."""
-        from efficientnerf.backends.pieces import pieces
-
         return pieces(int(np.diff(self.first).max()), first=1024)
 
 
@@ -97,8 +97,6 @@ def economy_of(tree: NerfTree, weight: np.ndarray | None = None, entries: int = 
 def economised(tree: NerfTree, weight: np.ndarray | None = None, rate: float = DEFAULT_RATE, entries: int = ENTRIES) -> NerfTree:
     """The tree with codes for `packed` at a rate, see `Economy.at`; arguments as of `economy_of`."""
     if not len(tree.density_values):
-        from efficientnerf.asset.quantisation import compacted
-
         return compacted(tree, entries)
     return economy_of(tree, weight, entries).at(rate)
 
@@ -130,8 +128,6 @@ def _counted(symbols: np.ndarray, contexts: int, walk: Callable[[Any], None]) ->
 
 def _densities(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Codes (N,) uint8 and their table (T,) float32."""
-    from efficientnerf.backends.numba.entropy import choices, walks
-
     table, codes = np.unique(quantised_density(voxels.density, voxels.side), return_inverse=True)
     codes = codes.reshape(-1).astype(np.uint8)
     side = float(np.max(voxels.side))
@@ -154,8 +150,6 @@ def _densities(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _bases(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Codes (N, 3) uint8 and their table (U, 3) float32."""
-    from efficientnerf.backends.numba.entropy import choices, walks
-
     values = np.ascontiguousarray(voxels.sh[:, 0], np.float32)
     nearest, table = base_codes(values)
     codes = nearest.copy()
@@ -182,8 +176,6 @@ def _slopes(base: np.ndarray) -> np.ndarray:
 
 def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, clusters: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Codes (N, K - 1) uint8 and palette (P, K - 1, 3) float32, halves in value; entries lie by how often the nearest codes name them."""
-    from efficientnerf.backends.numba.entropy import choices
-
     sh, count = voxels.sh, len(voxels.sh)
     slope = np.square(_slopes(sh[:, 0])).mean(axis=1)
     weight = (voxels.worth * slope / (4 * math.pi * rate)).astype(np.float32)
@@ -212,8 +204,6 @@ def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, c
 
 def _code_bits(codes: np.ndarray, voxels: _Voxels, beside: np.ndarray, entries: int) -> tuple[np.ndarray, np.ndarray]:
     """What it costs to repeat a neighbour or not (112, 4), and to name an entry (160, P), in the contexts of one group's codes (N,)."""
-    from efficientnerf.backends.numba.entropy import choices, walks
-
     split, situation = walks.REPEAT_CONTEXTS, beside.copy()
     counts = np.zeros((split + walks.CODE_CONTEXTS, 256), np.int64)
     for begin in range(0, len(codes), streams.PIECE):

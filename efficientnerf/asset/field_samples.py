@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from efficientnerf.asset.bake import Visibility, spread_pixels
+from efficientnerf.backends.numba.bricks import greatest_around, weigh_voxels
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering import environment
@@ -142,8 +143,6 @@ def _boxes_of(samples: FieldSamples, boxes: Sequence[np.ndarray]) -> Iterator[tu
 def cascade_visibility(samples: FieldSamples, grids: Sequence[Grid], brick: int, threshold: float) -> list[Visibility]:
     """The greatest weight of each voxel of nested grids; a sample counts in the innermost one whose box holds it, and along all of its extent: the density
     is taken to be the same throughout. Weights that do not exceed `threshold` are left out."""
-    from efficientnerf.backends.numba.bricks import weigh_voxels
-
     found = []
     hole = np.zeros((2, 3))
     for shape, voxel, low in grids:
@@ -164,8 +163,6 @@ def cascade_visibility(samples: FieldSamples, grids: Sequence[Grid], brick: int,
 
 def seen_weights(visibility: Visibility, indices: np.ndarray, shape: tuple[int, int, int], brick: int) -> np.ndarray:
     """(N, 2) float32: the greatest weight that voxels (N, 3) have on any ray, and that they or those next to them have."""
-    from efficientnerf.backends.numba.bricks import greatest_around
-
     row_of = np.full(math.prod(shape), -1, np.int32)
     row_of[visibility.cells] = np.arange(len(visibility.cells))
     out = np.empty((len(indices), 2), np.float32)

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors.numpy import save as save_tensors
 
-from efficientnerf.asset.cascades import Cascade, brick_ranges, bricks_of, cascades_of, check_cascades
+from efficientnerf.asset.cascades import brick_ranges, bricks_of, cascades_of, check_cascades
 from efficientnerf.asset.file import packed, whole_scene
 from efficientnerf.asset.file.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
 from efficientnerf.asset.file.layouts import LAYOUTS
@@ -22,7 +23,7 @@ from efficientnerf.asset.file.memory import check_memory, needed
 from efficientnerf.asset.file.metadata import MAJOR, STEP_MINOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of, step_size_of
 from efficientnerf.asset.file.serialisation import WRITERS, written_as
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.tree import STEP_SIZE, NerfTree
+from efficientnerf.asset.tree import STEP_SIZE, Cascade, NerfTree
 
 __all__ = ["LAYOUTS", "WRITERS", "FormatError", "contents", "describe", "load", "save", "serialize"]
 
@@ -32,8 +33,6 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
 
     layout  one of WRITERS; by default `compact` where the harmonics are codes already, else `sparse`
     """
-    from safetensors.numpy import save as save_tensors
-
     if tree.outer or tree.environment is not None:
         _check_whole(tree)
     written = written_as(tree, layout)

@@ -17,6 +17,8 @@ import numpy as np
 from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba import kmeans
+from efficientnerf.backends.pieces import pieces
 from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0
 
@@ -111,8 +113,6 @@ def base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def clustered(vectors: np.ndarray, weight: np.ndarray, entries: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Centroids (P, D) float32, halves in value, P <= entries, and the code (n,) of each vector (n, D) float32."""
-    from efficientnerf.backends.numba import kmeans
-
     rng = np.random.Generator(np.random.Philox(key=seed))
     sample = _sample(vectors, weight, max(SAMPLES, 16 * entries), rng)
     centroids = _seeded(sample, entries, rng)
@@ -143,8 +143,6 @@ def _sample(vectors: np.ndarray, weight: np.ndarray, count: int, rng: np.random.
 
 def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.ndarray:
     """k-means++: each next centroid a vector drawn in proportion to its squared distance from those before; fewer where all distances are zero."""
-    from efficientnerf.backends.numba import kmeans
-
     if not len(sample):
         return np.zeros((0, sample.shape[1]), np.float32)
     most = max(SAMPLES // 4, 4 * entries)
@@ -163,9 +161,6 @@ def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.nd
 
 def _nearest(vectors: np.ndarray, centroids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Index of the nearest centroid of each vector, and the squared distance to it."""
-    from efficientnerf.backends.numba import kmeans
-    from efficientnerf.backends.pieces import pieces
-
     found, distance = np.zeros(len(vectors), np.int32), np.zeros(len(vectors), np.float32)
     for part in pieces(len(vectors), first=4096):
         kmeans.nearest_centroids(np.ascontiguousarray(vectors[part].T), centroids, found[part], distance[part])

@@ -5,14 +5,10 @@ N points.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import queries
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 
 def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:

@@ -7,34 +7,13 @@ B bricks, N stored voxels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from efficientnerf.asset.cascades import brick_ranges, cascades_of, subset, voxel_sides
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Similarity
-
-REGIONS = ("foreground", "all")
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """The foreground region, in the tree's frame, z up.
-
-    bounds         (2, 3) least and greatest corner
-    corner_radius  of the four vertical edges: 0 is a box, half of the shorter side a disc in plan
-    fade           width of the band inside of its sides in which opacity fades to nothing
-    bricks         (B,) bool, the bricks that belong to it; None: all
-    """
-
-    bounds: np.ndarray
-    corner_radius: float = 0.0
-    fade: float = 0.0
-    bricks: np.ndarray | None = None
+from efficientnerf.asset.tree import NerfTree, Region
+from efficientnerf.geometry.cameras import Similarity
 
 
 def inside_distance(region: Region, points: np.ndarray) -> np.ndarray:

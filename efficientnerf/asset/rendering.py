@@ -8,20 +8,20 @@ R rays, N stored voxels, K harmonics.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from efficientnerf.asset.cascades import cascades_of
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends import dispatch
+from efficientnerf.backends.numba import rays as kernels
+from efficientnerf.backends.numba.tree.rendering import render_image
+from efficientnerf.backends.numba.tree.surroundings import over_environment
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
 from efficientnerf.rendering.harmonics import basis
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 RAYS_PER_BAND = 2**20  # of supersampled images at once
 MOST_PIXELS = 2**27  # 4 GiB of colours, opacities, depths and normals
@@ -57,13 +57,11 @@ def render(
 
     Raises ValueError for a camera without an image: of no size or of more than MOST_PIXELS, without a focal length, or with numbers that are not finite.
     """
-    from efficientnerf.backends.numba.tree.rendering import render_image
-
     _check_camera(camera, supersample)
     behind = _background(background)
     on_device = dispatch.tree_backend(tree) == "triton"
     if on_device and tree.ndc is None:
-        from efficientnerf.backends.triton import tree as cuda_tree
+        from efficientnerf.backends.triton import tree as cuda_tree  # needs Triton, which is there on CUDA alone
 
         parts = cuda_tree.render_image(cuda_tree.device_tree_of(tree), camera, background=background, supersample=supersample)
         rendering = Rendering(*(part.cpu().numpy() for part in parts))
@@ -112,16 +110,12 @@ def render_rays(
     if tree.ndc is None:
         outputs = Rendering(*dispatch.tree_rays(tree, origins, directions, None, eye, columns))
     else:
-        from efficientnerf.backends.numba import rays as kernels
-
         warped = kernels.warp_rays(tree.ndc, origins, directions)
         colour, opacity, along, normal = dispatch.tree_rays(tree, warped.origins, warped.directions, np.asarray(directions), eye, columns)
         outputs = Rendering(colour, opacity, *kernels.unwarp_hits(tree.ndc, warped, along, normal))
     if behind is not None:
         return replace(outputs, colour=outputs.colour + (1 - outputs.opacity[:, None]) * behind)
     if tree.environment is not None:
-        from efficientnerf.backends.numba.tree.surroundings import over_environment
-
         return replace(outputs, colour=over_environment(tree.environment, directions, outputs.opacity, outputs.colour))
     return outputs
 

@@ -21,14 +21,49 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.cascades import Cascade, brick_ranges, cascades_of
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.region import Region
+from efficientnerf.backends.numba.tree.leaps import leaps as distances
 from efficientnerf.geometry.ndc import WORLD, Frame, Ndc
 from efficientnerf.rendering.harmonics import harmonics_count
 
 LOOKUPS = ("trilinear", "nearest")
 STEP_SIZE, MIN_STEP, MAX_STEP = 0.5, 0.25, 1.0  # voxels: where nothing else is stated, and what may be
+
+
+@dataclass(frozen=True, eq=False)
+class Cascade:
+    """A grid of a tree, in the tree's frame.
+
+    shape        coarse cells along x, y, z
+    voxel        side of a voxel
+    bounds_min   (3,) float64 corner
+    brick_index  shape int32: rows of the tree's `voxel_index`, -1 where a cell is empty
+    """
+
+    shape: tuple[int, int, int]
+    voxel: float
+    bounds_min: np.ndarray
+    brick_index: np.ndarray
+
+    def bounds(self, brick: int) -> np.ndarray:
+        """(2, 3) corners, for so many voxels along a coarse cell."""
+        return np.stack([self.bounds_min, self.bounds_min + np.asarray(self.shape) * brick * self.voxel])
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """The foreground region, in the tree's frame, z up.
+
+    bounds         (2, 3) least and greatest corner
+    corner_radius  of the four vertical edges: 0 is a box, half of the shorter side a disc in plan
+    fade           width of the band inside of its sides in which opacity fades to nothing
+    bricks         (B,) bool, the bricks that belong to it; None: all
+    """
+
+    bounds: np.ndarray
+    corner_radius: float = 0.0
+    fade: float = 0.0
+    bricks: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +180,6 @@ class NerfTree:
 
 def leaps(occupied: np.ndarray) -> np.ndarray:
     """`NerfTree.leap` of coarse cells (X, Y, Z) bool."""
-    from efficientnerf.backends.numba.tree.leaps import leaps as distances
-
     return distances(occupied)
 
 
@@ -207,17 +240,3 @@ def tree_from_voxels(
         lookup=lookup,
         step_size=step_size,
     )
-
-
-def voxel_coordinates(tree: NerfTree) -> np.ndarray:
-    """Coordinates (N, 3) int32 of the stored voxels in their own cascade, in their order."""
-    out = np.empty((len(tree.density_values), 3), np.int32)
-    for cascade, (first, end) in zip(cascades_of(tree), brick_ranges(tree) if tree.outer else [(0, len(tree.voxel_index))], strict=True):
-        owner = np.zeros(end - first, np.int64)
-        cells = np.flatnonzero(cascade.brick_index.reshape(-1) >= 0)
-        owner[cascade.brick_index.reshape(-1)[cells] - first] = cells
-        rows = tree.voxel_index[first:end]
-        brick, local = np.nonzero(rows >= 0)
-        cell = np.stack(np.unravel_index(owner[brick], cascade.shape), axis=-1)
-        out[rows[brick, local]] = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
-    return out

@@ -15,21 +15,19 @@ import functools
 import importlib
 import warnings
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends import Notice
+from efficientnerf.backends.torch.hash_grid import HashLevels
+from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.rendering.compositing import Composite
 from efficientnerf.sampling.samples import Samples
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.backends.torch.hash_grid import HashLevels
-    from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 Backend = Literal["torch", "numba", "triton"]
 
@@ -86,7 +84,7 @@ def triton_usable() -> bool:
     if not torch.cuda.is_available():
         return False
     try:
-        from efficientnerf.backends.triton.adam import adam as probe
+        from efficientnerf.backends.triton.adam import adam as probe  # whether Triton is there is found out here
     except ImportError as error:
         warnings.warn(f"Triton cannot be imported ({error}); plain torch is used on CUDA, many times slower. Install triton.", Notice, stacklevel=3)
         return False

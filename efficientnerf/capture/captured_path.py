@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from efficientnerf.geometry.cameras import Camera
 
@@ -51,7 +52,7 @@ def captured_path(poses: Sequence[np.ndarray], frames: int) -> list[np.ndarray]:
         return [_poses(rows[:1], given)[0]] * frames
     ends = rows[-1] * _sign(rows[0], rows[-1])
     closed = len(rows) > 3 and bool(np.linalg.norm(ends - rows[0]) <= CLOSES * steps.mean())
-    keys = _thinned(_smoothed(rows, closed), closed)
+    keys = _thinned(_smoothed(rows, closed))
     curve = _spline(keys, closed)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], frames + 1)[:-1] if closed else np.linspace(0.0, along[-1], frames)
@@ -85,8 +86,6 @@ def capture_order(rows: np.ndarray) -> np.ndarray:
 
 def _rows(poses: np.ndarray) -> np.ndarray:
     """(C, 7): centres, in units of half of their mean distance from their middle, and unit quaternions; a right angle counts as about 0.77 such units."""
-    from scipy.spatial.transform import Rotation
-
     centres = poses[:, :3, 3]
     size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() / 2
     return np.concatenate([centres / (size if size > 0 else 1.0), Rotation.from_matrix(poses[:, :3, :3]).as_quat()], axis=1)
@@ -94,8 +93,6 @@ def _rows(poses: np.ndarray) -> np.ndarray:
 
 def _poses(rows: np.ndarray, given: np.ndarray) -> list[np.ndarray]:
     """The inverse of `_rows` of the given poses (C, 4, 4)."""
-    from scipy.spatial.transform import Rotation
-
     centres = given[:, :3, 3]
     size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() / 2
     out = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -163,7 +160,7 @@ def _smoothed(rows: np.ndarray, closed: bool) -> np.ndarray:
     return out
 
 
-def _thinned(rows: np.ndarray, closed: bool) -> np.ndarray:
+def _thinned(rows: np.ndarray) -> np.ndarray:
     """MAX_KEYS of the rows at most, at even distances along the way."""
     if len(rows) <= MAX_KEYS:
         return rows

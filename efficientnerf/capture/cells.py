@@ -9,6 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from efficientnerf.geometry.cameras import Camera, project
 
@@ -54,8 +57,6 @@ class Cells:
 
 def observed_cells(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], side: float) -> Cells:
     """The cells, of about this side or larger, in which rays end."""
-    from scipy.spatial import cKDTree
-
     ends = np.flatnonzero(np.isfinite(points).all(axis=1))
     while True:
         index = np.floor(points[ends] / side)
@@ -101,10 +102,6 @@ def weight_in_middle(pixels: np.ndarray) -> np.ndarray:
 
 def connected_parts(places: np.ndarray, apart: float) -> tuple[int, np.ndarray]:
     """How many parts places (N, D) form that are connected by steps up to `apart`, and the part (N,) of each."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     pairs = cKDTree(places).query_pairs(apart, output_type="ndarray")
     count, part = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places),) * 2), directed=False)
     return int(count), part

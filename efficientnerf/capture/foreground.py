@@ -14,8 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from efficientnerf.asset.region import Region, inside_distance
+from efficientnerf.asset.region import inside_distance
+from efficientnerf.asset.tree import Region
 from efficientnerf.capture.cells import CENTRAL, CONNECTED, Cells, connected_parts, observed_cells
 from efficientnerf.capture.coverage import meeting_point
 from efficientnerf.capture.supports import Plane, find_supports, rays_that_end, with_feet
@@ -169,8 +171,6 @@ def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.n
 
 def _ending_in_view(cells: Cells, beside: np.ndarray, subject: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(M,) bool: connected parts of the cells beside a subject that end within the pictures, as horns do, and neither go on out of them nor in other cells."""
-    from scipy.spatial import cKDTree
-
     at, out = np.flatnonzero(beside), np.zeros(len(beside), bool)
     if not len(at) or not subject.any():
         return out

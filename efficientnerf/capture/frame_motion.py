@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 
 DETAIL = 640  # px, longest side of the picture in which sharpness is measured
@@ -30,8 +31,6 @@ def sharpness(grey: np.ndarray) -> float:
     Crete et al. 2007, "The blur effect", with squares, which need no blurred picture: the difference of two neighbours that were blurred over n pixels
     is that of two pixels n apart, by n.
     """
-    import cv2
-
     picture = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), NOISE)
     near, far = _energies(picture, 1), _energies(picture, BLUR)
     return float(((near - far / BLUR**2) / (near + FLAT)).min().clip(0.0))
@@ -39,8 +38,6 @@ def sharpness(grey: np.ndarray) -> float:
 
 def _energies(picture: np.ndarray, n: int) -> np.ndarray:
     """(4,) mean squared differences of pixels that are n apart along rows, along columns and along both diagonals."""
-    import cv2
-
     pairs = (
         (picture[:, n:], picture[:, :-n]),
         (picture[n:], picture[:-n]),
@@ -88,16 +85,12 @@ class Motion:
         return self._total
 
     def _set_anchor(self, grey: np.ndarray) -> None:
-        import cv2
-
         corners = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, APART)
         self._anchor, self._lost = grey, 0
         self._corners = self._latest = np.empty((0, 1, 2), np.float32) if corners is None else corners
 
     def _moved(self, grey: np.ndarray) -> float | None:
         """Since the anchor; None where its corners are not found again. Nothing moves in a picture without corners."""
-        import cv2
-
         if len(self._corners) < FEWEST:
             self._set_anchor(grey)  # there may be some now
             self._base = self._total

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 LEAST_SCREEN = 0.05  # of the pixels, that are like the screen
@@ -50,8 +51,6 @@ def key_of(name: str) -> Key:
 
 def keyed(rgb: np.ndarray, key: Key) -> np.ndarray | None:
     """(h, w) uint8: how much of each pixel of an sRGB image (h, w, 3) uint8 is object, 0 to 255; None where too little of it is screen."""
-    import cv2
-
     lab = _lab(cv2.GaussianBlur(rgb, (3, 3), 0))
     like = _candidates(lab, key)
     if key.from_border:
@@ -78,8 +77,6 @@ def _distance(lab: np.ndarray, screen: np.ndarray, key: Key) -> np.ndarray:
 def _mixed(distance: np.ndarray, low: float) -> np.ndarray:
     """(h, w) from 0 to 1: how much of each pixel is object. Beside the screen, a pixel as far from it as the object nearby is object alone; mixed ones lie
     between. Elsewhere whatever differs is object."""
-    import cv2
-
     near = cv2.dilate((distance < low).astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8)) > 0
     whole = np.where(near, np.maximum(cv2.dilate(distance, np.ones((2 * EDGE + 1,) * 2, np.uint8)) - low, RAMP), RAMP)
     return np.asarray(np.clip((distance - low) / whole, 0, 1))
@@ -87,8 +84,6 @@ def _mixed(distance: np.ndarray, low: float) -> np.ndarray:
 
 def _lab(rgb: np.ndarray) -> np.ndarray:
     """(h, w, 3) float32 CIELAB."""
-    import cv2
-
     return np.asarray(cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
 
 
@@ -127,8 +122,6 @@ def _terms(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _touching_border(region: np.ndarray) -> np.ndarray:
     """(h, w) bool: the parts of a region that reach into the border."""
-    import cv2
-
     _, labels = cv2.connectedComponents(region.astype(np.uint8), connectivity=4)
     strip = np.zeros_like(region)
     wide = max(1, round(BORDER * max(region.shape)))
@@ -151,8 +144,6 @@ def without_specks(mask: np.ndarray) -> np.ndarray:
 
 def _parts(region: np.ndarray) -> list[tuple[int, int, Any]]:
     """The connected parts of a region: their place by size, the largest 0; pixels; and where they are, a mask of the whole picture."""
-    import cv2
-
     count, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=8)
     order = sorted(range(1, count), key=lambda part: -int(stats[part, cv2.CC_STAT_AREA]))
     return [(number, int(stats[part, cv2.CC_STAT_AREA]), labels == part) for number, part in enumerate(order)]

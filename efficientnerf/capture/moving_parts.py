@@ -11,7 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
 
@@ -98,9 +101,6 @@ def _one_motion(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _photographs_of(joined: np.ndarray, image_of: np.ndarray) -> np.ndarray:
     """(N,) of each feature the number of photographs in which it is found again, itself included, by the pairs (E, 2) of features that are joined."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     size = len(image_of)
     graph = coo_array((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(size, size))
     count, track = connected_components(graph, directed=False)
@@ -110,9 +110,6 @@ def _photographs_of(joined: np.ndarray, image_of: np.ndarray) -> np.ndarray:
 
 def share_of_parts(places: np.ndarray, camera: Camera) -> float:
     """The share of the picture inside of the outlines of the parts: features (N, 2) that are near to each other, OF_A_PART or more."""
-    import cv2
-    from scipy.sparse.csgraph import connected_components
-
     places = np.unique(np.round(places), axis=0)  # a feature may have two directions
     if len(places) < OF_A_PART:
         return 0.0

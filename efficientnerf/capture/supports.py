@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from efficientnerf.capture.cells import CONNECTED, Cells, connected_parts
 from efficientnerf.geometry.cameras import Camera
@@ -126,8 +127,6 @@ Outline = tuple[np.ndarray, np.ndarray]
 def _outline(places: np.ndarray, apart: float) -> Outline | None:
     """The convex hull of the largest connected parts of places (N, 2): its middle (2,) and its sides (S, 2), each the normal over the distance of a side from
     the middle; None where it has no area."""
-    from scipy.spatial import ConvexHull, QhullError
-
     _, part = connected_parts(places, apart)
     size = np.bincount(part)
     try:

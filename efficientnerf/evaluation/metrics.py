@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from skimage.metrics import structural_similarity
 
 WINDOW = 11  # pixels a side of SSIM's Gaussian window
 BAND = 256  # rows of an image that are compared at a time
@@ -81,8 +82,6 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     Wang, Bovik, Sheikh and Simoncelli 2004, equation 13, with an 11 x 11 Gaussian of sigma 1.5, K1 = 0.01, K2 = 0.03 and population (not sample)
     covariances, as in the NeRF literature.
     """
-    from skimage.metrics import structural_similarity
-
     image, truth, _ = _checked(image, truth, None)
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"ssim: an image of {image.shape[1]} x {image.shape[0]} pixels is smaller than the window of {WINDOW} x {WINDOW}")

@@ -10,7 +10,6 @@ R rays.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,10 +17,8 @@ import torch
 from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.rendering import ray_parts
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.ndc import ndc_distance, world_distance
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 MARGIN_DEPTH = 0.02
 MARGIN_VOXELS = 3.0

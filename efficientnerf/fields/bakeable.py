@@ -9,7 +9,7 @@ from efficientnerf.rendering.harmonics import basis
 
 
 class BakeableField(nn.Module):
-    """A field of `efficientnerf.fields` whose `forward` takes points (N, 3) alone."""
+    """A field (`efficientnerf.fields.field`) whose `forward` takes points (N, 3) alone."""
 
     degree: int
 

@@ -34,7 +34,7 @@ def level_sizes(levels: int, log2_table: int, coarsest: int, finest: int) -> tup
 
 
 class HashField(BakeableField):
-    """hidden x layers ReLU network over 2L features; see `efficientnerf.fields`."""
+    """hidden x layers ReLU network over 2L features; see `efficientnerf.fields.field`."""
 
     activation = "exp"
 

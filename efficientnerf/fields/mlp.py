@@ -48,7 +48,7 @@ def linear_layers(shapes: list[tuple[int, int]], generator: torch.Generator) -> 
 
 
 class MlpField(BakeableField):
-    """`layers` of `hidden` units; the input enters again in the middle. See `efficientnerf.fields`.
+    """`layers` of `hidden` units; the input enters again in the middle. See `efficientnerf.fields.field`.
 
     precision  "auto", "float32" or "bfloat16": what products are computed in (`efficientnerf.backends.torch.linear_chain`)
     """

@@ -21,7 +21,7 @@ DIRECTION_FREQUENCIES = 4
 
 
 class NerfField(nn.Module):
-    """See `efficientnerf.fields`; its values are the density and the colour before its sigmoid."""
+    """See `efficientnerf.fields.field`; its values are the density and the colour before its sigmoid."""
 
     activation = "softplus"
     degree = 0  # one coefficient a colour, of a constant

@@ -191,7 +191,7 @@ def _like(constant: np.ndarray, value: Any) -> Any:
     """The constant in the kind, type and device of `value`."""
     if _is_numpy(value):
         return np.asarray(constant, value.dtype)
-    from efficientnerf.backends import transfer
+    from efficientnerf.backends import transfer  # finding cameras needs no torch
 
     return transfer.constant(constant, value)
 
@@ -203,7 +203,7 @@ def _one(value: Any) -> Any:
 def _where(condition: Any, yes: Any, no: Any) -> Any:
     if _is_numpy(condition):
         return np.where(condition, yes, no)
-    import torch
+    import torch  # finding cameras needs none
 
     return torch.where(condition, yes, no)
 
@@ -215,6 +215,6 @@ def _at_least(value: Any, least: float) -> Any:
 def _stack(parts: list[Any]) -> Any:
     if _is_numpy(parts[0]):
         return np.stack(parts, axis=-1)
-    import torch
+    import torch  # finding cameras needs none
 
     return torch.stack(parts, dim=-1)

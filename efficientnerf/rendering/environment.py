@@ -10,12 +10,10 @@ H, W rows and columns, R rays.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    from torch import Tensor
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
 
 
 def directions_of(height: int, width: int) -> np.ndarray:
@@ -42,8 +40,6 @@ def lookup(environment: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 def lookup_on(environment: Tensor, directions: Tensor) -> Tensor:
     """`lookup` on the tensors' device."""
-    import torch
-
     height, width = environment.shape[:2]
     column = (torch.atan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) + 0.5) * width - 0.5
     # The angle by both of its sides: in float32 the arc cosine loses half of the digits at the poles.
@@ -70,8 +66,6 @@ SURE = 4.0  # weight of a texel at which half of its colour is its own
 def filled(total: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """A map (H, 2 H, 3) float32 of weighted sums of colours (H, 2 H, 3): where the weight (H, 2 H) is small, what is known around it fades in, from near and
     far, and where nothing is known at all `mean` (3,)."""
-    from scipy.ndimage import gaussian_filter
-
     known = weight.sum()
     out = np.broadcast_to(np.asarray(mean if known < 1e-6 else total.reshape(-1, 3).sum(axis=0) / known, np.float64), total.shape)
     sigma = len(total) / 4

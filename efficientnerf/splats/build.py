@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.splats.gaussians import MAX_DEGREE, Gaussians
 from efficientnerf.splats.merging import merged
 from efficientnerf.splats.refit import View, refitted
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 __all__ = ["Budget", "NothingToShow", "View", "gaussians_of_asset"]
 

@@ -15,19 +15,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates, voxel_sides
+from efficientnerf.asset.region import voxel_centres
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree import contributions, queries
+from efficientnerf.backends.numba.tree.cells import cells_of as tree_cells
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
 from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0, basis_numpy
 from efficientnerf.splats.gaussians import MAX_DEGREE, Gaussians, quaternions_from
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 # docs/experiments/splats.md
 RAYS = 2**19  # of all views together that find out which voxels show
@@ -65,10 +66,7 @@ class Shown:
 
 def greatest_weights(tree: NerfTree, cameras: Sequence[Camera], count: int = RAYS) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of about `count` pixels, spread evenly over the pictures."""
-    from efficientnerf.backends.numba.tree import contributions
-    from efficientnerf.backends.numba.tree.cells import cells_of
-
-    grid, found = cells_of(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
+    grid, found = tree_cells(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
     stride = max(1.0, np.sqrt(sum(camera.width * camera.height for camera in cameras) / count))
     for number, camera in enumerate(cameras):
         # Each picture's raster begins elsewhere, so that together they meet more voxels.
@@ -84,10 +82,6 @@ def greatest_weights(tree: NerfTree, cameras: Sequence[Camera], count: int = RAY
 
 def shown_voxels(tree: NerfTree, cameras: Sequence[Camera]) -> Shown:
     """The voxels that the cameras see."""
-    from efficientnerf.asset.cascades import voxel_cascades, voxel_sides
-    from efficientnerf.asset.region import voxel_centres
-    from efficientnerf.asset.tree import voxel_coordinates
-
     weight = greatest_weights(tree, cameras)
     voxels = np.flatnonzero(weight > LEAST_WEIGHT)
     keys = _spread_bits(voxel_coordinates(tree)[voxels].astype(np.int64)) | voxel_cascades(tree)[voxels].astype(np.int64) << 57
@@ -211,8 +205,6 @@ def _gaussians_of_cells(tree: NerfTree, shown: Shown, begin: np.ndarray, degree:
 
 def _normals(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     """(C, 3) down the density's gradient, in the frame; zero where it is flat."""
-    from efficientnerf.backends.numba.tree import queries
-
     return np.asarray(queries.normal_at(tree, points), np.float64)
 
 
@@ -281,8 +273,6 @@ def _directions(count: int) -> np.ndarray:
 
 def environment_shell(tree: NerfTree, most: int, degree: int) -> Gaussians:
     """Far Gaussians in the colours of a tree's environment map; none without one."""
-    from efficientnerf.asset.cascades import cascades_of
-
     count = 0 if tree.environment is None else min(int(SHELL_SHARE * most), SHELL_MOST)
     bounds = cascades_of(tree)[-1].bounds(tree.brick)
     distance = SHELL_DISTANCE * np.linalg.norm(bounds[1] - bounds[0]) / 2

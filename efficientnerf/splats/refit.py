@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.backends.numba.splats import fitting, raster
+from efficientnerf.backends.numba.splats.fitting import Rates
+from efficientnerf.backends.numba.splats.pairs import pairs_of
+from efficientnerf.backends.numba.splats.projection import OPACITY, RECORD, ROTATION, SCALE, project
+from efficientnerf.backends.numba.splats.raster import Picture
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import LANES, LOG_SCALES, gaussians_from, grouped, lens_of, ungrouped, values_of
-
-if TYPE_CHECKING:
-    from efficientnerf.backends.numba.splats.fitting import Rates
-    from efficientnerf.backends.numba.splats.raster import Picture
 
 # docs/experiments/splats.md
 MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
@@ -63,10 +63,6 @@ def refitted(
     background  sRGB colour behind pictures without alpha; None: these are opaque
     reached     called after each step, with their number and the picture's mean squared error of a channel
     """
-    from efficientnerf.backends.numba.splats import fitting, raster
-    from efficientnerf.backends.numba.splats.pairs import pairs_of
-    from efficientnerf.backends.numba.splats.projection import RECORD, project
-
     values, degree = values_of(gaussians), gaussians.degree
     count, sums = len(gaussians), np.zeros((0, raster.SUMS), np.float32)
     moments = np.zeros((len(values), fitting.GRADIENTS + values.shape[1], LANES), np.float32)
@@ -101,8 +97,6 @@ def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: 
 
     The halves lie along the longest axis, beside each other in memory, and begin without momentum.
     """
-    from efficientnerf.backends.numba.splats.projection import OPACITY, ROTATION, SCALE
-
     rows, state = ungrouped(values, len(errors)), ungrouped(moments, len(errors))
     alive = rows[:, OPACITY] > np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
     copies = alive.astype(np.int64)
@@ -135,8 +129,6 @@ def _band(view: View, rng: np.random.Generator) -> View:
 
 def _picture(view: View, background: tuple[float, float, float] | None) -> Picture:
     """As kernels take it."""
-    from efficientnerf.backends.numba.splats.raster import Picture
-
     pixels = view.pixels
     over_all = pixels.shape[2] == 4 or background is None
     if pixels.shape[2] == 3:
@@ -147,8 +139,6 @@ def _picture(view: View, background: tuple[float, float, float] | None) -> Pictu
 
 def _rates(done: float) -> Rates:
     """The rates when so much, 0 to 1, of the steps is done."""
-    from efficientnerf.backends.numba.splats.fitting import Rates
-
     fall = LAST_RATE**done
     rates = np.asarray([MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS], np.float32) * np.float32(fall)
     return Rates(

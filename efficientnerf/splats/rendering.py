@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from efficientnerf.backends.numba.splats import raster
+from efficientnerf.backends.numba.splats.pairs import pairs_of
+from efficientnerf.backends.numba.splats.projection import RECORD, Lens, project
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, fold_radius, rays
 from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.splats.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from efficientnerf.backends.numba.splats.projection import Lens
 
 NEAR = 0.05  # depth in front of which nothing is rendered, units of the training frame
 BESIDE = 0.15  # of the picture's width and height, beside it, up to where derivatives of the projection follow the means; as 3DGS
@@ -36,10 +36,6 @@ def render(gaussians: Gaussians, camera: Camera, background: tuple[float, float,
 
 def render_values(values: np.ndarray, degree: int, camera: Camera, background: tuple[float, float, float] | None = None) -> SplatImage:
     """`render` of Gaussians in groups of sixteen, see `values_of`."""
-    from efficientnerf.backends.numba.splats import raster
-    from efficientnerf.backends.numba.splats.pairs import pairs_of
-    from efficientnerf.backends.numba.splats.projection import RECORD, project
-
     records = np.zeros((len(values) * LANES, RECORD), np.float32)
     project(values, lens_of(camera), degree, records)
     pairs = pairs_of(records, camera.width, camera.height)
@@ -53,8 +49,6 @@ def render_values(values: np.ndarray, degree: int, camera: Camera, background: t
 
 def lens_of(camera: Camera, whole: Camera | None = None) -> Lens:
     """The camera as kernels take it; of a part of a picture with the limits of the whole."""
-    from efficientnerf.backends.numba.splats.projection import Lens
-
     k, fisheye = camera.intrinsics, camera.model == "OPENCV_FISHEYE"
     top, bottom = ("k1", "k2", "k3", "k4" if fisheye else ""), ("", "", "") if fisheye else ("k4", "k5", "k6")
     lens = [k.get(name, 0.0) for name in ("fx", "fy", "cx", "cy", *top, *bottom, "p1", "p2")]

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
 
 OPAQUE = 0.5  # opacity of a pixel from which the surface has to cover it
 FAINT = 0.25  # below which a pixel shows nothing
@@ -47,8 +45,6 @@ class Agreement:
 
 def asset_view(tree: NerfTree, camera: Camera) -> AssetView:
     """What a camera of the training frame sees."""
-    from efficientnerf.asset.rendering import render
-
     seen = render(tree, camera, normals=False)
     return AssetView(camera, seen.opacity, seen.depth)
 

@@ -6,10 +6,10 @@ V vertices, F faces. Everything is in the frame of the volume (`efficientnerf.su
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.surface.agreement import AssetView
 from efficientnerf.surface.colours import surface_colours
 from efficientnerf.surface.fusion import Fusion
 from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_threshold, enclosed_cells, isosurface, silent
@@ -18,9 +18,6 @@ from efficientnerf.surface.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.smoothing import rounds_within, smooth, smooth_normals
 from efficientnerf.surface.visible_parts import Shown, visible_parts
 from efficientnerf.surface.volume import NdcVolume, Volume
-
-if TYPE_CHECKING:
-    from efficientnerf.surface.agreement import AssetView
 
 # Rounds of smoothing normals for each of smoothing, at most, and how sharp the edges are that stay. docs/experiments/surface.md
 NORMALS, FUSED_NORMALS = (1, 6, 0.6), (8, 80, 0.2)  # of surfaces of densities alone, and of fused ones

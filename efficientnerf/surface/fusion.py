@@ -11,16 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.mesh.fusion import CHANNELS, FILLED, fit_planes, fuse
+from efficientnerf.backends.numba.tree.queries import distance_back
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import rays
 from efficientnerf.surface.agreement import AssetView
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 # docs/experiments/surface.md
 ABSORBED = 0.15  # share of the light that is gone at the depths that are fused: half is gone well inside of what is soft
@@ -53,8 +53,6 @@ class Fusion:
 
 def front_depth(tree: NerfTree, view: AssetView) -> np.ndarray:
     """(H, W) float32 depth at which ABSORBED of the light is gone, along the view axis, of the pixels that have a median depth."""
-    from efficientnerf.backends.numba.tree.queries import distance_back
-
     hit = np.isfinite(view.depth)
     y, x = np.nonzero(hit)
     origins, directions = rays(view.camera, np.stack([x, y], -1) + 0.5)
@@ -69,8 +67,6 @@ def front_depth(tree: NerfTree, view: AssetView) -> np.ndarray:
 
 def fusion_of(tree: NerfTree, views: Sequence[AssetView], tick: Callable[[], None]) -> Fusion:
     """What pinhole cameras with images of one size see of a tree, for its inmost cascade. `tick` is called before each; what it raises stops the work."""
-    from efficientnerf.backends.numba.mesh.fusion import CHANNELS, fit_planes
-
     height, width = views[0].depth.shape
     voxel = float(tree.voxel)
     planes = np.empty((len(views), height, width, CHANNELS), np.float32)
@@ -86,10 +82,6 @@ def fusion_of(tree: NerfTree, views: Sequence[AssetView], tick: Callable[[], Non
 
 def fused_opacity(fusion: Fusion, opacity: np.ndarray, low: np.ndarray, bounds_min: np.ndarray, voxel: float) -> np.ndarray:
     """(X, Y, Z) float32 values whose level 1/2 is the surface, from those of the densities, for voxels from `low` on. The outermost MARGIN are of no use."""
-    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
-
-    from efficientnerf.backends.numba.mesh.fusion import FILLED, fuse
-
     wanted = maximum_filter(opacity > EMPTY, size=3).astype(np.uint8)
     wanted[opacity >= HAZE] = FILLED
     distance, weight = (np.zeros(opacity.shape, np.float32) for _ in range(2))

@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.ndimage import binary_dilation, label
+from skimage.measure import marching_cubes
 
+from efficientnerf.asset.region import inside_distance
 from efficientnerf.surface.filled import dense_voxels, filled_blocks, filled_parts
 from efficientnerf.surface.fusion import MARGIN, Fusion, fused_opacity
 from efficientnerf.surface.mesh import compact
@@ -100,8 +103,6 @@ def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> 
 
     A cell counts as dense if one of its voxels is, so that light does not creep in through pinholes of the size of a voxel.
     """
-    from scipy.ndimage import label
-
     grid, pool = _grid(volume), pool_of(volume)
     cells = -(-grid // pool)
     dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
@@ -122,8 +123,6 @@ def _filled_block(volume: Volume, low: np.ndarray, high: np.ndarray, threshold: 
     What is enclosed grows by a few voxels, as far as nothing dense is in the way: into the corners that its coarse cells left out, and
     into pinholes, which it fills. The margin that is read makes the result the same for both blocks that share a plane.
     """
-    from scipy.ndimage import binary_dilation
-
     if enclosed is None:
         return np.asarray(volume.density_block(low, high))
     margin = pool_of(volume) + 1
@@ -150,8 +149,6 @@ def isosurface(
     Marching cubes (Lewiner's, by scikit-image) runs on the opacity f = 1 - 2^(-sigma / threshold) at level 1/2 instead of on sigma: densities
     jump from nothing to hundreds within a voxel, and vertices interpolated on them would all sit at the same end of their edges.
     """
-    from skimage.measure import marching_cubes
-
     grid = _grid(volume)
     starts = [np.arange(-1, grid[axis], block) for axis in range(3)]
     blocks = filled_blocks(volume, [len(each) for each in starts], block)
@@ -197,7 +194,6 @@ def _clipped(volume: Volume, opacity: np.ndarray, low: np.ndarray) -> np.ndarray
     region = volume.region if isinstance(volume, WorldVolume) else None
     if region is None:
         return opacity
-    from efficientnerf.asset.region import inside_distance
 
     corners = np.stack(np.meshgrid(*([0, side - 1] for side in opacity.shape), indexing="ij"), -1).reshape(-1, 3)
     at = [np.asarray(volume.bounds_min) + (low + index + 0.5) * volume.voxel for index in (corners, np.argwhere(np.ones(opacity.shape, bool)))]

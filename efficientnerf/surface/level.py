@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from scipy.ndimage import binary_dilation
 
+from efficientnerf.asset.rendering import ray_parts
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree.queries import density_at
 from efficientnerf.geometry.cameras import rays
 from efficientnerf.surface.agreement import OPAQUE, AssetView
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.volume import volume_of
 
 LEVELS = 2.0 ** (-np.arange(9) / 2)  # of the highest level
 EDGE = 2  # pixels on either side of the silhouettes' edges that are looked at
@@ -43,8 +45,6 @@ def silhouette_level(tree: NerfTree, views: Sequence[AssetView], highest: float,
 
 def _near_edges(view: AssetView) -> tuple[np.ndarray, np.ndarray]:
     """Pixels near the edges of a view's silhouette: whether they are opaque (R,), and their centres (R, 2)."""
-    from scipy.ndimage import binary_dilation
-
     opaque = view.opacity >= OPAQUE
     near = binary_dilation(opaque, iterations=EDGE) & binary_dilation(~opaque, iterations=EDGE)
     row, column = np.nonzero(near)
@@ -54,9 +54,6 @@ def _near_edges(view: AssetView) -> tuple[np.ndarray, np.ndarray]:
 
 def surfaces_met(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """(R, L) bool: which rays of the world meet the surfaces at levels (L,) of a tree of one grid, by samples a voxel apart at most."""
-    from efficientnerf.backends.numba.tree.queries import density_at
-    from efficientnerf.surface.volume import volume_of
-
     plain = volume_of(tree).tree
     # A tree's density is interpolated, so that with opacities in its place these are.
     opaque = [replace(plain, density_values=(1 - np.exp2(-plain.density_values.astype(np.float64) / level)).astype(np.float32)) for level in levels]
@@ -69,10 +66,6 @@ def surfaces_met(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, le
 
 def _samples(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Samples along rays, some rays at a time: their rays (S,) and points of the tree's frame (S, 3)."""
-    import torch
-
-    from efficientnerf.asset.rendering import ray_parts
-
     warped = tree.frame.rays(origins, directions)
     (_, begin, end), *_ = ray_parts(tree, torch.from_numpy(warped.origins), torch.from_numpy(warped.directions))
     first, length = begin.numpy(), np.maximum((end - begin).numpy(), 0.0)

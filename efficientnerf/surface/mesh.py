@@ -7,7 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import fast_simplification
 import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +85,6 @@ def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F,) areas."""
-    import trimesh
-
     return np.asarray(trimesh.triangles.area(vertices[faces]))
 
 
@@ -125,8 +126,6 @@ def face_neighbours(faces: np.ndarray, count: int) -> np.ndarray:
 
 def face_components(faces: np.ndarray, count: int) -> np.ndarray:
     """(F,) the connected component, 0..C-1, of each face; `count` is the number of vertices. Components are numbered by their first vertex."""
-    import trimesh
-
     if not len(faces):
         return np.zeros(0, np.int64)
     label = trimesh.graph.connected_component_labels(trimesh.geometry.faces_to_edges(faces), node_count=count)
@@ -136,8 +135,6 @@ def face_components(faces: np.ndarray, count: int) -> np.ndarray:
 
 def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
     """Whether the mesh is closed, and its components."""
-    import trimesh
-
     if not len(faces):
         return Topology(False, 0, 0, 0)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -154,7 +151,7 @@ def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """
     for _ in range(8):
         distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-        faces = faces[distinct & ~_folded(faces, len(vertices))]
+        faces = faces[distinct & ~_folded(faces)]
         corners = vertices[faces]  # (F, 3, 3)
         length = np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=2)  # (F, 3) of the edge from each corner to the next
         flat = np.linalg.norm(face_vectors(vertices, faces), axis=1) <= 1e-10 * length.max(1) ** 2
@@ -173,7 +170,7 @@ def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return compact(vertices, faces)
 
 
-def _folded(faces: np.ndarray, count: int) -> np.ndarray:
+def _folded(faces: np.ndarray) -> np.ndarray:
     """(F,) faces that cancel with another face on the same three vertices, in pairs."""
     ordered = np.sort(faces, 1)
     _, group = np.unique(ordered, axis=0, return_inverse=True)
@@ -264,9 +261,6 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[np.n
     Where the quadrics of a collapse are nearly singular its best place may lie far off the surface, a spike: a vertex that is further than
     a mean edge from all former vertices goes to the nearest of them.
     """
-    import fast_simplification
-    from scipy.spatial import cKDTree
-
     if len(faces) <= budget:
         return vertices, faces
     # Around the origin and of size one: the library works partly in single precision.

@@ -9,22 +9,18 @@ F faces.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.asset.cascades import Cascade, cascade_tree, cascades_of, voxel_cascades
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, voxel_cascades
+from efficientnerf.asset.tree import Cascade, NerfTree, Region
+from efficientnerf.surface.agreement import AssetView
 from efficientnerf.surface.extraction import cleaned_surface, points, spread, surface
 from efficientnerf.surface.fusion import Fusion, fusion_of
 from efficientnerf.surface.isosurface import NoSurface, Progress
 from efficientnerf.surface.mesh import Mesh, PointCloud, compact, face_areas
 from efficientnerf.surface.visible_parts import Shown
 from efficientnerf.surface.volume import volume_of
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.region import Region
-    from efficientnerf.surface.agreement import AssetView
 
 MIN_FACES = 20
 SKIPPED = 2  # of the views whose depths are fused, one in so many has its silhouette fitted

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from efficientnerf.backends.numba.mesh.rasterise import rasterise, row_spans
 from efficientnerf.backends.pieces import pieces
-from efficientnerf.geometry.cameras import Camera, project, rays
+from efficientnerf.geometry.cameras import Camera, project
 
 BANDS = 16  # of rows, that threads share
 FIRST = 4096  # faces in the first piece
@@ -36,8 +37,6 @@ class MeshImage:
 def mesh_image(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> MeshImage:
     """What of a mesh each pixel's centre meets first, from either side. Edges are straight between the distorted places of their ends; faces that reach behind
     the camera, or beyond what its lens shows, are left out."""
-    from efficientnerf.backends.numba.mesh.rasterise import rasterise, row_spans
-
     pixels, depth = project(camera, vertices)
     near = np.zeros((camera.height, camera.width), np.float32)
     shown = np.full((camera.height, camera.width), -1, np.int32)
@@ -48,11 +47,3 @@ def mesh_image(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> MeshI
         rasterise(pixels, depth, faces, rows, part.start, part.stop, min(BANDS, camera.height), near, shown)
     with np.errstate(divide="ignore"):
         return MeshImage(shown, np.where(shown >= 0, np.float32(1) / near, np.float32(np.inf)).astype(np.float32))
-
-
-def shown_points(image: MeshImage, camera: Camera) -> np.ndarray:
-    """(M, 3) float64 world points of the pixels that show a face, row by row."""
-    hit = image.covered
-    y, x = np.nonzero(hit)
-    origins, directions = rays(camera, np.stack([x, y], -1) + 0.5)
-    return np.asarray(origins + (image.depth[hit] / (directions @ camera.forward))[:, None] * directions)

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from efficientnerf.backends.numba.mesh.shade import shade
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project, resized, rows_of
-from efficientnerf.surface.mesh import Mesh, Texture
+from efficientnerf.surface.mesh import Mesh, Texture, face_areas
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 
 SAMPLES = 4  # along each side of a pixel. docs/experiments/textures.md
@@ -85,8 +86,6 @@ class Shader:
         return images[-1], images[0]
 
     def _shaded(self, seen: MeshImage, pixels: np.ndarray, depth: np.ndarray, samples: int, *, textured: bool) -> ColouredImage:
-        from efficientnerf.backends.numba.mesh.shade import shade
-
         height, width = (side // samples for side in seen.face.shape)
         colour = np.zeros((height, width, 3), np.float32)
         texture = NO_TEXTURE if self.pyramid is None or not textured else (self.coordinates, self.pyramid.texels, self.pyramid.levels)
@@ -115,7 +114,6 @@ def vertex_colours(mesh: Mesh, parts: int = 3) -> np.ndarray:
     """(V, 3) float32 sRGB colours of the vertices that come nearest to the mesh's texture: its means round each vertex, weighted by area and by how much the
     vertex counts there. Vertices without a face keep theirs. `parts`: places along a side of each face."""
     assert mesh.texture is not None
-    from efficientnerf.surface.mesh import face_areas
 
     area = face_areas(mesh.vertices, mesh.faces)
     sums, total = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.surface.agreement import OPAQUE, AssetView
@@ -61,8 +62,6 @@ def fitted_to_silhouettes(
 
 def _moves(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, camera: Camera, edge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices on the surface's silhouette in a view, and how far outward (N,) the asset's lies there, in units of the world. `edge`: of `_asset_edge`."""
-    from scipy.ndimage import map_coordinates
-
     pixels, depth = project(camera, vertices)
     towards = vertices - camera.centre
     cosine = (towards * normals).sum(1) / np.linalg.norm(towards, axis=1)
@@ -84,16 +83,12 @@ def _finer(camera: Camera) -> Camera:
 
 def _asset_edge(view: AssetView) -> np.ndarray | None:
     """`_distance_inside` of the asset's silhouette, FINER times as many pixels along a side: its opacity is interpolated between pixels."""
-    from scipy.ndimage import map_coordinates
-
     rows, columns = ((np.arange(FINER * side) + 0.5) / FINER - 0.5 for side in view.opacity.shape)
     return _distance_inside(map_coordinates(view.opacity, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest") >= OPAQUE)
 
 
 def _distance_inside(mask: np.ndarray) -> np.ndarray | None:
     """(H, W) float32 pixels from the edge of a silhouette, positive inside; None where it has no edge."""
-    from scipy.ndimage import distance_transform_edt
-
     if mask.all() or not mask.any():
         return None
     return np.where(mask, distance_transform_edt(mask) - 0.5, 0.5 - distance_transform_edt(~mask)).astype(np.float32)

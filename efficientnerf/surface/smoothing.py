@@ -9,7 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
+from efficientnerf.backends.numba.mesh.normals import smooth_face_normals
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.surface.mesh import face_neighbours, face_vectors, vertex_normals
 
@@ -43,8 +45,6 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
     thin parts would shrink to nothing. Zheng et al., "Bilateral normal filtering for mesh denoising", TVCG 2011; Sun et al., "Fast and effective
     feature-preserving mesh denoising", TVCG 2007.
     """
-    from scipy.sparse import csr_matrix
-
     if rounds <= 0 or not len(faces):
         return vertices
     normals, _ = smoothed_face_normals(vertices, faces, rounds, sharpness)
@@ -75,8 +75,6 @@ def smoothed_face_normals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(F, 3) unit normals of faces after `rounds` of bilateral smoothing (`smooth_normals`), and twice their areas (F,). `tick` is called often; what it
     raises stops the work."""
-    from efficientnerf.backends.numba.mesh.normals import smooth_face_normals
-
     vectors, beside = face_vectors(vertices, faces), face_neighbours(faces, len(vertices))
     area = np.linalg.norm(vectors, axis=1)
     normals = vectors / np.maximum(area, 1e-300)[:, None]
@@ -91,8 +89,6 @@ def smoothed_face_normals(
 
 def vertex_neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:
     """Which vertices share an edge, a sparse matrix (V, V) of ones, and how many there are of each (V, 1), at least one."""
-    from scipy.sparse import csr_matrix
-
     tail, head = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
     rows, columns = np.concatenate([tail, head]), np.concatenate([head, tail])
     neighbours = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))

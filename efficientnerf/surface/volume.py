@@ -10,18 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from efficientnerf.asset import queries
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.backends.numba.tree import queries as frame_queries
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.region import Region
-    from efficientnerf.asset.tree import NerfTree
 
 VOXELS_AT_ONCE = 2**20  # of bricks, while dense voxels are found
 FARTHEST = 50.0  # times the near plane's depth: the far limit where the asset does not say

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import LEAST_RESOLUTION, Auto, Count, Fraction, NonNegative, Off, PositiveInt, Seed, setting
+from efficientnerf.settings import LEAST_RESOLUTION, Auto, Count, Fraction, NonNegative, Off, PositiveInt, Seconds, Seed, setting
 
 # What `auto` means for train.log2_hashmap_size and train.finest_resolution in bounded scenes.
 LOG2_TABLE = 17
@@ -19,13 +19,13 @@ class TrainSettings:
     """How a field is trained. The defaults are for two CPU cores (`preview`)."""
 
     iterations: PositiveInt = setting(4000, "Optimisation steps.")
-    time_budget: Annotated[float, Meta(gt=0.0)] | Off = setting(
+    time_budget: Seconds | Off = setting(
         "off", "Time of the stage, in place of a number of steps: steps are timed, and as many are taken as fit; off: train.iterations steps.", unit="seconds"
     )
-    sample_batch_size: PositiveInt | Off = setting(
+    sample_batch_size: Annotated[int, Meta(ge=1, le=1 << 26)] | Off = setting(
         65536, "Target number of samples in a step, from which the number of rays follows; off: always max_rays_per_batch rays.", advanced=True
     )
-    max_rays_per_batch: PositiveInt = setting(8192, "Most rays in a step.", advanced=True)
+    max_rays_per_batch: Annotated[int, Meta(ge=1, le=1 << 22)] = setting(8192, "Most rays in a step.", advanced=True)
     seed: Seed = setting(0, "Seed of every random choice in training.")
     field: Literal["hash", "mlp", "nerf"] = setting(
         "hash", "Kind of field: a multiresolution hash grid (hash), the paper's networks (mlp), or those of the original NeRF, which cannot be baked (nerf)."
@@ -70,11 +70,13 @@ class TrainSettings:
     near_plane: NonNegative | Auto = setting(
         "auto", "Where rays begin along the view axis, in the capture's units (the paper: 2 for synthetic scenes); auto: the scene's.", advanced=True
     )
-    far_plane: Annotated[float, Meta(gt=0.0)] | Auto = setting(
+    far_plane: Annotated[float, Meta(ge=1e-9, le=1e6)] | Auto = setting(
         "auto", "Where rays end along the view axis, in the capture's units (the paper: 6); N_c samples lie between near and far then; auto: the scene's.",
         advanced=True,
     )  # fmt: skip
-    pivotal_threshold: Fraction = setting(1e-4, "Weight epsilon above which a coarse sample is pivotal.", advanced=True)
+    pivotal_threshold: Annotated[float, Meta(ge=0.0, le=0.01)] = setting(
+        1e-4, "Weight epsilon above which a coarse sample is pivotal.", advanced=True
+    )
     max_pivots: Annotated[int, Meta(ge=1, le=4096)] = setting(
         8, "Most pivotal samples on a ray; those of least weight are dropped (the paper drops none).", advanced=True
     )
@@ -133,7 +135,7 @@ class TrainSettings:
         0.0, "Fraction of the rays of a step on which pruned samples are evaluated too (the authors' release: 0.01).", advanced=True
     )
     occupancy_warmup_steps: Count = setting(256, "First steps, in which no density voxel is pruned.", advanced=True)
-    learning_rate: NonNegative = setting(2e-2, "Learning rate of Adam after the first steps (the paper: 5e-4).", advanced=True)
+    learning_rate: Fraction = setting(2e-2, "Learning rate of Adam after the first steps (the paper: 5e-4).", advanced=True)
     lr_final_ratio: Fraction = setting(0.05, "Ratio to which the learning rate falls exponentially over lr_decay_steps.", advanced=True)
     lr_decay_steps: PositiveInt | Auto = setting(
         "auto", "Steps in which the learning rate falls to lr_final_ratio of itself (the paper: 500,000); auto: all steps.", advanced=True

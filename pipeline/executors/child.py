@@ -189,7 +189,8 @@ class Children:
     def work(self, request: Mapping[str, Any], report: Report, *, cores: int, gpus: Sequence[int] = ()) -> Event:
         """What the child of a run answers to a request; never raises.
 
-        request  {"kind": "prepare" | "stage" | "finish", "run": path, ...}; "stage" with "stage", "device", "memory" (bytes or None)
+        request  {"kind": "prepare" | "stage" | "finish", "run": path, ...}; "prepare" with "scene" and "memory" (bytes or None), "stage" with "stage",
+                 "device" and "memory"
         cores    that it computes on
         gpus     CUDA devices that it sees
         """

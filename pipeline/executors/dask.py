@@ -189,8 +189,8 @@ _lock = threading.Lock()
 
 def _work(task: dict[str, Any], topic: str, module: str) -> dict[str, Any]:
     """Do a task in a child of this worker; its events go to the topic."""
-    from distributed import get_worker
-    from distributed.worker import thread_state
+    from distributed import get_worker  # an extra
+    from distributed.worker import thread_state  # an extra
 
     worker, key = get_worker(), thread_state.key
     with _lock:

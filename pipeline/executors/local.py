@@ -85,7 +85,7 @@ def peak_memory() -> int:
 def peak_memory_of_children() -> int:
     """Bytes of the largest child that has ended; 0 where the system does not say."""
     with contextlib.suppress(ImportError):
-        import resource
+        import resource  # not on Windows
 
         return _bytes(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
     return 0

@@ -37,8 +37,8 @@ class Program(Protocol):
     @property
     def stages(self) -> Sequence[Stage]: ...
 
-    def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
-        """Make the run of a scene, or bring its settings up to date; returns warnings. Raises PipelineError."""
+    def prepare(self, run: Path, scene: dict[str, Any], memory: int | None) -> list[str]:
+        """Make the run of a scene, or bring its settings up to date; returns warnings, also of stages in this much memory. Raises PipelineError."""
 
     def describe(self, run: Path) -> dict[str, Any]:
         """What fleet.json shows of a run as it is now: "metrics", "bytes", "verdict", "result"."""
@@ -111,7 +111,7 @@ def serve(program: Program) -> None:
 def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dict[str, Any]:
     path = Path(request["run"])
     if request["kind"] == "prepare":
-        for text in program.prepare(path, request["scene"]):
+        for text in program.prepare(path, request["scene"], request["memory"]):
             channel.warn("", text)
         found = _survey(program, path)
         return {"stages": found, "finished": program.is_finished(path), **_estimates(program, path, found, request, channel), **program.describe(path)}

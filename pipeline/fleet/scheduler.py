@@ -216,7 +216,7 @@ class Scheduler:
         if each.what == "prepare":
             scene = each.state.scene()
             plain = {"name": scene.name, "sources": list(scene.sources), "settings": scene.settings, "preset": scene.preset, "seed": scene.seed}
-            request |= {"scene": plain}
+            request |= {"scene": plain, "memory": worker.share_of_memory}
         elif each.what in self.stages:
             donor = self._donor(each)
             facts = {"stage": each.what, "device": self.device if self.stages[each.what].uses_device else "cpu", "memory": memory}

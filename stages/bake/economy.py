@@ -8,16 +8,21 @@ are fitted to the images, which changes no file's size. An attempt that was stop
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset import economy
+from efficientnerf.asset.cascades import subset
+from efficientnerf.asset.economy import economised
+from efficientnerf.asset.format import serialize
+from efficientnerf.asset.refinement import fit
+from efficientnerf.asset.refinement.quantised import refit
+from efficientnerf.asset.refinement.targets import Targets
+from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
+from stages.bake.refine.refinement import ERROR_RAYS, targets_on_device
 from stages.bake.refine.timing import PACKING_TRIES, REFIT_STEPS
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.refinement.targets import Targets
-    from efficientnerf.asset.tree import NerfTree
+from stages.train.log import psnr_of
 
 # docs/experiments/packed.md
 FILL, AIM = 0.97, 0.985  # of the size, at least, where codes could be finer; and what is aimed at
@@ -34,12 +39,6 @@ def packed_tree(job: Job, tree: NerfTree, targets: Targets, size: int) -> tuple[
 
     targets  what voxels are weighed by, and tables are fitted to
     """
-    from efficientnerf.asset.economy import economised
-    from efficientnerf.asset.refinement import fit
-    from efficientnerf.asset.refinement.quantised import refit
-    from stages.bake.refine.refinement import ERROR_RAYS, targets_on_device
-    from stages.train.log import psnr_of
-
     settings = job.settings
     coded = _coded(job, tree, targets, size) if len(tree.density_values) else economised(tree)
     targets = targets_on_device(job, coded, targets)
@@ -53,11 +52,6 @@ def packed_tree(job: Job, tree: NerfTree, targets: Targets, size: int) -> tuple[
 
 def _coded(job: Job, tree: NerfTree, targets: Targets, size: int) -> NerfTree:
     """The tree with the finest codes that fit."""
-    from efficientnerf.asset import economy
-    from efficientnerf.asset.cascades import subset
-    from efficientnerf.asset.format import serialize
-    from efficientnerf.asset.refinement import fit
-
     count = min(max(job.settings.visibility_rays, len(tree.density_values)), 4 * len(targets.pixels))
     weight = fit.max_weights(tree, targets, count, job.settings.seed)
     known = economy.economy_of(tree, weight)

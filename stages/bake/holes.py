@@ -5,15 +5,13 @@ N voxels, P rays.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from efficientnerf.asset.cascades import voxels_around
+from efficientnerf.asset.field_samples import FieldSamples
+from efficientnerf.asset.rendering import render_rays
+from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.field_samples import FieldSamples
-    from efficientnerf.asset.tree import NerfTree
 
 FIELD_OPACITY, TREE_OPACITY = 0.95, 0.5  # of a hole: the field's at least, the tree's at most
 RAYS = 2**19  # that are looked along, at most
@@ -23,8 +21,6 @@ END_WEIGHT = 0.02  # of a sample that is part of the surface where a ray ends
 
 def find_holes(job: Job, tree: NerfTree, samples: FieldSamples) -> tuple[np.ndarray, float]:
     """The rays, as places in `samples`, that end in holes; and their share of those that were looked along."""
-    from efficientnerf.asset.rendering import render_rays
-
     every = np.arange(0, len(samples.pixel), max(1, -(-len(samples.pixel) // RAYS)))
     opaque = every[samples.opacity[every] > FIELD_OPACITY]
     found = []
@@ -40,8 +36,6 @@ def find_holes(job: Job, tree: NerfTree, samples: FieldSamples) -> tuple[np.ndar
 
 def voxels_of_holes(tree: NerfTree, samples: FieldSamples, holes: np.ndarray) -> np.ndarray:
     """(N,) bool: the stored voxels around the points at which the field's light ends on the rays `holes`."""
-    from efficientnerf.asset.cascades import voxels_around
-
     out = np.zeros(len(tree.density_values), bool)
     for begin in range(0, len(holes), RAYS_PER_BLOCK):
         part = holes[begin : begin + RAYS_PER_BLOCK]

@@ -4,24 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
 
+import torch
+
+from efficientnerf.asset.bake import grid_of
+from efficientnerf.asset.file.serialisation import bytes_per_voxel, most_voxels
+from efficientnerf.asset.refinement.error_map import MAX_CELLS
+from efficientnerf.asset.refinement.fit import PATCH_SIDE
+from efficientnerf.model import Model
+from efficientnerf.settings import given
+from efficientnerf.training.pixels import PixelRows, Pixels
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
+from stages.artifacts import BakeInputs
+from stages.bake.plan import Plan
+from stages.bake.resolution import MAX_CASCADES, size_limits
+from stages.bake.resolution import MAX_CELLS as MAX_COARSE_CELLS
+from stages.bake.settings import BakeSettings
+from stages.bake.voxels import MAX_OVERSHOOT, finest_choice
+from stages.bake.whole_scene import grids_of
 from stages.cores import count_cores
-from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
+from stages.evaluate.views import constant_background
+from stages.io.field_file import load_renderer
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import Scene, View, views_of
+from stages.memory.forecast import Known
+from stages.memory.need import MIB, Need, has_room, libraries, refuse_what_does_not_fit
 from stages.train.data import channels_of, count_pixels
 from stages.train.memory import DENSITY_VOXEL, PIXELS, parameters, pixels_needed, place_pixels
 from stages.train.pixel_file import PixelFile
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.pixels import PixelRows
-    from efficientnerf.training.settings import TrainSettings
-    from stages.bake.plan import Plan
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene, View
 
 COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement
 PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, those in the order of the file or decoded, two in the refinement
@@ -30,21 +41,10 @@ PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, thos
 # measured on: its number, or of whole scenes the field's samples along its ray, twice while they are joined; of a ray of a refinement step: its records.
 VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 400, 5000
 ERROR_CELL = 48  # bytes of a cell of the error map: two errors, chances, factors and numbers of tiles, and what is made of these
+# Bytes written: of a voxel in a checkpoint besides its values; of a ray, the field's samples of a whole scene. Voxels that a visibility ray shows, of which
+# 4 to 6 were measured. Rays that are refined before a first checkpoint is written.
+WRITTEN, WRITTEN_RAY, SHOWN, SHORT = 24, 700, 8, 20 * 32768
 MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.contributions
-
-
-class AtMost(Protocol):
-    def __call__(self, count: int, *, stored: bool) -> Need:
-        """What baking so many voxels takes; `stored` as for `needed`."""
-
-
-@dataclass(frozen=True)
-class Trained:
-    """What of a field decides how much is baked: its settings, with numbers for what is "auto", its space, and the degree of its harmonics."""
-
-    settings: TrainSettings
-    space: Space
-    degree: int
 
 
 def voxels_needed(voxels: int, harmonics: int, *, packed: bool = False) -> int:
@@ -61,49 +61,41 @@ def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick
 
 def free_on_device(device: str) -> int:
     """Bytes available on a CUDA device: free ones, and those that this process has reserved but not allocated."""
-    import torch
-
     return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
 def needed(
-    settings: BakeSettings, trained: Any, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool,
-    whole: bool, device: str,
-) -> Need:  # fmt: skip
-    """What baking takes.
+    settings: BakeSettings, m: Model, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, whole: bool, device: str
+) -> Need:
+    """What baking a model takes.
 
-    trained   settings of the field
     channels  of the pixels
+    voxels    that are baked
     cells     coarse cells of the finest grids in question
     bricks    that are reached by samples, at most
-    voxels    that are baked
     stored    whether the pixels are in a file
     whole     whether a whole scene is baked
     """
-    from efficientnerf.asset.refinement.error_map import MAX_CELLS
-    from efficientnerf.asset.refinement.fit import PATCH_SIDE
-    from efficientnerf.settings import given
-
-    pixels = pixels_needed(views, channels, stored=stored)
+    pixels, harmonics = pixels_needed(views, channels, stored=stored), (m.fine.degree + 1) ** 2
     rays = min(settings.visibility_rays, count_pixels(tuple(views)))
     return Need({
         PIXELS: pixels[PIXELS],
-        "voxels": max(voxels_needed(voxels, (degree + 1) ** 2, packed=settings.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
+        "voxels": max(voxels_needed(voxels, harmonics, packed=settings.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
         "the grid": CELL * cells + BRICK_VOXEL * settings.brick_size**3 * bricks,
         "rays": (SCENE_RAY if whole else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
         "the error map": ERROR_CELL * min(MAX_CELLS, count_pixels(tuple(views)) // PATCH_SIDE),
-        "the field": 3 * 4 * parameters(trained) + DENSITY_VOXEL * (given(trained.occupancy_resolution) or 192) ** 3 // 4,
+        "the field": 3 * 4 * parameters(m.settings) + DENSITY_VOXEL * (given(m.settings.occupancy_resolution) or 192) ** 3 // 4,
         "libraries": libraries(device),
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     settings, channels = job.settings, channels_of(job.inputs["poses"], views)
-    finest, voxels, at_most = most_needed(settings, Trained(m.settings, m.space, m.fine.degree), s, views, channels, mib, splits, whole, job.device)
+    finest, voxels, at_most = most_needed(settings, m, s, views, channels, mib, whole, job.device)
     stored = not has_room(job, at_most(voxels, stored=False))
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
@@ -114,61 +106,68 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: fl
 
 
 def most_needed(
-    settings: BakeSettings, trained: Trained, s: Scene, views: Sequence[View], channels: int, mib: float, splits: int, whole: bool, device: str
-) -> tuple[int, int, AtMost]:
-    """What baking takes at most, before its voxels are counted.
+    settings: BakeSettings, m: Model, s: Scene, views: Sequence[View], channels: int, mib: float, whole: bool, device: str
+) -> tuple[int, int, Callable[..., Need]]:
+    """What baking a model takes at most, before its voxels are counted.
 
     mib      that the asset may have
-    splits   how often voxels will be split
-    returns  voxels along the finest grid in question; how many are baked at most; and a function from a number of voxels to what it takes
+    returns  voxels along the finest grid in question; how many are baked at most; and `needed` as a function of (voxels, stored=)
     """
-    from efficientnerf.asset.file.serialisation import most_voxels
-    from stages.bake.pruning import most_children
-    from stages.bake.voxels import MAX_OVERSHOOT
+    finest, cells = _finest_cells(settings, m, s, whole=whole)
+    room = most_voxels(int(mib * MIB), settings.layout, m.fine.degree, (1, 1, 1), settings.brick_size)
 
-    finest, cells = _finest_cells(settings, trained, s, whole=whole)
-    room = most_voxels(int(mib * 2**20), settings.layout, trained.degree, (1, 1, 1), settings.brick_size)
-    voxels = min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3)
+    def at_most(voxels: int, *, stored: bool) -> Need:
+        bricks = min(cells, voxels // 8)
+        return needed(settings, m, views, channels, voxels=voxels, cells=cells, bricks=bricks, stored=stored, whole=whole, device=device)
 
-    def at_most(count: int, *, stored: bool) -> Need:
-        about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": trained.degree, "whole": whole, "device": device}
-        return needed(settings, trained.settings, views, channels, **about, stored=stored)
-
-    return finest, voxels, at_most
+    return finest, min(MAX_OVERSHOOT * room, cells * settings.brick_size**3), at_most
 
 
-def _finest_cells(settings: BakeSettings, trained: Trained, s: Scene, *, whole: bool) -> tuple[int, int]:
+def _finest_cells(settings: BakeSettings, m: Model, s: Scene, *, whole: bool) -> tuple[int, int]:
     """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
-    from efficientnerf.asset.bake import grid_of
-    from efficientnerf.settings import given
-    from stages.bake.resolution import MAX_CASCADES, MAX_CELLS
-    from stages.bake.voxels import finest_choice
-    from stages.bake.whole_scene import grids_of
-
-    bounds, discretise = trained.space.bounds, given(trained.settings.discretise)
-    finest = finest_choice(settings, trained, s).resolution
+    bounds, discretise = m.space.bounds, given(m.settings.discretise)
+    finest = finest_choice(settings, m.settings, s).resolution
     if not whole:
         return finest, math.prod(grid_of(bounds, finest, settings.brick_size)[0])
     count = given(settings.cascades) or MAX_CASCADES
     cells = sum(math.prod(shape) for shape, _, _ in grids_of(bounds, finest, settings.brick_size, count, None))
     stated = given(settings.resolution) or given(settings.max_resolution) or discretise
-    return finest, cells if stated else min(cells, 2 * MAX_CELLS)  # coarse cells are more by those that make grids fit each other
+    return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
-def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
+def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: Pixels, plan: Plan, mib: float) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
-    pixels        as they were placed
-    splits, room  how often voxels will be split, and how many there is room for then
+    pixels  as they were placed
     """
-    from stages.bake.pruning import most_children
-
     whole, voxels = plan.samples is not None, plan.voxels
-    if splits:
-        voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
-    bricks = -(-plan.bricks * voxels // max(plan.voxels, 1))
-    about: dict[str, Any] = {"cells": plan.cells * 8**splits, "bricks": bricks, "voxels": voxels, "degree": m.fine.degree, "whole": whole, "device": job.device}
-    need = needed(job.settings, m.settings, views, pixels.images.shape[1], **about, stored=isinstance(pixels.images, PixelFile))
+    grid = {"voxels": voxels, "cells": plan.cells, "bricks": plan.bricks}
+    stored = isinstance(pixels.images, PixelFile)
+    need = needed(job.settings, m, views, pixels.images.shape[1], **grid, stored=stored, whole=whole, device=job.device)
     harmonics = (m.fine.degree + 1) ** 2
     remedy = f"Lower bake.max_mib ({mib:g}) or bake.resolution ({plan.choice.resolution}): {voxels:,} voxels with {harmonics} harmonics are too many."
     refuse_what_does_not_fit(job, need, remedy)
+
+
+def memory_needed(known: Known) -> Need:
+    """What the stage bake takes at most, before its voxels are counted."""
+    return _before(known)[-1]
+
+
+def space_needed(known: Known) -> int:
+    """The field's samples, the values of the voxels as they are baked, a checkpoint of their refinement, two while it is replaced, and the asset."""
+    own, (degree, whole, mib, rays, voxels, _) = known.settings["bake"], _before(known)
+    values, voxels = 4 * (1 + 3 * (degree + 1) ** 2), min(voxels, SHOWN * rays)
+    checkpoints = 1 if own.refine_steps != "auto" and own.refine_steps * own.refine_rays_per_batch < SHORT else 2
+    asset = min(int(mib * MIB), 2 * bytes_per_voxel(own.layout, degree) * voxels)
+    return (values + checkpoints * (values + WRITTEN)) * voxels + asset + whole * WRITTEN_RAY * rays + known.pictures()
+
+
+def _before(known: Known) -> tuple[int, bool, float, int, int, Need]:
+    """(degree of the harmonics, whether a whole scene is baked, MiB of the asset, visibility rays, voxels, what these take of memory), each at most."""
+    own, inputs = known.settings["bake"], known.inputs(BakeInputs)
+    m, s = load_renderer(inputs.train.folder).model, load_scene(inputs.poses.folder, inputs.train.folder)
+    views, whole = views_of(s, "train"), constant_background(s) is None
+    mib = size_limits(own, s, known.device, count_cores(), whole=whole, discretise=given(m.settings.discretise))[1]
+    _, voxels, at_most = most_needed(own, m, s, views, channels_of(inputs.poses.folder, views), mib, whole, known.device)
+    return m.fine.degree, whole, mib, min(own.visibility_rays, count_pixels(views)), voxels, at_most(voxels, stored=False)

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.capture.forward_facing import ForwardFacing
+from efficientnerf.model import Model
+from pipeline.hashes import sha256_of
 from pipeline.stage import Job
 from stages.artifacts import BakeInputs, inputs_of
+from stages.bake.settings import BakeSettings
 from stages.framing.captured import captured_metadata
-
-if TYPE_CHECKING:
-    from efficientnerf.capture.forward_facing import ForwardFacing
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene
+from stages.io.scene import Scene
 
 
 def sources_of(job: Job) -> dict[str, str]:
     """SHA-256 of the files that the asset was made from: cameras and field."""
-    from pipeline.hashes import sha256_of
-
     inputs = inputs_of(BakeInputs, job.inputs)
     return {path.name: sha256_of(path) for path in (inputs.poses.scene, inputs.train.field)}
 
 
-def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
+def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:
     """What an asset needs to be used without its run."""
-    from importlib.metadata import PackageNotFoundError, version
-
     try:
         tool = version("efficientnerf")
     except PackageNotFoundError:

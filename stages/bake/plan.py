@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.field_samples import FieldSamples, Grid
-    from efficientnerf.asset.region import Region
-    from efficientnerf.geometry.spaces import Space
-    from stages.bake.resolution import Choice
+from efficientnerf.asset.field_samples import FieldSamples, Grid
+from efficientnerf.asset.tree import Region
+from efficientnerf.geometry.spaces import Space
+from stages.bake.resolution import Choice
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,30 +7,25 @@ N voxels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.cascades import subset
+from efficientnerf.asset.components import small_components, unsupported_components
+from efficientnerf.asset.field_samples import FieldSamples
+from efficientnerf.asset.refinement import fit
+from efficientnerf.asset.refinement.state import RefinementState, subset_state
+from efficientnerf.asset.refinement.targets import Targets
+from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.bake.holes import find_holes, voxels_of_holes
 from stages.bake.voxels import FEW_VIEWS_RATIO, seen_by_few
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.field_samples import FieldSamples
-    from efficientnerf.asset.refinement.state import RefinementState
-    from efficientnerf.asset.refinement.targets import Targets
-    from efficientnerf.asset.tree import NerfTree
-    from stages.io.scene import Scene
+from stages.io.scene import Scene
 
 # Training rays per voxel that are rendered to see which voxels show, at least bake.visibility_rays; in normalised device coordinates, where no ray
 # misses and each meets many voxels, fewer. docs/experiments/refinement.md
 RAYS_PER_VOXEL, NDC_RAYS_PER_VOXEL = 1.0, 0.25
-CHILDREN_OVERSHOOT = 3.0  # voxels after a split over those that the asset has room for, at most: few of them show
-
-
-def most_children(room: int) -> int:
-    """Voxels after a split, at most, where there is room for so many in the asset."""
-    return max(8, int(CHILDREN_OVERSHOOT * room))
 
 
 @dataclass(frozen=True)
@@ -57,9 +52,6 @@ def prune(
 
     baked  (N,) densities before the first step, of a whole scene
     """
-    from efficientnerf.asset.cascades import subset
-    from efficientnerf.asset.refinement.state import subset_state
-
     state.to_host()
     greatest = greatest_weights(job, state, targets)
     if state.tree.ndc is not None:
@@ -69,11 +61,8 @@ def prune(
         return state, Pruned()
     if samples is None:
         if state.tree.background is None:
-            from efficientnerf.asset.components import small_components
-
             keep &= ~small_components(state.tree, keep, job.settings.min_component)
         return subset_state(state, keep, subset(state.tree, keep)), Pruned()
-    from efficientnerf.asset.components import unsupported_components
 
     assert baked is not None
     keep &= ~unsupported_components(state.tree, keep, job.settings.min_component, samples)
@@ -98,8 +87,6 @@ def count_rays(job: Job, ndc: bool, voxels: int, targets: Targets) -> int:
 
 def greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of many training pixels."""
-    from efficientnerf.asset.refinement import fit
-
     count = count_rays(job, state.tree.ndc is not None, len(state.density), targets)
 
     def progress(done: int, total: int) -> None:

@@ -10,17 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.capture.forward_facing import ForwardFacing
 from efficientnerf.settings import given
 from pipeline.errors import UsageError
-
-if TYPE_CHECKING:
-    from efficientnerf.capture.forward_facing import ForwardFacing
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene
+from stages.bake.settings import BakeSettings
+from stages.io.scene import Scene
 
 MIN_RESOLUTION = 32  # voxels along the longest side
 # docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background, of a whole scene (in its innermost cascade), and in
@@ -45,11 +42,6 @@ class Choice:
 
     resolution: int
     why: str
-
-
-def baked_resolution(resolution: int, splits: int) -> int:
-    """Voxels along the longest side of what is baked, which are split so often to have the asset's resolution."""
-    return -(-resolution // 2**splits)
 
 
 def finest_resolution(s: Scene, most: int | None) -> Choice:

@@ -6,30 +6,31 @@ N voxels, K harmonics.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset import bake
+from efficientnerf.asset.cascades import nested
+from efficientnerf.asset.field_samples import density_as_seen
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.spaces import Space
+from efficientnerf.model import Model
 from pipeline.stage import Job
+from stages.bake.plan import Plan
 from stages.bake.scratch import read_arrays, write_arrays
+from stages.bake.settings import BakeSettings
+from stages.io.scene import Scene
 from stages.scratch import once, unusable
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.spaces import Space
-    from stages.bake.plan import Plan
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene
 
 def baked_values(
-    job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space, name: str = "block"
+    job: Job, m: Model, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space, name: str = "block"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Density (N,) and harmonics (N, K, 3) of voxels (N, 3); blocks of an earlier attempt are read.
 
     name  of the blocks in the scratch folder
     """
-    from efficientnerf.asset import bake
-
     blocks, harmonics = bake.blocks_of(len(indices), points), (m.fine.degree + 1) ** 2
     density, sh = np.empty(len(indices), np.float32), np.empty((len(indices), harmonics, 3), np.float32)
     done = rows = 0
@@ -56,12 +57,8 @@ def baked_values(
     return density, sh
 
 
-def baked_tree(job: Job, m: Any, s: Scene, plan: Plan, metadata: dict[str, Any]) -> NerfTree:
+def baked_tree(job: Job, m: Model, s: Scene, plan: Plan, metadata: dict[str, Any]) -> NerfTree:
     """The tree with the field's values."""
-    from efficientnerf.asset.cascades import nested
-    from efficientnerf.asset.field_samples import density_as_seen
-    from efficientnerf.asset.tree import tree_from_voxels
-
     settings: BakeSettings = job.settings
     trees = []
     for n, ((shape, voxel, low), indices) in enumerate(zip(plan.grids, plan.indices, strict=True)):

@@ -6,23 +6,26 @@ N voxels.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from efficientnerf.asset import bake
+from efficientnerf.asset.bake import Visibility
+from efficientnerf.asset.file import serialisation
+from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.geometry.spaces import NdcSpace, Space
+from efficientnerf.model import Model
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job
+from stages.bake.resolution import MIN_RESOLUTION, Choice, affordable_resolution, finest_resolution, refuse_without_room
 from stages.bake.scratch import read_arrays, write_arrays
+from stages.bake.settings import BakeSettings
+from stages.framing.view_coverage import count_views, has_min_views, kept_pixels
+from stages.io import scene
+from stages.io.scene import Scene
 from stages.scratch import unusable
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.bake import Visibility
-    from efficientnerf.geometry.ndc import Ndc
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.pixels import Pixels
-    from stages.bake.resolution import Choice
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene
 
 MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: of which the refinement keeps the heaviest
 OVERSHOOT = 1.7  # the same where the resolution is chosen: few of the dilated voxels show. docs/experiments/bake-resolution.md
@@ -37,10 +40,8 @@ def well_seen_views(count: int) -> int:
 
 
 
-def voxel_space(job: Job, m: Any) -> Space:
+def voxel_space(job: Job, m: Model) -> Space:
     """The field's space, in a frame where voxels are cubes."""
-    from efficientnerf.geometry.spaces import NdcSpace
-
     depth, discretise, space = given(job.settings.ndc_voxel_depth), given(m.settings.discretise), m.space
     if not isinstance(space, NdcSpace):
         if depth is not None:
@@ -53,12 +54,8 @@ def voxel_space(job: Job, m: Any) -> Space:
     return space if depth == 1 else space.with_voxel_depth(depth)
 
 
-def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
-    """The asset's resolution; the visibility of the voxels to bake, which will be split so often to have it, and their coordinates (N, 3)."""
-    from efficientnerf.asset import bake
-    from efficientnerf.asset.file import serialisation
-    from stages.bake.resolution import MIN_RESOLUTION, affordable_resolution, baked_resolution, refuse_without_room
-
+def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float) -> tuple[Choice, Visibility, np.ndarray]:
+    """The asset's resolution; the visibility of the voxels to bake, and their coordinates (N, 3)."""
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick_size
 
@@ -66,12 +63,12 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
         shape, _ = bake.grid_of(bounds, resolution, brick)
         return serialisation.most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, shape, brick)
 
-    finest = choice = finest_choice(settings, m, s)
+    finest = choice = finest_choice(settings, m.settings, s)
     fixed = (given(settings.resolution) or given(m.settings.discretise)) is not None
     least = finest.resolution if fixed else MIN_RESOLUTION
     refuse_without_room(settings, mib, least, room(least), environment=False)
     if fixed:
-        shape, voxel = bake.grid_of(bounds, baked_resolution(choice.resolution, splits), brick)
+        shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         visibility = by_views(job, s, visibility, shape, voxel, space)
         return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
@@ -94,11 +91,10 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
         return last
 
     choice = affordable_resolution(finest, lambda at: len(at_resolution(at)[2]), lambda at: int(OVERSHOOT * room(at)))
-    baked = baked_resolution(choice.resolution, splits)
-    _, coarse, indices = at_resolution(baked)
+    _, coarse, indices = at_resolution(choice.resolution)
     most = MAX_OVERSHOOT * room(choice.resolution)
     if len(indices) > most:
-        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, baked, brick)[0], most)
+        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, choice.resolution, brick)[0], most)
     return choice, coarse, indices
 
 
@@ -117,28 +113,21 @@ def by_views(job: Job, s: Scene, visibility: Visibility, shape: tuple[int, int, 
 
 def seen_by_few(job: Job, s: Scene, ndc: Ndc, points: np.ndarray) -> np.ndarray:
     """(N,) bool: which points (N, 3) in normalised device coordinates fewer training images have in view than `well_seen_views`, by pixels that are kept."""
-    from stages.framing.view_coverage import count_views, kept_pixels
-    from stages.io import scene
-
     views = scene.views_of(s, "train")
     return count_views(ndc.world(points), [view.camera for view in views], kept_pixels(job.inputs["poses"], views)) < well_seen_views(len(views))
 
 
-def finest_choice(settings: BakeSettings, m: Any, s: Scene) -> Choice:
+def finest_choice(settings: BakeSettings, trained: TrainSettings, s: Scene) -> Choice:
     """The resolution that is stated, or else the finest in question."""
-    from stages.bake.resolution import Choice, finest_resolution
-
     stated: int | None = given(settings.resolution)
-    discretise: int | None = given(m.settings.discretise)
+    discretise: int | None = given(trained.discretise)
     if (fixed := stated or discretise) is not None:
         return Choice(fixed, "bake.resolution" if stated else "train.discretise")
     return finest_resolution(s, given(settings.max_resolution))
 
 
-def _visibility(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visibility:
+def _visibility(job: Job, m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visibility:
     """The visibility of voxels, computed or from an earlier attempt."""
-    from efficientnerf.asset import bake
-
     settings: BakeSettings = job.settings
     kinds = {"cells": ("int64", 1), "greatest": ("float32", 2)}
     stored = read_arrays(job.work / "visibility", kinds, job.warn)
@@ -165,8 +154,6 @@ def _fits(found: Visibility, cells: int, per_cell: int) -> bool:
 
 def _heaviest_voxels(job: Job, visibility: Visibility, shape: tuple[int, int, int], most: int) -> np.ndarray:
     """Coordinates (N, 3) of the visible voxels: about `most` at most, and then those of greatest weight."""
-    from efficientnerf.asset import bake
-
     settings: BakeSettings = job.settings
     threshold = settings.weight_threshold
     indices = bake.chosen_voxels(visibility, shape, settings.brick_size, threshold, settings.dilate)
@@ -189,12 +176,9 @@ def just_below(weight: np.float32) -> float:
 CENTRES_PER_BLOCK = 2**20
 
 
-def with_min_views(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
+def with_min_views(m: Model, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
     """The voxels that at least train.min_views training images have in view, in contracted scenes. The density voxels, which training masked
     elsewhere (`stages.framing.view_coverage`), are larger, and what they hold would stick out as a rim."""
-    from stages.framing.view_coverage import has_min_views
-    from stages.io import scene
-
     if not m.space.contracted or m.settings.min_views == "off":
         return indices
     cameras = [view.camera for view in scene.views_of(s, "train")]

@@ -12,30 +12,52 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.asset.bake import Visibility, chosen_voxels
+from efficientnerf.asset.cascades import cascade_grids
+from efficientnerf.asset.field_samples import (
+    FieldSamples,
+    Grid,
+    cascade_visibility,
+    environment_beyond,
+    field_samples,
+    picture_places,
+    seen_weights,
+    surface_points,
+    weight_by_box,
+)
+from efficientnerf.asset.file.serialisation import most_voxels
+from efficientnerf.asset.tree import Region
+from efficientnerf.capture.foreground import find_foreground
+from efficientnerf.geometry.spaces import Space
+from efficientnerf.model import Model
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import Pixels
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.bake.plan import Plan
+from stages.bake.resolution import (
+    MAX_BEYOND,
+    MAX_CASCADES,
+    MIN_RESOLUTION,
+    Choice,
+    affordable_resolution,
+    finest_of_cascades,
+    refuse_without_room,
+)
 from stages.bake.scratch import read_arrays, write_arrays
-from stages.bake.voxels import just_below
+from stages.bake.settings import BakeSettings
+from stages.bake.voxels import MAX_OVERSHOOT, OVERSHOOT, just_below
+from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
+from stages.io import scene
 from stages.io.json_file import read_json
+from stages.io.scene import Scene
 from stages.scratch import unusable
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from efficientnerf.asset.bake import Visibility
-    from efficientnerf.asset.field_samples import FieldSamples, Grid
-    from efficientnerf.asset.region import Region
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.pixels import Pixels
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene
+from stages.train.priors import filled_points
 
 # Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned
 # in those that are partly as close, such as a wall behind the cameras, is baked. docs/experiments/near-cameras.md
@@ -53,12 +75,8 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
     return [np.stack([low, low + np.asarray(shape) * brick * voxel]) for shape, voxel, low in grids]
 
 
-def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> Plan:
-    """The cascades, their voxels, which will be split so often, the region and the environment."""
-    from efficientnerf.asset.field_samples import cascade_visibility, environment_beyond, seen_weights
-    from stages.bake.resolution import MIN_RESOLUTION, Choice, affordable_resolution, baked_resolution, finest_of_cascades, refuse_without_room
-    from stages.bake.voxels import MAX_OVERSHOOT, OVERSHOOT
-
+def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mib: float) -> Plan:
+    """The cascades, their voxels, the region and the environment."""
     settings: BakeSettings = job.settings
     stated, discretise = given(settings.resolution), given(m.settings.discretise)
     fixed = stated or discretise
@@ -96,7 +114,7 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
     else:
         finest = finest_of_cascades(s, bounds, count, settings.brick_size, given(settings.max_resolution))
         choice = affordable_resolution(finest, lambda at: sum(map(len, at_resolution(at)[3])), lambda at: int(OVERSHOOT * room(at)))
-    _, grids, seen, indices = at_resolution(baked_resolution(choice.resolution, splits))
+    _, grids, seen, indices = at_resolution(choice.resolution)
     indices = heaviest_of(job, seen, grids, indices, MAX_OVERSHOOT * room(choice.resolution))
     indices = [keep_clear(job, m, s, part, grid) for part, grid in zip(indices, grids, strict=True)]
     mean = pixels.images[samples.pixel[:: max(1, len(samples.pixel) // 4096)]][:, :3].mean(axis=0) / 255.0
@@ -105,10 +123,8 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
     return Plan(choice, space, grids, indices, sum(len(one.cells) for one in seen), weights, samples, region, environment)
 
 
-def room_of(settings: BakeSettings, m: Any, grids: Sequence[Grid], mib: float, *, environment: bool = True) -> int:
+def room_of(settings: BakeSettings, m: Model, grids: Sequence[Grid], mib: float, *, environment: bool = True) -> int:
     """How many voxels an asset of so many MiB holds, beside the cells of these grids and an environment map."""
-    from efficientnerf.asset.file.serialisation import most_voxels
-
     cells = sum(math.prod(shape) for shape, _, _ in grids)
     rows = settings.environment_size if environment else 0
     return most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, (cells, 1, 1), settings.brick_size, environment=rows)
@@ -119,8 +135,6 @@ def grids_of(bounds: np.ndarray, resolution: int, brick: int, count: int, lattic
 
     lattice  (3,) a corner of some voxel of that grid; None: they lie about the centre
     """
-    from efficientnerf.asset.cascades import cascade_grids
-
     voxel = float((bounds[1] - bounds[0]).max()) / resolution
     if lattice is None:
         return cascade_grids(bounds, voxel, brick, count)
@@ -131,9 +145,6 @@ def grids_of(bounds: np.ndarray, resolution: int, brick: int, count: int, lattic
 
 def cascades_needed(samples: FieldSamples, bounds: np.ndarray, stated: int | None) -> int:
     """How many cascades around `bounds` (2, 3) hold what the photographs show, but for a share of MAX_BEYOND."""
-    from efficientnerf.asset.field_samples import weight_by_box
-    from stages.bake.resolution import MAX_BEYOND, MAX_CASCADES
-
     if stated is not None:
         return stated
     centre, half = bounds.mean(axis=0), (bounds[1] - bounds[0]) / 2
@@ -144,11 +155,6 @@ def cascades_needed(samples: FieldSamples, bounds: np.ndarray, stated: int | Non
 
 def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> Region:
     """The foreground region; the scene bounds where they were given by hand (poses.crop_box), and where the field says too little."""
-    from efficientnerf.asset.field_samples import picture_places, surface_points
-    from efficientnerf.asset.region import Region
-    from efficientnerf.capture.foreground import find_foreground
-    from stages.io import scene
-
     if bounds_are_given(poses):
         return Region(np.asarray(s.bounds, np.float64))
     every = slice(None, None, max(1, len(samples.pixel) // FOREGROUND_RAYS))
@@ -172,8 +178,6 @@ def bounds_are_given(poses: Path) -> bool:
 def chosen_of(seen: Sequence[Visibility], grids: Sequence[Grid], settings: BakeSettings, threshold: float) -> list[np.ndarray]:
     """Coordinates (N, 3) of the visible voxels of each cascade, dilated. Into the box of the cascade before they reach by one voxel, from which values just
     outside of it are interpolated."""
-    from efficientnerf.asset.bake import chosen_voxels
-
     chosen = []
     boxes = boxes_of(grids, settings.brick_size)
     for n, (visibility, (shape, voxel, low)) in enumerate(zip(seen, grids, strict=True)):
@@ -199,12 +203,8 @@ def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], ind
     return indices
 
 
-def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
+def keep_clear(job: Job, m: Model, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
     """The voxels that are not close to the path of the training cameras, and that are not poorly seen."""
-    from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
-    from stages.io import scene
-    from stages.train.priors import filled_points
-
     views = scene.views_of(s, "train")
     masks, filled = kept_pixels(job.inputs["poses"], views), filled_points(job.inputs["poses"], len(views))
     cameras, near = [view.camera for view in views], [view.near for view in views]
@@ -222,10 +222,8 @@ def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> n
     return indices[np.concatenate(kept)] if kept else indices
 
 
-def _samples(job: Job, m: Any, pixels: Pixels) -> FieldSamples:
+def _samples(job: Job, m: Model, pixels: Pixels) -> FieldSamples:
     """The field's samples, taken or from an earlier attempt."""
-    from efficientnerf.asset.field_samples import FieldSamples, field_samples
-
     settings: BakeSettings = job.settings
     stored = read_arrays(job.work / "samples", KINDS, job.warn)
     if stored is not None:

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascade_tree, cascades_of
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.evaluation.surfaces import opacity_nearer, surface_limits
+from efficientnerf.model import UNSEEN
 from stages.evaluate.views import constant_background, upsample
 from stages.io.scene import Scene, View
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 RenderTree = Callable[..., Any]  # (camera, background=..., normals=...) -> Rendering
 OnRays = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (R, 3), directions (R, 3), distances (R,) -> (R,)
@@ -42,11 +44,6 @@ class EvaluatedAsset:
 
 def evaluated(tree: NerfTree) -> EvaluatedAsset:
     """The asset of a tree, on the tree's device."""
-    from efficientnerf.asset.cascades import cascade_tree, cascades_of
-    from efficientnerf.asset.rendering import render
-    from efficientnerf.evaluation.surfaces import opacity_nearer, surface_limits
-    from efficientnerf.model import UNSEEN
-
     whole, limits, nearer = partial(render, tree), partial(surface_limits, tree), partial(opacity_nearer, tree)
     behind = None if tree.environment is not None else tree.background or (UNSEEN, UNSEEN, UNSEEN)
     if not tree.outer and tree.environment is None:

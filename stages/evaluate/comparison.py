@@ -15,27 +15,32 @@ numbers a view, that fits the photograph best (`metrics.colour_fitted`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.evaluation.lpips import SMALLEST, Lpips
+from efficientnerf.evaluation.metrics import colour_fitted, psnr, ssim
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.rendering.field_renderer import FieldRenderer
+from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.evaluate.asset import EvaluatedAsset, over_field, render_asset
+from stages.evaluate.lpips_weights import find_weights
 from stages.evaluate.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
 from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
 from stages.evaluate.splats import EvaluatedSplats, splats_image, splats_metrics
 from stages.evaluate.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluate.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
+from stages.figures.plots import error_map, to_uint8
 from stages.io.scene import Scene, View
 from stages.train.averaged import Taken
-
-if TYPE_CHECKING:
-    from efficientnerf.evaluation.lpips import Lpips
 
 HOLE, SOLID = 0.5, 0.95
 FLOATER_RAYS = 4096
@@ -46,7 +51,7 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 
 def evaluate_view(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: FieldRenderer | None, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
     perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: ReliablePoints | None = None,
     taken: Taken | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
@@ -58,15 +63,13 @@ def evaluate_view(
     points      that the asset's depth is compared with
     taken       `stages.train.averaged.as_taken`
     """
-    from stages.figures.plots import error_map, to_uint8
-
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     shown = partial(as_shown, job, view, taken)
     unbounded = constant_background(scene) is None
     metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
     images: list[np.ndarray] = []
     seen = None
-    if with_field or (unbounded and asset.inner is None):
+    if field is not None and (with_field or (unbounded and asset.inner is None)):
         small_camera = subsample_camera(view.camera, stride)
         limits = asset.limits if with_field else None
         seen = field.render(small_camera, progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach, limits=limits)
@@ -152,8 +155,6 @@ def floating(
     used    (H, W) bool, pixels that count
     excess  (H, W) the asset's squared error less the network's
     """
-    from efficientnerf.geometry.cameras import rays
-
     step = 1
     while len(range(0, camera.height, step)) * len(range(0, camera.width, step)) > FLOATER_RAYS:
         step += 1
@@ -176,8 +177,6 @@ def _share(part: np.ndarray, whole: np.ndarray) -> float | None:
 
 def lpips_metrics(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
     """LPIPS by name; None for images too small for the networks."""
-    from efficientnerf.evaluation.lpips import SMALLEST
-
     large = min(image.shape[:2]) >= SMALLEST
     return {name: metric(image, truth.colour, truth.mask) if large else None for name, metric in perceptual.items()}
 
@@ -189,8 +188,6 @@ def sample_shares(counts: Any) -> dict[str, float]:
 
 def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) -> dict[str, float | None]:
     """The figures of QUALITY; None where no pixel, or no whole SSIM window, can be compared."""
-    from efficientnerf.evaluation.metrics import colour_fitted, psnr, ssim
-
     used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
     boxed = None if inside is None else used & inside
     windows = used[5:-5, 5:-5]
@@ -214,3 +211,29 @@ def clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
     if bad:
         job.warn(f"{what} is not finite at {bad} pixels; they count as black")
     return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+
+
+def load_lpips(network: str, folder: str | None, *, bundled: Sequence[Path] | None = None) -> Lpips:
+    """The metric by "alex" or "vgg".
+
+    folder   searched first, for the network and for the heads
+    bundled  folders that are searched for the heads then; None: that of the package torchmetrics
+
+    Raises UsageError, which names what is missing and where to get it.
+    """
+    backbone, heads = find_weights(network, folder, bundled=bundled)
+    try:
+        return Lpips(network, _state(backbone), _state(heads))
+    except ValueError as error:
+        raise BadInput(f"LPIPS, {backbone.name} with {heads}: {error}. Get the files again.") from None
+
+
+def _state(path: Path) -> dict[str, Any]:
+    """Tensors of a file of torch's, read without executing anything in it."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load does not document what it raises for a damaged file
+        raise BadInput(f"{path}: not a readable file of weights ({str(error).splitlines()[0][:80] if str(error) else type(error).__name__}).") from None
+    if not isinstance(state, dict):
+        raise BadInput(f"{path}: holds {type(state).__name__}; expected named tensors.")
+    return state

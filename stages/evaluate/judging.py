@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import statistics
 from collections.abc import Mapping, Sequence
@@ -9,7 +10,9 @@ from typing import Any
 
 from pipeline.files import Unreadable, read_json, write_json
 from pipeline.stage import Job
-from stages.artifacts import EvaluateOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
+from stages.bake.refine.refinement import usual_steps
+from stages.bake.settings import BakeSettings
 from stages.evaluate import sparse_points
 from stages.evaluate.asset import EvaluatedAsset, render_asset
 from stages.evaluate.comparison import as_shown, compare, counting, trivial
@@ -17,6 +20,7 @@ from stages.evaluate.sparse_points import ReliablePoints
 from stages.evaluate.summary import means
 from stages.evaluate.trivial import equivalent_blur
 from stages.evaluate.views import constant_background, evenly_spaced, ground_truth
+from stages.io.png import write_png
 from stages.io.scene import Scene, View, views_of
 from stages.train.averaged import Taken
 from stages.verdict.result import ResultVerdict, camera_verdict_of, verdict_on_result
@@ -72,8 +76,6 @@ def _read(job: Job) -> Any:
 
 def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints, metrics: Mapping[str, Any], job: Job) -> None:
     """Of the view whose points agree least with the asset's depth."""
-    from stages.io.png import write_png
-
     counts = [found["sparse_points"] for found in metrics["views"]]
     shares = [1.0 if not found["points"] else 1 - (found["nearer"] + found["farther"]) / found["points"] for found in counts]
     view = views[shares.index(min(shares))]
@@ -82,3 +84,12 @@ def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: Re
     depth = asset.render(view.camera, normals=False).depth
     pixels, kinds, _ = sparse_points.judged(points, scene.views.index(view), view.camera, depth, counting(truth))
     write_png(sparse_points.picture(truth.colour, depth, pixels, kinds), EvaluateOutputs(job.out).sparse_points)
+
+
+def refinement_of(bake: BakeOutputs) -> dict[str, int]:
+    """Steps that were taken, and the least that are usual for so many voxels and rays a step: a figure that is poor for want of steps asks for no other
+    remedy."""
+    report = read_json(bake.report)
+    last = json.loads(bake.log.read_text(encoding="utf-8").splitlines()[-1])
+    rays = last["rays"] or BakeSettings().refine_rays_per_batch  # 0: there was no step
+    return {"steps": report["optimisation"]["steps"], "usual_steps": usual_steps(report["voxels"], rays, 0 if "cascades" in report else None)}

@@ -11,20 +11,25 @@ covered             their share of the pixels that count
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.region import surroundings
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.evaluation.metrics import psnr, ssim
+from efficientnerf.surface.mesh import Mesh, moved
+from efficientnerf.surface.shading import ColouredImage, Shader
 from stages.artifacts import MeshOutputs
 from stages.evaluate.asset import EvaluatedAsset, RenderTree
 from stages.evaluate.views import GroundTruth, constant_background, upsample
+from stages.formats.exporters.writing import source_frame
+from stages.io.pictures import read_header
 from stages.io.scene import Scene, View
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.surface.mesh import Mesh
-    from efficientnerf.surface.shading import ColouredImage, Shader
+from stages.mesh.files import read_mesh
 
 FIGURES = ("psnr", "ssim", "psnr_covered", "psnr_vertex_colours", "ssim_vertex_colours", "asset_psnr_covered", "covered")
 MARGIN = 0.03  # of the depth, that surroundings have to be nearer to hide the mesh: it ends where they begin
@@ -47,22 +52,12 @@ class EvaluatedMesh:
 
 def evaluated_mesh(mesh: Mesh, surroundings: RenderTree | None) -> EvaluatedMesh:
     """A mesh of the training frame."""
-    from efficientnerf.surface.shading import Shader
-
     size = None if mesh.texture is None else max(mesh.texture.colours.shape[:2])
     return EvaluatedMesh(Shader(mesh), surroundings, {"faces": len(mesh.faces), "vertices": len(mesh.vertices), "texture_size": size})
 
 
 def load_mesh(outputs: MeshOutputs, tree: NerfTree, region: str) -> EvaluatedMesh:
     """The mesh of a run, made of this asset, or of its foreground where `region` says so. Raises CorruptArtifact."""
-    from functools import partial
-
-    from efficientnerf.asset.region import surroundings
-    from efficientnerf.asset.rendering import render
-    from efficientnerf.surface.mesh import moved
-    from stages.formats.exporters.writing import source_frame
-    from stages.mesh.files import read_mesh
-
     to_world = source_frame(tree.metadata).world_from_capture
     mesh = moved(read_mesh(outputs), to_world.scale, to_world.rotation, to_world.translation)
     with_surroundings = tree.ndc is None and (tree.environment is not None or (tree.region is not None and region == "foreground"))
@@ -72,8 +67,6 @@ def load_mesh(outputs: MeshOutputs, tree: NerfTree, region: str) -> EvaluatedMes
 
 def mesh_bytes(outputs: MeshOutputs) -> int:
     """Of memory, that measuring a mesh takes beside the view itself: its arrays, and those of its texture."""
-    from stages.io.pictures import read_header
-
     texels = 0
     if outputs.texture.is_file():
         width, height = read_header(outputs.texture).size
@@ -117,8 +110,6 @@ def mesh_metrics(image: np.ndarray, plain: np.ndarray, covered: np.ndarray, asse
     image, plain, covered  of `mesh_image`, clipped
     asset                  its image of the view, clipped
     """
-    from efficientnerf.evaluation.metrics import psnr, ssim
-
     used = np.ones(covered.shape, bool) if truth.mask is None else truth.mask
     on_mesh = used & (covered >= 0.5)
 

@@ -22,83 +22,45 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from msgspec import Meta
 
-from efficientnerf.settings import Auto, Off, PositiveInt, given, setting
+from efficientnerf.asset import format
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.field_renderer import FieldRenderer
+from efficientnerf.settings import given
 from pipeline.files import read_json, write_json
-from pipeline.stage import Job, Stage
-from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of, needs_of
+from pipeline.stage import Job
+from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of
 from stages.compiling import compiling_kernels
 from stages.evaluate.asset import EvaluatedAsset, evaluated
-from stages.evaluate.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view
-from stages.evaluate.judging import judge, training_figures
-from stages.evaluate.lpips_weights import find_weights, load_lpips
-from stages.evaluate.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
-from stages.evaluate.refinement import refinement_of
+from stages.evaluate.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view, load_lpips
+from stages.evaluate.judging import judge, refinement_of, training_figures
+from stages.evaluate.memory import needed
+from stages.evaluate.mesh import FIGURES, EvaluatedMesh, load_mesh
+from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, MAX_FIELD_RAYS, EvaluateSettings, networks_of
 from stages.evaluate.sparse_points import COUNTS, observed_points
 from stages.evaluate.splats import FIGURES as SPLATS_FIGURES
 from stages.evaluate.splats import EvaluatedSplats, load_splats
-from stages.evaluate.strips import STRIP_RAYS, strip_views, write_strips
+from stages.evaluate.strips import strip_views, write_strips
 from stages.evaluate.summary import in_words, quality, summary
 from stages.evaluate.trivial import BLURS
 from stages.evaluate.video import write_captured_path
-from stages.evaluate.views import constant_background, evaluation_views, evenly_spaced, stride_for
+from stages.evaluate.views import bounded_stride, constant_background, evaluation_views, evenly_spaced, stride_for
+from stages.figures.plots import contact_sheet, thumbnail_of
+from stages.io.field_file import load_renderer
+from stages.io.png import read_png, write_png
+from stages.io.refined_cameras import load_scene
 from stages.io.scene import View
+from stages.memory.need import refuse_what_does_not_fit
 from stages.scratch import note, noted, once
+from stages.train.averaged import as_taken
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from stages.memory.need import Need
-
-MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
-MAX_FIELD_RAYS = 400_000  # of all of them together, then
 SHEET_ROWS = 8
 THUMBNAIL = 320  # pixels, longest side
-NETWORKS = ("alex", "vgg")  # of LPIPS
-
-
-@dataclass(frozen=True)
-class EvaluateSettings:
-    """How much is measured."""
-
-    field_views: PositiveInt | Literal["all"] = setting(16, "Number of test views that the field is rendered for, spread evenly.", advanced=True)
-    field_image_scale: Annotated[float, Meta(ge=0.01, le=1.0)] | Auto = setting(
-        "auto",
-        f"Scale of the pixel grid on which the field is rendered; auto: at most {MAX_FIELD_IMAGE_SIZE} along the longest side, and about "
-        f"{MAX_FIELD_RAYS} pixels in all.",
-        advanced=True,
-    )
-    field_background_rays: PositiveInt = setting(
-        500_000,
-        "Total number of rays through the field for the surroundings of the other views, in unbounded scenes whose asset holds none.",
-        advanced=True,
-    )
-    strips: Literal["on", "off"] = setting(
-        "on", "Whether photograph, network, asset and mesh are shown side by side at full size, for the worst, the median and the best view."
-    )
-    captured_path_frames: Annotated[int, Meta(ge=1, le=9999)] | Off = setting(90, "Number of frames of the video along the captured cameras; off: none.")
-    lpips: Literal["off", "alex", "vgg", "both"] = setting("off", "Network of LPIPS, where that is measured too; its weights are files of their own.")
-    lpips_weights: str = setting(
-        "auto", "Folder with the weights of LPIPS; auto: torch's cache and the package torchmetrics, which are searched in any case.", advanced=True
-    )
-
-
-def networks_of(settings: EvaluateSettings) -> tuple[str, ...]:
-    """Of LPIPS, those that are asked for."""
-    return {"off": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
-
-
-def check(settings: Mapping[str, Any]) -> None:
-    """UsageError where weights of LPIPS are missing."""
-    own: EvaluateSettings = settings["evaluate"]
-    for network in networks_of(own):
-        find_weights(network, given(own.lpips_weights))
 
 
 Measured = str | float | dict[str, int | float | list[float] | None] | None  # the name of a view, or its metrics
@@ -106,14 +68,9 @@ Measured = str | float | dict[str, int | float | list[float] | None] | None  # t
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from efficientnerf.asset import format
-    from stages.memory.need import refuse_what_does_not_fit
-
     inputs = inputs_of(EvaluateInputs, job.inputs)
 
-    def load_field() -> Any:
-        from stages.io.field_file import load_renderer
-
+    def load_field() -> FieldRenderer:
         return load_renderer(inputs.train.folder, job.device)
 
     tree = format.load(inputs.bake.asset).to(job.device)
@@ -122,22 +79,8 @@ def run(job: Job) -> None:
     evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree), refinement_of(inputs.bake))
 
 
-def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
-    """What comparing its views with photographs takes of memory."""
-    from stages.io.scene import load
-    from stages.memory.rendering import views_needed
-
-    cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
-    scale = given(settings.field_image_scale)
-    most = max(camera.width * camera.height for camera in cameras)
-    rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
-    if settings.strips == "on":
-        rays = max(rays, min(most, STRIP_RAYS))
-    return views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, device, mesh=mesh_bytes(inputs.mesh))
-
-
 def evaluate(
-    asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job, mesh: EvaluatedMesh, splats: EvaluatedSplats | None = None,
+    asset: EvaluatedAsset, tree: NerfTree, load_field: Callable[[], FieldRenderer], job: Job, mesh: EvaluatedMesh, splats: EvaluatedSplats | None = None,
     refinement: Mapping[str, int] | None = None,
 ) -> None:
     """Write metrics, pictures and video. Metrics and thumbnails of each view are kept in job.work, so that a kill costs at most one view.
@@ -148,9 +91,6 @@ def evaluate(
     splats      the same
     refinement  of the asset, `refinement_of`
     """
-    from stages.io.refined_cameras import load_scene
-    from stages.train.averaged import as_taken
-
     settings: EvaluateSettings = job.settings
     scene = load_scene(job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage])
     views, split = evaluation_views(scene)
@@ -197,7 +137,7 @@ def evaluate(
 def _field_stride(views: Sequence[View], scale: float | None) -> int:
     """The stride of the pixels that the field renders; None: as is affordable."""
     if scale is not None:
-        return max(1, math.ceil(1.0 / scale - 1e-6))
+        return bounded_stride(views, max(1, math.ceil(1.0 / scale - 1e-6)))
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     return max(math.ceil(longest / MAX_FIELD_IMAGE_SIZE), stride_for(views, MAX_FIELD_RAYS))
 
@@ -211,8 +151,6 @@ def _check(
     composited  whether there are metrics of the asset over the field's surroundings, too
     others      of "splats" and "sparse_points" those that there are
     """
-    from stages.io.png import read_png
-
     names = {*QUALITY, "width", "height", *perceptual}
     asset, network = measured["asset"], measured["network"]
     if measured["name"] != view.name or not names <= asset.keys() or with_field == (network is None):
@@ -243,9 +181,6 @@ def _thumbnails(folder: Path, k: int) -> list[Path]:
 
 
 def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> list[Path]:
-    from stages.figures.plots import thumbnail_of
-    from stages.io.png import write_png
-
     paths = _thumbnails(folder, k)
     for path, image in zip(paths, images, strict=True):
         write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), path, durable=False)
@@ -253,9 +188,6 @@ def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> list
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
-    from stages.figures.plots import contact_sheet
-    from stages.io.png import read_png
-
     shown = [drawn[k] for k in evenly_spaced(len(drawn), SHEET_ROWS)]
     rows = [[read_png(path) for path in _thumbnails(job.work, k)] for k in shown]
     labels = []
@@ -264,6 +196,3 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
         labels.append([view["name"], f"field {quality(view['network'])}", "error of the field", f"asset {quality(view['asset'])}", "error of the asset"])
     title = f"{metrics['split']} views: field {quality(metrics['network'])}; asset {quality(metrics['asset'])}; errors are white from 0.25"
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
-
-
-STAGE = Stage(name="evaluate", version=9, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True, check=check)

@@ -17,7 +17,10 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, project
-from stages.io.scene import Scene
+from stages.figures.drawing import matplotlib
+from stages.figures.plots import to_uint8
+from stages.framing.near_planes import reliable_points
+from stages.io.scene import Scene, read_points
 
 TOLERANCE = 0.05  # of a point's depth; docs/experiments/verdict.md
 FEW = 30  # points of all views together, below which nothing is said
@@ -55,9 +58,6 @@ def observed_points(folder: Path, scene: Scene, reach: np.ndarray | None) -> Rel
 
     reach  (2, 3) beyond which the asset has no density; None: the scene bounds, or of a forward-facing scene nothing
     """
-    from stages.framing.near_planes import reliable_points
-    from stages.io.scene import read_points
-
     points = read_points(folder) if scene.points else None
     if points is None or not any(points.tracks):
         return None
@@ -116,10 +116,6 @@ def picture(photograph: np.ndarray, depth: np.ndarray, pixels: np.ndarray, kinds
 
     photograph  (H, W, 3) float, 0 to 1
     """
-    from matplotlib import colormaps
-
-    from stages.figures.plots import to_uint8
-
     paper = to_uint8(np.repeat(0.3 + 0.6 * photograph.mean(-1, keepdims=True), 3, axis=-1))
     for kind in (AGREES, FARTHER, NEARER):
         for x, y in pixels[kinds == kind]:
@@ -127,6 +123,6 @@ def picture(photograph: np.ndarray, depth: np.ndarray, pixels: np.ndarray, kinds
     hit = np.isfinite(depth)
     low, high = np.quantile(depth[hit], [0.02, 0.98]) if hit.any() else (0.0, 1.0)
     shown = 1.0 - np.clip((np.where(hit, depth, high) - low) / max(high - low, 1e-9), 0.0, 1.0)
-    colours = to_uint8(colormaps["viridis"](shown)[:, :, :3])
+    colours = to_uint8(matplotlib().colormaps["viridis"](shown)[:, :, :3])
     colours[~hit] = 255
     return np.concatenate([paper, colours], axis=1)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.evaluation.metrics import psnr, ssim
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.splats.rendering import render
+from pipeline.files import read_json
 from stages.artifacts import SplatsOutputs
 from stages.evaluate.asset import EvaluatedAsset
 from stages.evaluate.mesh import MAX_PSNR
 from stages.evaluate.views import GroundTruth, constant_background
+from stages.formats.exporters.splats.frames import moved
+from stages.formats.exporters.splats.ply import read_splats
+from stages.formats.exporters.writing import source_frame
 from stages.io.scene import Scene, View
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
 
 FIGURES = ("psnr", "ssim")
 
@@ -35,12 +39,6 @@ class EvaluatedSplats:
 
 def load_splats(outputs: SplatsOutputs, tree: NerfTree) -> EvaluatedSplats | None:
     """The Gaussians of a run, from the file that others read; None where it made none of all that the asset shows. Raises CorruptArtifact."""
-    from efficientnerf.splats.rendering import render
-    from pipeline.files import read_json
-    from stages.formats.exporters.splats.frames import moved
-    from stages.formats.exporters.splats.ply import read_splats
-    from stages.formats.exporters.writing import source_frame
-
     if not outputs.ply.is_file() or read_json(outputs.report).get("region") != "all":
         return None
     gaussians = moved(read_splats(outputs.ply), source_frame(tree.metadata).world_from_capture)
@@ -58,8 +56,6 @@ def splats_metrics(image: np.ndarray, truth: GroundTruth) -> dict[str, float | N
 
     image  clipped
     """
-    from efficientnerf.evaluation.metrics import psnr, ssim
-
     used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
     return {
         "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs, PosesOutputs
 from stages.evaluate.asset import EvaluatedAsset, render_asset
@@ -22,6 +23,8 @@ from stages.evaluate.comparison import as_shown, compare
 from stages.evaluate.mesh import EvaluatedMesh, mesh_image
 from stages.evaluate.summary import quality
 from stages.evaluate.views import ground_truth, stride_for, subsample, subsample_camera
+from stages.figures.plots import contact_sheet
+from stages.io.png import read_png
 from stages.io.scene import Scene, View
 from stages.scratch import Warn, note, noted
 from stages.train.averaged import Taken
@@ -40,7 +43,7 @@ def strip_views(figures: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
 
 
 def write_strips(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, load_field: Callable[[], Any], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]],
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, load_field: Callable[[], FieldRenderer], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]],
     job: Job, warn: Warn, taken: Taken | None = None,
 ) -> list[dict[str, Any]]:
     """Write the strips of the chosen views; returns their entries of metrics.json. A strip is kept in job.work, so that a kill costs at most one."""
@@ -66,10 +69,8 @@ def write_strips(
 
 
 def _write_strip(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: FieldRenderer, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
 ) -> dict[str, Any]:
-    from stages.figures.plots import contact_sheet
-
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     seen = field.render(subsample_camera(view.camera, stride), progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach)
     truth = truth.subsampled(stride)
@@ -87,8 +88,6 @@ def _write_strip(
 
 def _check(picture: Path, view: View, entry: Mapping[str, Any], outputs: Collection[str]) -> None:
     """Raises where this is no strip of the view, or its picture is missing or can't be read."""
-    from stages.io.png import read_png
-
     names = ("network", "asset", "mesh")
     if entry["view"] != view.name or not all({*FIGURES} <= entry[name].keys() for name in names) or min(entry["width"], entry["height"]) < 1:
         raise ValueError("no strip of this view")

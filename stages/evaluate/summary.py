@@ -42,7 +42,7 @@ def summary(
     mesh        facts about the mesh
     splats      facts about the Gaussians, if there are any
     perceptual  names of LPIPS metrics
-    refinement  the asset's, see `stages.evaluate.refinement`
+    refinement  the asset's, see `stages.evaluate.judging`
     train       figures of the asset on views that training saw
     """
     drawn = [view for view in figures if view["network"] is not None]

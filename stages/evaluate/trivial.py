@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 BLURS = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08)  # standard deviations of the Gaussian, of the longest side: each twice the one before
@@ -39,8 +40,6 @@ def blurred_psnrs(truth: np.ndarray, mask: np.ndarray | None = None) -> list[flo
 
 def blurred(picture: np.ndarray, deviation: float, mask: np.ndarray | None = None) -> np.ndarray:
     """(H, W, 3) float32: a picture blurred by a Gaussian of a standard deviation in pixels, of the pixels that count alone."""
-    import cv2
-
     height, width = picture.shape[:2]
     weights = np.ones((height, width, 1), np.float32) if mask is None else mask[..., None].astype(np.float32)
     layers = np.concatenate([picture.astype(np.float32) * weights, weights], axis=-1)  # (H, W, 4)

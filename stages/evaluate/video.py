@@ -3,34 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from efficientnerf.asset.rendering import Rendering
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.capture.captured_path import captured_cameras
+from efficientnerf.geometry.cameras import Camera
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs
 from stages.evaluate.asset import EvaluatedAsset
+from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.io.scene import Scene
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.rendering import Rendering
-    from efficientnerf.geometry.cameras import Camera
 
 LONGEST = 480  # pixels, the longer side of the video
 FPS, CRF = 15, 20
 
 
-def write_captured_path(asset: EvaluatedAsset, tree: Any, scene: Scene, frames: int, job: Job) -> None:
+def write_captured_path(asset: EvaluatedAsset, tree: NerfTree, scene: Scene, frames: int, job: Job) -> None:
     """Write the video. Frames are kept in job.work, so that a kill costs at most one.
 
     tree  the asset's, whose metadata frames need
     """
-    import numpy as np
-
-    from efficientnerf.capture.captured_path import captured_cameras
-    from stages.figures.frames import RenderOptions, encode_frames, render_frames
-
     behind = scene.background or asset.behind
 
-    def draw(tree: Any, camera: Camera, **more: Any) -> Rendering:
+    def draw(tree: NerfTree, camera: Camera, **more: Any) -> Rendering:
         rendering: Rendering = asset.render(camera, background=behind, **more)
         return replace(rendering, opacity=np.ones_like(rendering.opacity))  # whatever is behind has been drawn
 

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from efficientnerf.geometry.cameras import MODELS, Camera
-from stages.io.scene import Scene, View
+from efficientnerf.model import UNSEEN
+from stages.io.scene import Scene, View, read_image, read_mask, views_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,6 @@ class GroundTruth:
 
 def evaluation_views(scene: Scene) -> tuple[tuple[View, ...], str]:
     """The views to report on and their split: test, else val, else train. Raises ValueError where the scene has no views."""
-    from stages.io.scene import views_of
-
     for split in ("test", "val", "train"):
         views = views_of(scene, split)
         if views:
@@ -52,7 +52,12 @@ def evenly_spaced(count: int, wanted: int | None) -> list[int]:
 def stride_for(views: Sequence[View], rays: int) -> int:
     """The stride at which the views together have at most about this many rays."""
     total = sum(view.camera.width * view.camera.height for view in views)
-    return max(1, math.ceil(math.sqrt(total / rays)))
+    return bounded_stride(views, max(1, math.ceil(math.sqrt(total / rays))))
+
+
+def bounded_stride(views: Sequence[View], stride: int) -> int:
+    """The stride, or the largest one that leaves a pixel of each view."""
+    return min([stride, *(min(view.camera.width, view.camera.height) for view in views)])
 
 
 def ground_truth(folder: Path, view: View, background: tuple[float, float, float] | None, stride: int = 1) -> GroundTruth:
@@ -60,8 +65,6 @@ def ground_truth(folder: Path, view: View, background: tuple[float, float, float
 
     background  what images with alpha are composited on; None: alpha below one half masks
     """
-    from stages.io.scene import read_image, read_mask
-
     pixels = subsample(read_image(folder, view), stride).astype(np.float32) / 255.0
     mask = read_mask(folder, view)
     mask = None if mask is None else subsample(mask, stride)
@@ -97,8 +100,6 @@ def subsample(values: np.ndarray, stride: int) -> np.ndarray:
 
 def upsample(values: np.ndarray, stride: int, width: int, height: int) -> np.ndarray:
     """The inverse of `subsample`: bilinear, clamped at the border; (H', W', ...) -> (height, width, ...)."""
-    import cv2
-
     values = np.ascontiguousarray(values, np.float32)
     if stride == 1:
         return values
@@ -109,6 +110,4 @@ def upsample(values: np.ndarray, stride: int, width: int, height: int) -> np.nda
 
 def constant_background(scene: Scene) -> tuple[float, float, float] | None:
     """The colour behind the asset in bounded and forward-facing scenes; None in unbounded ones."""
-    from efficientnerf.model import UNSEEN
-
     return scene.background if scene.background is not None or scene.forward is None else (UNSEEN, UNSEEN, UNSEEN)

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageOps
 
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
+from stages.figures.plots import contact_sheet
 from stages.io.pictures import UnreadableImage, opened
 from stages.io.scene import SPLITS, Scene
 
@@ -27,8 +29,6 @@ def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str
     rejected  (name, reason) of each
     files     name -> file of those that have a picture; names themselves are never opened, they may be anybody's
     """
-    from stages.figures.plots import contact_sheet
-
     entries: list[tuple[Path | None, str, str]] = [(folder / view.image, view.name, view.split) for view in scene.views]
     every = -(-len(entries) // MAX_THUMBNAILS)
     counts = {split: sum(entry[2] == split for entry in entries) for split in SPLITS} | {"rejected": len(rejected)}
@@ -45,8 +45,6 @@ def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str
 
 
 def _framed(path: Path | None, split: str) -> np.ndarray:
-    from PIL import ImageDraw, ImageOps
-
     framed = ImageOps.expand(_thumbnail(path), FRAME, COLOURS[split])
     if split == "rejected":
         draw, right, bottom = ImageDraw.Draw(framed), framed.width - 1, framed.height - 1
@@ -57,8 +55,6 @@ def _framed(path: Path | None, split: str) -> np.ndarray:
 
 def _thumbnail(path: Path | None) -> Any:
     """Longest side at most THUMBNAIL; grey without an image."""
-    from PIL import Image, ImageOps
-
     if path is not None:
         with contextlib.suppress(UnreadableImage), opened(path) as image:
             image.draft("RGB", (2 * THUMBNAIL, 2 * THUMBNAIL))

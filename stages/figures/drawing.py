@@ -21,7 +21,7 @@ def matplotlib() -> Any:
     first = "matplotlib" not in sys.modules
     if first:
         os.environ["MPLCONFIGDIR"] = _folder()
-    import matplotlib
+    import matplotlib  # once its folder is set
 
     if first:
         matplotlib.rcdefaults()
@@ -43,8 +43,8 @@ def _folder() -> str:
 def new_figure(width: float, height: float, dpi: int) -> tuple[Any, Any]:
     """An empty figure of so many inches, and its canvas."""
     matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # after the above
+    from matplotlib.figure import Figure  # after the above
 
     figure = Figure(figsize=(width, height), dpi=dpi, layout="tight")
     return figure, FigureCanvasAgg(figure)

@@ -6,17 +6,18 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.rendering import Rendering, render
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
+from stages.formats.exporters.exr import write_exr
+from stages.formats.exporters.frames import NAMED, frame_background, frame_from_rendering, over_background
+from stages.formats.exporters.video import write_mp4
 from stages.framing.camera_paths import similarity_of
+from stages.io.png import read_png, write_png
 from stages.scratch import Warn, note, noted, once
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.rendering import Rendering
-    from efficientnerf.asset.tree import NerfTree
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,6 @@ def render_frames(
     draw      `efficientnerf.asset.rendering.render`, unless another is given
     warn      is told of frames that can't be kept
     """
-    from efficientnerf.asset.rendering import render
-    from stages.formats.exporters.exr import write_exr
-    from stages.formats.exporters.frames import frame_background, frame_from_rendering
-    from stages.io.png import write_png
-
     background, similarity = frame_background(options.background), similarity_of(tree)
     surrounded = options.background == "auto" and tree.environment is not None
     if tree.environment is not None and not surrounded:
@@ -94,8 +90,6 @@ def render_frames(
 
 def _check(outputs: Sequence[Path], camera: Camera, value: list[str], names: Collection[str]) -> None:
     """Raises where a frame's files are not all there, or its PNG is none of this size."""
-    from stages.io.png import read_png
-
     if {path.name for path in outputs} != {*names}:
         raise ValueError("files are missing")
     if read_png(outputs[0]).shape[:2] != (camera.height, camera.width):
@@ -104,25 +98,4 @@ def _check(outputs: Sequence[Path], camera: Camera, value: list[str], names: Col
 
 def encode_frames(frames: Sequence[Path], path: Path, options: RenderOptions, each: Callable[[], None] | None = None) -> None:
     """Encode PNGs as an MP4."""
-    from stages.formats.exporters.frames import NAMED, over_background
-    from stages.formats.exporters.video import write_mp4
-    from stages.io.png import read_png
-
     write_mp4((over_background(read_png(frame), NAMED["white"]) for frame in frames), path, fps=options.fps, crf=options.crf, each=each)
-
-
-def render_path(
-    tree: NerfTree,
-    cameras: Sequence[Camera],
-    out_dir: Path,
-    options: RenderOptions,
-    progress: Progress | None = None,
-    draw: Callable[..., Rendering] | None = None,
-) -> list[Path]:
-    """Render a path to a folder: PNG frames, EXR and video by the options; returns the files. Frames of the same names are overwritten."""
-    written = render_frames(tree, cameras, out_dir, options, progress, draw=draw)
-    if options.video is not None:
-        video = out_dir / options.video
-        encode_frames([path for path in written if path.suffix == ".png"], video, options)
-        written.append(video)
-    return written

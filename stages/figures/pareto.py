@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.files import atomic
 from stages.figures.drawing import new_figure
 
 Point = tuple[float, float, str]  # cost, quality, label
@@ -32,8 +33,6 @@ def pareto_plot(path: Path, series: Mapping[str, Sequence[Point]], *, x_label: s
 
     The same points are the same bytes.
     """
-    from pipeline.files import atomic
-
     figure, canvas = new_figure(8.0, 5.0, 110)
     axes = figure.add_subplot()
     costs = [x for points in series.values() for x, _, _ in points]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
+from pipeline.files import atomic
 from stages.figures.drawing import matplotlib, new_figure
-
-if TYPE_CHECKING:
-    from PIL import Image
+from stages.io.png import read_png, write_png
 
 MARGIN = 8
 LABEL_HEIGHT = 18
@@ -28,10 +27,6 @@ def contact_sheet(
     labels     one text for each image, or None; long ones are elided in the middle
     thumbnail  longest side of the thumbnails, pixels; smaller images are enlarged to it
     """
-    from PIL import Image, ImageDraw, ImageFont
-
-    from stages.io.png import write_png
-
     if not any(len(row) for row in rows):
         raise ValueError(f"{path}: a contact sheet of no images")
     thumbnails = [[None if image is None else thumbnail_of(image, thumbnail) for image in row] for row in rows]
@@ -65,8 +60,6 @@ def grid_sheet(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, 
 
 def thumbnail_of(image: np.ndarray, longest: int) -> Image.Image:
     """A PIL RGB image whose longest side is `longest`; transparency is composited on light grey."""
-    from PIL import Image
-
     pixels = to_uint8(image)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[:, :, None], 3, axis=2)
@@ -125,11 +118,6 @@ def curve(
 
 def with_palette(path: Path, colours: int = 128) -> None:
     """Write a plot's PNG again with a palette: half the bytes or fewer, for a document; thin lines keep their colours to within a few of 255 levels."""
-    from PIL import Image
-
-    from pipeline.files import atomic
-    from stages.io.png import read_png
-
     plain = Image.fromarray(np.ascontiguousarray(read_png(path)[..., :3]))
     with atomic(path) as temporary:
         plain.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)

@@ -9,21 +9,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.cascades import Cascade, cascades_of
+from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.region import inside_share
+from efficientnerf.asset.tree import Cascade, NerfTree
+from efficientnerf.capture.captured_path import captured_path
 from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity
+from efficientnerf.geometry.ndc import Ndc
 from pipeline.errors import BadInput
 from stages.framing.captured import captured_of
 from stages.io.scene import Orbit
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.ndc import Ndc
 
 PATHS = ("auto", "orbit", "sway", "captured")
 MAX_FITTED_FOV = 50.0  # degrees; with a larger one the camera would be too near, and moves back instead
@@ -284,8 +283,6 @@ def _framed_orbit(tree: NerfTree, points: np.ndarray, path: str, sway: float | N
 
 def captured_cameras(tree: NerfTree, frames: int, width: int, height: int, fov: float | None = None) -> list[Camera]:
     """Cameras on the way of the captured ones, with about their field of view along the diagonal. Raises BadInput where the asset keeps none."""
-    from efficientnerf.capture.captured_path import captured_path
-
     captured = captured_of(tree.metadata)
     if captured is None:
         raise BadInput("asset: it keeps no captured cameras, which the path `captured` follows. Bake it again, or choose another path.")

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, project, resized
@@ -88,7 +89,7 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, small: SmallPict
     return MaskUse(Silhouettes(use["alpha"], use["masks"]), reasons, tuple(dict.fromkeys(doubtful)))
 
 
-def without_silhouette(photos: Sequence[Photo], silhouettes: Silhouettes, renders: bool) -> list[str]:
+def without_silhouette(photos: Sequence[Photo], silhouettes: Silhouettes) -> list[str]:
     """Names of the photos of which nothing says what is background, in a capture whose others do. Raises BadInput where too few are left."""
     have = [(silhouettes.masks and photo.mask is not None) or (silhouettes.alpha and _has_alpha(photo)) for photo in photos]
     if not silhouettes or all(have) or not any(have):
@@ -100,8 +101,6 @@ def without_silhouette(photos: Sequence[Photo], silhouettes: Silhouettes, render
 
 def compactness(kept: np.ndarray) -> str | None:
     """Why what a mask keeps, (h, w) bool, is no compact object; None where it is one."""
-    import cv2
-
     share = float(kept.mean())
     if share > MOST_KEPT:
         return f"keep more than {MOST_KEPT:.0%} of the picture"
@@ -124,8 +123,6 @@ def overlaps(pictures: Sequence[np.ndarray], cameras: Sequence[Camera], hull: np
     hull, step centres (N, 3) of the voxels of a hull that leaves nothing out, and their sides (3,): the voxels are split, and those whose centre is outside
                of a silhouette are left out
     """
-    import cv2
-
     cameras = [resized(camera, picture.shape[1], picture.shape[0]) for picture, camera in zip(pictures, cameras, strict=True)]
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     xyz, step = (hull[:, None] + corners * step / 4).reshape(-1, 3), step / 2

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.asset.region import Region, cropped, foreground, voxel_centres
+from efficientnerf.asset.region import cropped, foreground, voxel_centres
+from efficientnerf.asset.tree import NerfTree, Region
+from efficientnerf.geometry.cameras import Similarity
 from pipeline.errors import UsageError
 from stages.framing.camera_paths import similarity_of
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Similarity
 
 
 def restricted(tree: NerfTree, region: str, crop: Sequence[float] | None = None) -> NerfTree:

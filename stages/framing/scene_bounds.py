@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from efficientnerf.geometry.cameras import Camera, Similarity, project, rays, resized
 from stages.io.capture import Capture, Photo, SparsePoints
@@ -109,8 +111,6 @@ def _cameras_pass_through(xyz: np.ndarray, cameras: Sequence[Camera], centres: n
 
 def _bounds_of_path(xyz: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A box round the path and the points within twice the median distance from it."""
-    from scipy.spatial import cKDTree
-
     distance = cKDTree(centres).query(xyz)[0]
     near = xyz[distance <= 2 * np.median(distance)]
     both = np.concatenate([np.quantile(near, [0.02, 0.98], axis=0), centres])
@@ -119,8 +119,6 @@ def _bounds_of_path(xyz: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, n
 
 def outliers(xyz: np.ndarray, *, neighbours: int = 5, factor: float = 4.0) -> np.ndarray:
     """(N,) bool: points whose distance to their neighbours is more than `factor` times the median."""
-    from scipy.spatial import cKDTree
-
     count = min(neighbours, len(xyz) - 1)
     if count < 1:
         return np.zeros(len(xyz), bool)
@@ -267,8 +265,6 @@ def visual_hull(
 
 def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """(N,) bool twice: balls of this radius whose centre projects into the image, and those of them whose projection has no opaque pixel."""
-    import cv2
-
     pixels, depth = project(camera, xyz)
     with np.errstate(invalid="ignore", divide="ignore"):
         reach = np.ceil(radius * camera.intrinsics["fx"] / depth) + 1  # px

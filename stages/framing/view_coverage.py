@@ -18,18 +18,16 @@ Reliable sparse points are evidence that space is filled: what would mask more t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+import torch
+from scipy.spatial import cKDTree
 
 from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.spaces import Space
 from stages.framing.scene_bounds import in_view
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from efficientnerf.geometry.spaces import Space
-    from stages.io.scene import View
+from stages.io.scene import View, read_mask
 
 Masks = Sequence[np.ndarray | None]  # (h, w) bool of each view at any size, True where pixels are kept; None: everywhere
 
@@ -50,8 +48,6 @@ FEW_BLOCK = 2  # density voxels along a side of the blocks beside the box that f
 
 def kept_pixels(folder: Path, views: Sequence[View]) -> Masks | None:
     """The masks of some views of a scene at small size, True where any pixel below is kept; None where no view has a mask."""
-    from stages.io.scene import read_mask
-
     masks = [None if mask is None else shrunk(mask, MASK_SIZE) for mask in (read_mask(folder, view) for view in views)]
     return None if all(mask is None for mask in masks) else masks
 
@@ -59,8 +55,6 @@ def kept_pixels(folder: Path, views: Sequence[View]) -> Masks | None:
 def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: int, side: int, masks: Masks | None = None) -> np.ndarray:
     """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those that are `poorly_seen`. Beside the box the middles of blocks of FEW_BLOCK
     voxels a side decide: what is there is larger, for it is contracted."""
-    import torch
-
     count = -(-side // FEW_BLOCK)
     lattice = np.minimum((np.arange(count) + 0.5) * (FEW_BLOCK / side), 1.0)
     grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -138,8 +132,6 @@ def cells_without_view(space: Space, cameras: Sequence[Camera], side: int, masks
     Of a block the corners are tried, the middles of its edges and faces, and its own, with masks whose kept parts are wider than these are apart. What lies
     a little outside of a picture counts as seen.
     """
-    import torch
-
     count = -(-side // BLOCK)
     lattice = np.minimum(np.arange(2 * count + 1) * (BLOCK / 2 / side), 1.0)
     grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -166,8 +158,6 @@ def cells_before_near(space: Space, cameras: Sequence[Camera], near: Sequence[fl
 
     filled  (F, 3) reliable sparse points; see `close_to_path`
     """
-    import torch
-
     count = -(-side // NEAR_BLOCK)
     lattice = np.minimum(np.arange(count + 1) * (NEAR_BLOCK / side), 1.0)
     grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -201,8 +191,6 @@ def close_to_path(
 
     filled  (F, 3) reliable sparse points: a camera that has more than MAX_CONTRADICTED of them so close stands where it cannot, and keeps nothing clear
     """
-    from scipy.spatial import cKDTree
-
     centres, plane = np.array([camera.centre for camera in cameras]), np.asarray(near, np.float64)
     if filled is not None and len(filled):
         within = cKDTree(filled).query_ball_point(centres, clearance * plane, return_length=True)
@@ -228,8 +216,6 @@ def close_to_path(
 
 def contradicted(cells: np.ndarray, space: Space, filled: np.ndarray) -> float:
     """The share of the reliable sparse points (F, 3) of the world that lie in masked density voxels (D, D, D) bool; 0 where there are none."""
-    import torch
-
     points = torch.from_numpy(np.asarray(filled, np.float64))
     grid = space.grid(points if space.ndc is None else space.ndc.points(points)).numpy()
     grid = grid[((grid >= 0) & (grid <= 1)).all(axis=1)]

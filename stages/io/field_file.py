@@ -6,12 +6,22 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
 
+from efficientnerf.fields.hash import FEATURES, grids, level_sizes
+from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.geometry.spaces import Space, space_from
+from efficientnerf.model import Model, model, restore, state_of
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.settings import given
+from efficientnerf.training.exposure.model import Exposure
+from efficientnerf.training.schedule import Schedule
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.files import write_atomically
@@ -19,18 +29,8 @@ from pipeline.stage import settings_from
 from pipeline.text import printable
 from stages.artifacts import TrainOutputs
 from stages.io.json_file import shown
-from stages.renamed_settings import updated
+from stages.io.scene import Scene
 from stages.scratch import opened
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.model import Model
-    from efficientnerf.rendering.field_renderer import FieldRenderer
-    from efficientnerf.training.exposure.model import Exposure
-    from efficientnerf.training.schedule import Schedule
-    from stages.io.scene import Scene
 
 FORMAT = 1
 
@@ -51,8 +51,6 @@ class _About(msgspec.Struct):
 
 def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path) -> None:
     """A safetensors file with one metadata entry, "field", a JSON text with a digest of the tensors: the same input gives the same bytes."""
-    from safetensors.torch import save
-
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     text = json.dumps({"format": FORMAT, **about, "sha256": digest_of(plain)}, sort_keys=True)
     data = save(plain, metadata={"field": text})
@@ -70,8 +68,6 @@ def digest_of(tensors: dict[str, Tensor]) -> str:
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors and the metadata of a file of `write_tensors`; CorruptArtifact where it is damaged."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with opened(path), safe_open(path, framework="pt", device="cpu") as file:
             about = json.loads((file.metadata() or {}).get("field", "null"), parse_constant=_refused)
@@ -92,8 +88,6 @@ def _refused(name: str) -> Any:
 
 def space_of(s: Scene) -> Space:
     """The space that a scene's field lives in."""
-    from efficientnerf.geometry.spaces import space_from
-
     return space_from(s.bounds, contracted=s.contracted) if s.forward is None else space_from(s.forward.bounds, ndc=s.forward.ndc)
 
 
@@ -107,8 +101,6 @@ def save_model(
     exposure  images of photographs, and what was learned of them, where it was
     schedule  that the model was trained with, which gives it again to the byte
     """
-    from efficientnerf.model import state_of
-
     trained = {} if schedule is None else {"iterations": schedule.iterations}
     about: dict[str, Any] = {
         "settings": dataclasses.asdict(m.settings) | trained,
@@ -129,8 +121,6 @@ def save_model(
 
 def load_exposure(folder: Path) -> tuple[list[str], Exposure] | None:
     """What `save_model` was given; None where exposure was not learned. Raises CorruptArtifact."""
-    from efficientnerf.training.exposure.model import Exposure
-
     path = TrainOutputs(folder).field
     if not _names_exposure(path):
         return None
@@ -153,8 +143,6 @@ def load_exposure(folder: Path) -> tuple[list[str], Exposure] | None:
 def _names_exposure(path: Path) -> bool:
     """Whether a field file has it, by its head alone: where exposure was not learned, nobody waits for the rest. One that cannot be read has none: it is
     refused where the field is needed."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with opened(path), safe_open(path, framework="pt", device="cpu") as file:
             return bool(set(EXPOSURE) & set(file.keys())) or '"exposed"' in (file.metadata() or {}).get("field", "")
@@ -164,18 +152,13 @@ def _names_exposure(path: Path) -> bool:
 
 def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     """The trained model in the folder of the train stage, ready to draw."""
-    from efficientnerf.geometry.ndc import Ndc
-    from efficientnerf.geometry.spaces import space_from
-    from efficientnerf.model import model, restore
-    from efficientnerf.rendering.field_renderer import FieldRenderer
-
     path = TrainOutputs(folder).field
     tensors, found = read_tensors(path)
     try:
         about = msgspec.convert(found, _About)
         ndc = None if about.ndc is None else Ndc.from_json(about.ndc)
         space = space_from(np.asarray(about.bounds, np.float64), contracted=about.contracted, ndc=ndc)
-        settings = settings_from(TrainSettings, updated("train", TrainSettings, about.settings))
+        settings = settings_from(TrainSettings, about.settings)
         _check_sizes(tensors, settings, space)
         m = model(space, settings, about.background, device, (about.near, about.far))
         restore(m, tensors)
@@ -189,8 +172,6 @@ def _check_sizes(tensors: dict[str, Tensor], settings: TrainSettings, space: Spa
     side = given(settings.occupancy_resolution) or space.occupancy_resolution
     expected: dict[str, tuple[int, ...]] = {"voxels": (side, side, side)}
     if settings.field == "hash":
-        from efficientnerf.fields.hash import FEATURES, grids, level_sizes
-
         for name, grid in zip(("coarse", "fine"), grids(settings), strict=True):
             expected[f"{name}.table"] = sum(level_sizes(**grid)[1]), FEATURES
     for name, shape in expected.items():

@@ -11,11 +11,18 @@ from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
+from stages.cores import count_cores
 from stages.formats.importers import one_line_errors
 from stages.formats.importers.masks import masks_of
 from stages.formats.importers.photographs import is_video, photographs
 from stages.formats.importers.source import MIN_IMAGES, Source
-from stages.io.pictures import MAX_SIDE
+from stages.io.pictures import MAX_SIDE, UnreadableImage, read_header
+from stages.memory.need import refuse_what_does_not_fit
+from stages.poses.memory import video_needed
+from stages.video.figure import write_frames_plot, write_frames_sheet
+from stages.video.frames import Reader, frames_of
+from stages.video.panorama import VIEWS, is_panorama, views_of
+from stages.video.reading import UnreadableVideo, opened
 
 Warn = Callable[[str], object]
 DECODERS = 16  # threads at most: each holds frames
@@ -78,18 +85,13 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
 
     max_side  longest side of the frames, pixels
     """
-    from stages.cores import count_cores
-    from stages.poses.memory import refuse_large_videos
-    from stages.video.frames import Reader, frames_of
-    from stages.video.reading import UnreadableVideo, opened
-
     if not found.videos:
         return found
     sizes = []
     for path in found.videos.values():
         with contextlib.suppress(UnreadableVideo), opened(path) as video:  # said where it is read
             sizes.append(video.stored)
-    refuse_large_videos(job, sizes)
+    refuse_what_does_not_fit(job, video_needed(sizes), "Export the video at a lower resolution.")
     reader = Reader(min(DECODERS, count_cores()), job.work / "videos", job.progress, job.safe_point, warn)
     try:
         chosen = frames_of(found.videos, count=job.settings.frames, max_side=max_side, reader=reader)
@@ -111,9 +113,6 @@ def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material
 
     max_side  longest side of the views, pixels
     """
-    from stages.io.pictures import UnreadableImage, read_header
-    from stages.video.panorama import VIEWS, is_panorama, views_of
-
     if job.settings.lens in ("perspective", "fisheye"):
         return found
     panoramas: dict[str, Path] = {}
@@ -138,8 +137,6 @@ def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material
 
 
 def _write_record(job: Job, record: list[dict[str, object]], paths: Mapping[str, Path]) -> None:
-    from stages.video.figure import write_frames_plot, write_frames_sheet
-
     outputs = PosesOutputs(job.out)
     write_json(outputs.frames, {"videos": record})
     write_frames_plot(record, outputs.frames_plot)

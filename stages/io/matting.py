@@ -6,6 +6,7 @@ a fringe of B, another one in each photograph.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 CLEAR = 0.25  # share of a pixel from which its own colour is solved for; below, noise would be multiplied by more than four
@@ -23,8 +24,6 @@ def without_background(colour: np.ndarray, cover: np.ndarray) -> np.ndarray:
     B is the mean colour of the pixels nearby that are wholly outside. Solutions stay within the colours of pixels nearby that are wholly inside, where there
     are any, for masks are not exact; pixels of which little is covered take the colour of their neighbours.
     """
-    import cv2
-
     share = cover.astype(np.float32) / 255
     soft = (cover > 0) & (cover < 255)
     if not soft.any():
@@ -45,8 +44,6 @@ def without_background(colour: np.ndarray, cover: np.ndarray) -> np.ndarray:
 
 def _mean_nearby(values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 3) the weighted mean of values near each pixel, and (H, W) whether there is any weight: of a near neighbourhood, else of a farther one."""
-    import cv2
-
     mean, some = np.zeros_like(values), np.zeros(weight.shape, bool)
     for sigma in (FAR, NEAR):
         total = cv2.GaussianBlur(weight, (0, 0), sigma)

@@ -25,7 +25,7 @@ def open_network(path: Path, option: str, threads: int, refused: Refused) -> Any
     """
     data = _bytes_of(path, option)
     try:
-        import onnxruntime  # an optional package
+        import onnxruntime  # an extra
     except ImportError:
         raise UsageError(f"{option} needs the package onnxruntime, which is not installed. Install it: pip install 'efficientnerf[rembg]'") from None
     options = onnxruntime.SessionOptions()

@@ -190,7 +190,9 @@ def apply_exif_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    import cv2
-
     pixels = np.ascontiguousarray(pixels)
-    return pixels if pixels.shape[1::-1] == size else np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+    if pixels.shape[1::-1] == size:
+        return pixels
+    import cv2  # importers list a source's files at the door
+
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))

@@ -27,11 +27,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, UnidentifiedImageError
 
 from pipeline.errors import PipelineError
 from pipeline.text import printable
 from stages.io.decoders.colour_profile import AS_IT_IS, Conversion, conversion_of
 from stages.io.decoders.jpeg_scans import has_more_scans, most_scans
+from stages.io.decoders.raw import RawFile
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "RAW")  # Pillow's names, and our own; a JPEG of several pictures (MPO) comes with JPEG
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are TIFFs of a thumbnail to other readers
@@ -83,8 +85,6 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     """A Pillow image of one of `formats`, whose pixels are not decoded yet. Nothing but decoding belongs into the block: whatever is raised in it becomes
     UnreadableImage, but for MemoryError, and OSError where the process has no more memory or open files, or the file cannot be read now.
     """
-    from PIL import Image
-
     try:
         with _regular_file(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
@@ -144,7 +144,7 @@ def _possible(file: _Bounded, formats: Sequence[str]) -> tuple[str, ...]:
     if head[4:8] == b"ftyp" and (b"avif" in brands or b"avis" in brands) and "AVIF" in formats:
         return ("AVIF",)
     if head[4:8] == b"ftyp" and "HEIF" in formats:
-        import pillow_heif
+        import pillow_heif  # other pictures are never decoded by it
 
         pillow_heif.register_heif_opener()
         return ("HEIF",)
@@ -153,14 +153,10 @@ def _possible(file: _Bounded, formats: Sequence[str]) -> tuple[str, ...]:
 
 def _raw(file: _Bounded) -> Any:
     """A camera's raw picture."""
-    from stages.io.decoders.raw import RawFile
-
     return RawFile(file)
 
 
 def _reason(error: Exception) -> str:
-    from PIL import Image, UnidentifiedImageError
-
     if isinstance(error, UnidentifiedImageError):
         return "no picture in a format that is read (PNG, JPEG, WebP, TIFF, BMP, HEIF, AVIF, camera raw), or damaged at its start"
     if isinstance(error, Image.DecompressionBombError):
@@ -196,8 +192,6 @@ def read_quality(path: Path) -> int | None:
 
 def exif_of(image: Any) -> Any:
     """The EXIF data before the pixels: getexif() would decode the whole of a PNG to look for a late block."""
-    from PIL import Image
-
     if image.format != "PNG":
         return image.getexif()
     exif = Image.Exif()
@@ -223,8 +217,6 @@ def rgb_and_alpha(image: Any, as_stored: bool = False) -> tuple[np.ndarray, np.n
 
     as_stored  without the picture's colour profile: of masks, whose levels are no colours
     """
-    from PIL import Image
-
     _refuse_unknown_samples(image)
     image.load()  # here, and not within NumPy, which takes some errors for another kind of object
     conversion = AS_IT_IS if as_stored else profile_of(image)

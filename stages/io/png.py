@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from pipeline.files import atomic
 from stages.io.pictures import opened
@@ -15,8 +16,6 @@ USUAL = 6
 
 def write_png(pixels: np.ndarray, path: Path, *, compress_level: int = USUAL, durable: bool = True) -> None:
     """Write (H, W), (H, W, 3) or (H, W, 4) uint8; see `pipeline.files.atomic`."""
-    from PIL import Image
-
     with atomic(path, durable=durable) as temporary:
         Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, "PNG", compress_level=compress_level)
 

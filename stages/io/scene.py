@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 from msgspec import to_builtins
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+from safetensors.numpy import save as tensor_bytes
 
 from efficientnerf.capture.forward_facing import SPACES, ForwardFacing
 from efficientnerf.geometry.cameras import Camera, Similarity
@@ -250,8 +253,6 @@ def read_mask(folder: Path, view: View) -> np.ndarray | None:
 
 def save_points(points: SparsePoints, folder: Path) -> None:
     """Write folder/points.safetensors; `points` in the training frame, tracks as indices into the scene's views."""
-    from safetensors.numpy import save
-
     counts = np.fromiter(map(len, points.tracks), np.int64, len(points.tracks))
     tensors = {
         "xyz": np.ascontiguousarray(points.xyz, np.float64),
@@ -260,7 +261,7 @@ def save_points(points: SparsePoints, folder: Path) -> None:
         "observer_counts": counts,
         "observers": np.fromiter(itertools.chain.from_iterable(points.tracks), np.int64, int(counts.sum())),
     }
-    PosesOutputs(folder).points.write_bytes(save(tensors))  # save_file() would leave it to its owner alone, whatever the umask
+    PosesOutputs(folder).points.write_bytes(tensor_bytes(tensors))  # save_file() would leave it to its owner alone, whatever the umask
 
 
 def read_points(folder: Path) -> SparsePoints:
@@ -277,9 +278,6 @@ def read_observations(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _point_arrays(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
     path = PosesOutputs(folder).points
     try:
         tensors = load_file(path)

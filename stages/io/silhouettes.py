@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from stages.io.capture import Photo, Silhouettes
@@ -62,8 +63,6 @@ def _alpha_of(photo: Photo) -> np.ndarray | None:
 
 
 def _mask_of(photo: Photo) -> np.ndarray | None:
-    import cv2
-
     try:
         levels = mask_levels(photo, read_header(photo.image).orientation)[0]
     except UnreadableImage:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import cv2
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
@@ -153,8 +154,6 @@ def _is_plain(image: Any) -> bool:
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resized by area averaging in sRGB, colours weighted by alpha."""
-    import cv2
-
     if pixels.shape[1::-1] == size:
         return pixels
     if pixels.shape[2] == 3:
@@ -171,8 +170,6 @@ def _cut_out(pixels: np.ndarray, levels: np.ndarray, size: tuple[int, int]) -> n
 
     A photograph without alpha has its surroundings yet, which the colours of soft edges are freed of.
     """
-    import cv2
-
     def to(size: tuple[int, int]) -> np.ndarray:
         if levels.shape[::-1] == size:
             return levels

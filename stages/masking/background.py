@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
@@ -42,8 +43,6 @@ def silhouettes_with_surroundings(paths: Mapping[str, Path], masks: Mapping[str,
 
 def stands_still(photos: Sequence[Photo], kind: Silhouettes, small: SmallPictures, safe_point: Callable[[], None]) -> bool:
     """Whether what lies outside of the silhouettes is the same in photographs that follow each other, or has no texture at all."""
-    import cv2
-
     found: list[float] = []
     for index in range(0, len(photos) - 1, -(-len(photos) // MOST_PAIRS)):
         safe_point()

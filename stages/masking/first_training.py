@@ -8,19 +8,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, resized
+from efficientnerf.model import Model, model
+from efficientnerf.training import loop
+from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job
+from stages.cores import use_all_cores
+from stages.framing.training_frame import find_training_frame
 from stages.io.capture import Capture
-
-if TYPE_CHECKING:
-    from efficientnerf.model import Model
-    from efficientnerf.training.pixels import Pixels
-    from stages.io.scene import Scene
+from stages.io.field_file import space_of
+from stages.io.scene import Scene, View, save_points
+from stages.train.data import sparse_depth_of
+from stages.train.priors import filled_points, mask_cells_by
 
 # docs/experiments/silhouettes.md
 SIDE = 320  # px, longest side of the photographs that it is trained on
@@ -49,14 +52,6 @@ def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settin
 
     images  (H, W, 3) uint8 of the photographs, upright
     """
-    from efficientnerf.model import model
-    from efficientnerf.training import loop
-    from efficientnerf.training.pixels import Pixels
-    from stages.cores import use_all_cores
-    from stages.io.field_file import space_of
-    from stages.train.data import sparse_depth_of
-    from stages.train.priors import filled_points, mask_cells_by
-
     use_all_cores()
     folder = job.work / "first_training"
     folder.mkdir(exist_ok=True)
@@ -73,9 +68,6 @@ def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settin
 
 def _scene(capture: Capture, sizes: list[tuple[int, int]], folder: Path) -> Scene:
     """The scene of a capture with photographs of these sizes (width, height), all of them for training; its points are written to the folder."""
-    from stages.framing.training_frame import find_training_frame
-    from stages.io.scene import Scene, View, save_points
-
     framed = find_training_frame(capture, space="contracted")
     world = framed.world_from_capture
     views = []

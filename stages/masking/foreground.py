@@ -10,26 +10,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
+from efficientnerf.asset.field_samples import field_samples, picture_places, surface_points
+from efficientnerf.capture.foreground import find_subject
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.compiling import compiling_kernels
 from stages.cores import count_cores, in_order
+from stages.figures.plots import grid_sheet
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
+from stages.framing.mask_use import LEAST_OVERLAP, MIN_AGREEING, alike, hull_overlaps
 from stages.io.capture import FOREGROUND, Capture, Photo, without
 from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header
-from stages.masking.first_training import FIRST, RAYS, SIDE, first_field
+from stages.masking.first_training import FIRST, RAYS, SIDE, FirstField, first_field
 from stages.masking.made import write_mask
 from stages.masking.subject import Subject, coverage, subject_of
-
-if TYPE_CHECKING:
-    from stages.masking.first_training import FirstField
+from stages.memory.need import refuse_what_does_not_fit
+from stages.scratch import note, noted
+from stages.train.memory import first_training_needed
 
 # docs/experiments/silhouettes.md
 LEAST_SAMPLE = 1e-3  # weight of a sample of the field that is looked at
@@ -55,8 +60,6 @@ class _Made(msgspec.Struct):
 
 def with_foreground_masks(job: Job, capture: Capture, warn: Any) -> Capture:
     """The capture with a silhouette of the foreground as the mask of each photograph that has a trustworthy one. Raises UsageError, BadInput."""
-    from stages.scratch import note, noted
-
     _refuse_other_masks(capture.photos)
     capture, images = _pictures(job, capture, warn)
     folder = job.work / "foreground"
@@ -74,9 +77,6 @@ def with_foreground_masks(job: Job, capture: Capture, warn: Any) -> Capture:
 
 def _made_anew(job: Job, capture: Capture, images: list[np.ndarray], folder: Path) -> _Made:
     """Masks in the folder, by a first training. Raises BadInput."""
-    from stages.memory.need import refuse_what_does_not_fit
-    from stages.train.memory import first_training_needed
-
     found: list[_Made] = []
 
     @compiling_kernels
@@ -122,9 +122,6 @@ def _pictures(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[np.n
 
 def _subject(field: FirstField) -> Subject:
     """The subject of a first training. Raises BadInput."""
-    from efficientnerf.asset.field_samples import field_samples, picture_places, surface_points
-    from efficientnerf.capture.foreground import find_subject
-
     samples = field_samples(field.model, field.pixels, RAYS, LEAST_SAMPLE, lambda done, total: None)
     points = surface_points(samples)
     found = find_subject(points, samples.view, picture_places(samples, field.pixels, slice(None)), field.cameras, weights=samples.opacity)
@@ -137,7 +134,6 @@ def _subject(field: FirstField) -> Subject:
 
 def _made(job: Job, capture: Capture, field: FirstField, subject: Subject, folder: Path) -> _Made:
     """Masks of the photographs, in the folder, whose silhouettes are those of one compact thing. Raises BadInput."""
-    from stages.framing.mask_use import LEAST_OVERLAP, MIN_AGREEING, alike, hull_overlaps
     small: list[tuple[Photo, np.ndarray]] = []
     for number, (photo, camera) in enumerate(zip(capture.photos, field.cameras, strict=True)):
         job.reached(number, len(capture.photos), "silhouettes of the foreground")
@@ -165,8 +161,6 @@ def _made(job: Job, capture: Capture, field: FirstField, subject: Subject, folde
 
 def cleaned(covered: np.ndarray) -> np.ndarray:
     """(H, W) uint8 of how much of each pixel is covered: without small parts and small gaps."""
-    import cv2
-
     mask = np.round(np.clip(covered, 0, 1) * 255).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats((mask >= 128).astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
@@ -185,10 +179,6 @@ def _border_share(kept: np.ndarray) -> float:
 
 def _draw(photos: Sequence[Photo], images: Sequence[np.ndarray], path: Path) -> None:
     """A sheet of photographs, (H, W, 3) uint8 each, in colour where their masks keep them; of many an even choice."""
-    import cv2
-
-    from stages.figures.plots import grid_sheet
-
     pictures, labels = [], []
     for photo, image in list(zip(photos, images, strict=True))[:: -(-len(photos) // MOST_SHEET)]:
         kept = np.zeros(image.shape[:2], np.uint8)

@@ -6,10 +6,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from efficientnerf.capture.keying import key_of, keyed
 from pipeline.errors import BadInput
+from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage
+from stages.io.png import write_png
+from stages.masking.network import MaskNetwork
+from stages.masking.static import SIDE, StillBackground, sharpened
 
 STATIC = "static"
 MASK_SIDE = 2048  # px, longest side of the photographs that masks are made from
@@ -73,9 +79,6 @@ def _all_made(
 
 
 def _by_network(model: Path) -> Callable[[Path, Path], bool]:
-    from stages.masking.network import MaskNetwork
-    from stages.masking.static import sharpened
-
     network = MaskNetwork(model)
 
     def make(photograph: Path, target: Path) -> bool:
@@ -89,8 +92,6 @@ def _by_network(model: Path) -> Callable[[Path, Path], bool]:
 
 
 def _by_key(how: str) -> Callable[[Path, Path], bool]:
-    from efficientnerf.capture.keying import key_of, keyed
-
     key = key_of(how)
 
     def make(photograph: Path, target: Path) -> bool:
@@ -104,8 +105,6 @@ def _by_key(how: str) -> Callable[[Path, Path], bool]:
 
 
 def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Callable[[], None]) -> Callable[[Path, Path], bool]:
-    from stages.masking.static import SIDE, StillBackground, sharpened
-
     small: dict[Path, np.ndarray] = {}
     for name in names:
         safe_point()
@@ -131,17 +130,11 @@ def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Calla
 
 
 def _read(path: Path, side: int) -> Any:
-    from stages.io.photo import read_photo
-
     return read_photo(path, side)
 
 
 def write_mask(mask: np.ndarray, size: tuple[int, int], target: Path) -> None:
     """At the photograph's own size (width, height)."""
-    import cv2
-
-    from stages.io.png import write_png
-
     if mask.shape[::-1] != size:
         mask = cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR)
     write_png(mask, target, durable=False)

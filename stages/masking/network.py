@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from pipeline.errors import BadInput
@@ -41,8 +42,6 @@ class MaskNetwork:
 
     def mask(self, rgb: np.ndarray) -> np.ndarray | None:
         """(h, w) uint8 at the network's size: how much of each pixel of an sRGB image (H, W, 3) uint8 is subject, 0 to 255; None where there is none."""
-        import cv2
-
         small = cv2.resize(rgb, self._size[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
         small = (small / max(float(small.max()), 1e-6) - self._mean) / self._deviation
         picture = np.ascontiguousarray(small.transpose(2, 0, 1)[None], np.float32)

@@ -8,18 +8,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from efficientnerf.settings import given
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
+from stages.cores import count_cores
+from stages.formats.importers import IMPORTERS, posed_format
+from stages.framing.mask_use import MIN_AGREEING, share_that_fits
 from stages.io.capture import BACKGROUND, FOREGROUND, LEFT_OUT, SEEN, Capture, Silhouettes
+from stages.io.material import photographs_of
+from stages.io.pictures import UnreadableImage, read_header
+from stages.io.silhouettes import SmallPictures
+from stages.masking.background import silhouettes_with_surroundings
+from stages.masking.made import made_masks, masks_by_network
+from stages.masking.polarity import SAID, kept_white
+from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
+from stages.poses.memory import feature_threads
+from stages.sfm.gps import STATED, with_gps, with_stated_cameras
+from stages.sfm.ladder import ENOUGH, features_for
+from stages.sfm.learned.networks import given_networks
+from stages.sfm.reconstruction import find_cameras
 
 Find = Callable[[str, Mapping[str, Path | None]], Capture]
 
 
 def cameras_of_photographs(job: Job, warn: Any) -> Capture:
     """The capture of the job's photographs and videos. Raises BadInput."""
-    from stages.io.material import photographs_of
-    from stages.masking.polarity import kept_white
-
     found = photographs_of(job, warn)
     paths, settings = found.paths, job.settings
     find = _search(job, paths, warn)
@@ -41,9 +54,6 @@ def cameras_of_photographs(job: Job, warn: Any) -> Capture:
 
 def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tuple[Capture, list[str]]:
     """The capture in the frame of cameras that the source states, where it is read as photographs in spite of them; else by GPS; and what is to be said."""
-    from stages.formats.importers import IMPORTERS, posed_format
-    from stages.sfm.gps import STATED, with_gps, with_stated_cameras
-
     said, source = [], job.source
     assert source is not None
     name = posed_format(source, job.settings) if len(job.sources) == 1 else None
@@ -62,9 +72,6 @@ def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tu
 
 def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], inverted: Mapping[str, Path]) -> Capture:
     """The capture of photographs with these masks; with the inverted ones in their place where these are silhouettes of one thing."""
-    from stages.masking.background import silhouettes_with_surroundings
-    from stages.masking.polarity import SAID
-
     def search(masks: Mapping[str, Path]) -> Capture:
         kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, {}), job.safe_point)
         # Alpha channels leave pixels out where these are no silhouettes.
@@ -90,8 +97,6 @@ def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[st
 
 def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, Path]:
     """Masks made for these photographs, by name, as `poses.mask_from` and `poses.mask_model` say."""
-    from stages.masking.made import made_masks, masks_by_network
-
     common: dict[str, Any] = {"safe_point": job.safe_point, "progress": job.progress, "warn": warn}
     if not paths:
         return {}
@@ -112,14 +117,6 @@ def mask_choice(settings: Any, facts: Mapping[str, object]) -> str:
 
 def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
     """Structure from motion on photographs, with a scratch folder of its own for each name."""
-    from efficientnerf.settings import given
-    from stages.cores import count_cores
-    from stages.io.pictures import UnreadableImage, read_header
-    from stages.poses.memory import feature_threads
-    from stages.sfm.ladder import features_for
-    from stages.sfm.learned.networks import given_networks
-    from stages.sfm.reconstruction import find_cameras
-
     source, settings = job.source, job.settings
     assert source is not None
     networks = given_networks(settings.features_model, settings.matcher_model)
@@ -156,9 +153,6 @@ def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path]) -> tupl
 
     Cameras by the subject alone are taken where they have nearly all photographs, or where all of the picture does not explain more.
     """
-    from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
-    from stages.sfm.ladder import ENOUGH
-
     masks = masks_of_turning_subject(paths, job.work / "masks", safe_point=job.safe_point, progress=job.progress)
     if not masks:
         return None, False
@@ -188,9 +182,6 @@ def _explained(capture: Capture) -> float:
 
 def _fit(capture: Capture) -> bool:
     """Whether the masks of nearly all photographs are silhouettes of one thing."""
-    from stages.framing.mask_use import MIN_AGREEING, share_that_fits
-    from stages.io.silhouettes import SmallPictures
-
     return share_that_fits(capture, Silhouettes(masks=True), SmallPictures()) >= MIN_AGREEING
 
 
@@ -199,9 +190,6 @@ def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mappi
 
     masks, everywhere  what leaves out what is not of the object, and what does not
     """
-    from stages.framing.mask_use import MIN_AGREEING, share_that_fits
-    from stages.io.silhouettes import SmallPictures
-
     def fit(found: Capture) -> float:
         return share_that_fits(found, kind, SmallPictures()) * len(found.photos)
 

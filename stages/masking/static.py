@@ -6,6 +6,7 @@ photographs. N photographs of (h, w).
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from efficientnerf.capture.keying import without_specks
@@ -44,8 +45,6 @@ class StillBackground:
 
     def mask(self, small: np.ndarray) -> np.ndarray:
         """(h, w) uint8 of one of the photographs (h, w, 3): 255 where it shows the object."""
-        import cv2
-
         off = np.abs(self._even(small) - self._colour).max(-1)
         found = ((off > self._limit) | self._never).astype(np.uint8)
         wide = max(1, round(CLOSING * max(found.shape)))
@@ -82,8 +81,6 @@ def _commonest(images: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]
 
 def sharpened(mask: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     """A mask at the size of its photograph (H, W, 3) uint8, its edge moved to the photograph's."""
-    import cv2
-
     large = cv2.resize(mask, (rgb.shape[1], rgb.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
     radius = max(2, round(GUIDE_RADIUS * max(rgb.shape[:2]) / SIDE))
     soft = cv2.ximgproc.guidedFilter(rgb.astype(np.float32) / 255, large, radius, GUIDE_EPSILON)
@@ -100,8 +97,6 @@ def border_of(shape: tuple[int, ...]) -> np.ndarray:
 
 def _filled(mask: np.ndarray) -> np.ndarray:
     """A mask (h, w) of 0 and 1 without what no border reaches."""
-    import cv2
-
     around = np.pad(1 - mask, 1, constant_values=1)
     _, labels = cv2.connectedComponents(around.astype(np.uint8), connectivity=4)
     return np.asarray((labels != labels[0, 0])[1:-1, 1:-1], np.uint8)

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
+import torch
+from scipy.spatial import cKDTree
 
 from efficientnerf.capture.cells import CONNECTED, connected_parts
 from efficientnerf.capture.foreground import MIN_PART, Foreground
 from efficientnerf.capture.supports import Plane, along
 from efficientnerf.geometry.cameras import Camera, project, rays
-
-if TYPE_CHECKING:
-    from efficientnerf.model import Model
+from efficientnerf.model import Model, render_rays
+from efficientnerf.rendering.compositing import ray_of_sample
 
 # docs/experiments/silhouettes.md
 FINER, MIN_ENDS = 2, 3  # cells along a side of the foreground's; rays that end in one, at least
@@ -46,8 +47,6 @@ class Subject:
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool."""
-        from scipy.spatial import cKDTree
-
         found = np.ones(len(points), bool)
         for (normal, offset), above in self.planes:
             found &= along(points, normal) - offset > above
@@ -69,8 +68,6 @@ def subject_of(found: Foreground, points: np.ndarray) -> Subject:
 
 def _grown(found: Foreground, points: np.ndarray, planes: Sequence[tuple[Plane, float]], side: float) -> np.ndarray:
     """(M, 3) centres of finer cells in which rays end, above the planes, connected with the subject: what is flat on a support was within its tolerance."""
-    from scipy.spatial import cKDTree
-
     low, high = found.region.bounds
     above = ((points >= low) & (points <= high)).all(axis=1)
     for (normal, offset), least in planes:
@@ -87,8 +84,6 @@ def _grown(found: Foreground, points: np.ndarray, planes: Sequence[tuple[Plane, 
 
 def _support(plane: Plane, found: Foreground, points: np.ndarray, least: float) -> tuple[Plane, float]:
     """The plane of the points round the subject that lie near a plane, and how thick it is."""
-    from scipy.spatial import cKDTree
-
     normal, offset = plane
     size = float(np.ptp(found.subject, axis=0).max())
     height = along(points, normal) - offset
@@ -115,8 +110,6 @@ def coverage(m: Model, subject: Subject, camera: Camera, near: float, far: float
 
     camera  in the training frame
     """
-    import torch
-
     found = np.zeros(camera.width * camera.height)
     chosen = np.flatnonzero(may_show(subject, camera))
     with torch.no_grad():
@@ -128,11 +121,6 @@ def coverage(m: Model, subject: Subject, camera: Camera, near: float, far: float
 
 def _coverage(m: Model, subject: Subject, camera: Camera, index: np.ndarray, near: float, far: float) -> np.ndarray:
     """(R,) `coverage` of these pixels (R,)."""
-    import torch
-
-    from efficientnerf.model import render_rays
-    from efficientnerf.rendering.compositing import ray_of_sample
-
     o, d = rays(camera, np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1))
     o, slant = np.broadcast_to(o, d.shape), np.maximum(d @ camera.forward, 1e-3)
     origins, directions, first, last = (torch.tensor(part, dtype=torch.float32) for part in (o, d, near / slant, far / slant))
@@ -146,8 +134,6 @@ def _coverage(m: Model, subject: Subject, camera: Camera, index: np.ndarray, nea
 
 def may_show(subject: Subject, camera: Camera) -> np.ndarray:
     """(H, W) bool: the pixels near which a cell of the subject is projected."""
-    import cv2
-
     place, depth = project(camera, subject.cells)
     found = np.zeros((camera.height, camera.width), np.uint8)
     if np.linalg.norm(subject.cells - camera.centre, axis=1).min() <= subject.reach:  # the camera is beside it

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pipeline.errors import BadInput
@@ -75,8 +76,6 @@ def border_stands_still(paths: Mapping[str, Path], safe_point: Callable[[], None
 
 
 def _texture_of_border(path: Path) -> np.ndarray | None:
-    import cv2
-
     try:
         grey = read_photo(path, SIDE).rgb.astype(np.float32).mean(2)
     except UnreadableImage:

@@ -6,7 +6,7 @@ setting that would make it smaller. So an artifact has the same bytes whatever m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from pipeline.errors import TooLittleMemory
@@ -48,7 +48,12 @@ def has_room(job: Job, need: Need) -> bool:
     if job.memory is None:
         return True
     now = available_now()
-    return need.total <= (job.memory.bytes if now is None else min(job.memory.bytes, now))
+    return need.total <= min(job.memory.bytes, job.memory.bytes if now is None else now)
+
+
+def most_threads(job: Job, threads: int, need: Callable[[int], Need]) -> int:
+    """As many of the threads as `has_room` for what they take; one where there is room for none."""
+    return next((fewer for fewer in range(threads, 1, -1) if has_room(job, need(fewer))), 1)
 
 
 def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:

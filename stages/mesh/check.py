@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.surface.agreement import AssetView
-    from efficientnerf.surface.mesh import Mesh
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.surface.agreement import AssetView, agreement, asset_view, differences, shown_pixels
+from efficientnerf.surface.isosurface import automatic_threshold
+from efficientnerf.surface.level import silhouette_level
+from efficientnerf.surface.mesh import Mesh
+from efficientnerf.surface.rasteriser import mesh_image
+from efficientnerf.surface.volume import volume_of
+from stages.figures.shading import difference_row
+from stages.framing.camera_paths import turntable_cameras
+from stages.framing.captured import captured_of
 
 CAPTURED, ORBIT = 12, 12  # cameras
 FUSED = 24  # cameras beside these, whose depths are fused too
@@ -23,10 +29,6 @@ PICTURED = 3  # views in the picture: those that agree least
 
 def check_cameras(tree: NerfTree) -> list[Camera]:
     """Some of the captured cameras, where the asset keeps any, and a turntable's."""
-    from efficientnerf.geometry.cameras import Camera
-    from stages.framing.camera_paths import turntable_cameras
-    from stages.framing.captured import captured_of
-
     captured = captured_of(tree.metadata)
     longer = min(LONGER_SIDE, PIXELS_PER_VOXEL * max(tree.resolution))
     width, height = (longer, max(1, 3 * longer // 4)) if captured is None else (captured.width, captured.height)
@@ -42,9 +44,6 @@ def check_cameras(tree: NerfTree) -> list[Camera]:
 
 def other_cameras(tree: NerfTree, known: list[Camera]) -> list[Camera]:
     """Captured cameras that are not among those of the check, with images of the same size; of an asset that keeps none a turntable's between them."""
-    from stages.framing.camera_paths import turntable_cameras
-    from stages.framing.captured import captured_of
-
     captured, size = captured_of(tree.metadata), (known[0].width, known[0].height)
     if captured is None:
         return turntable_cameras(tree, frames=2 * ORBIT, width=size[0], height=size[1])[1::2]
@@ -56,8 +55,6 @@ def other_cameras(tree: NerfTree, known: list[Camera]) -> list[Camera]:
 
 def asset_views(tree: NerfTree, progress: Callable[[int, int, str], None]) -> tuple[list[AssetView], list[AssetView]]:
     """What the cameras of the check see of the asset; and these with others, whose depths are fused: none of a forward-facing asset."""
-    from efficientnerf.surface.agreement import asset_view
-
     checking = check_cameras(tree)
     cameras, out = [*checking, *(other_cameras(tree, checking) if tree.ndc is None else [])], []
     for number, camera in enumerate(cameras):
@@ -68,10 +65,6 @@ def asset_views(tree: NerfTree, progress: Callable[[int, int, str], None]) -> tu
 
 def checked(mesh: Mesh, views: list[AssetView], tick: Callable[[], None]) -> tuple[dict[str, Any], np.ndarray]:
     """How a mesh of the training frame agrees with the asset, for its report, and a picture (H, W, 3) uint8. `tick` is called after each view."""
-    from efficientnerf.surface.agreement import agreement, differences
-    from efficientnerf.surface.rasteriser import mesh_image
-    from stages.figures.shading import difference_row
-
     images = []
     for view in views:
         images.append(mesh_image(mesh.vertices, mesh.faces, view.camera))
@@ -95,8 +88,6 @@ def warning_of(report: dict[str, Any]) -> str | None:
 def shown_by(views: list[AssetView], voxel: float, tick: Callable[[], None]) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
     """(vertices, faces, component of each face) -> how much of each component the views show; see `efficientnerf.surface.agreement.shown_pixels`. `tick` is
     called before each view; what it raises stops the work."""
-    from efficientnerf.surface.agreement import shown_pixels
-
     def ticking() -> Iterator[AssetView]:
         for view in views:
             tick()
@@ -108,10 +99,6 @@ def shown_by(views: list[AssetView], voxel: float, tick: Callable[[], None]) -> 
 def level_of(tree: NerfTree, threshold: float | None, views: list[AssetView], tick: Callable[[], None]) -> float | None:
     """The density of the surface: what is given, else that which has the asset's silhouettes; None for nested grids, each of which has its own. Raises
     NoSurface."""
-    from efficientnerf.surface.isosurface import automatic_threshold
-    from efficientnerf.surface.level import silhouette_level
-    from efficientnerf.surface.volume import volume_of
-
     if threshold is not None or tree.outer:
         return threshold
     return silhouette_level(tree, views[::2], automatic_threshold(volume_of(tree)), tick)

@@ -17,6 +17,8 @@ from stages.formats.exporters.obj import head as obj_head
 from stages.formats.exporters.ply import FACE, VERTEX
 from stages.formats.exporters.ply import mesh_header as ply_header
 from stages.formats.exporters.writing import MOST_TEXELS, SourceFrame, write_parts
+from stages.io.pictures import UnreadableImage, read_header
+from stages.io.png import read_png
 
 MOST_BYTES = 2**32  # of a file that is read
 
@@ -105,9 +107,6 @@ def _accessor(document: Any, blob: bytes, index: int, kind: str, width: int) -> 
 
 
 def _picture(path: Path) -> np.ndarray:
-    from stages.io.pictures import UnreadableImage, read_header
-    from stages.io.png import read_png
-
     try:
         if max(read_header(path).size) > MOST_TEXELS:
             _refuse(path, f"more than {MOST_TEXELS} texels along a side")

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
-from stages.memory.need import SURFACES, Need, libraries
-from stages.memory.rendering import tree_bytes
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.fusion import MARGIN
+from efficientnerf.surface.isosurface import BLOCK, pool_of
+from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
+from stages.artifacts import MeshInputs
+from stages.io.scene import load, views_of
+from stages.memory.forecast import Known
+from stages.memory.need import MIB, SURFACES, Need, libraries
+from stages.memory.tree import asset_of, tree_bytes
 from stages.mesh.check import CAPTURED, FUSED, LONGER_SIDE, ORBIT
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from stages.mesh.settings import MeshSettings
+from stages.mesh.texture import largest_photograph
+from stages.train.data import count_pixels
 
 # Bytes. Of a stored voxel: vertices and faces while they are joined, cleaned and decimated, as many as a thin shell has; of a cell in which enclosed space
 # is found, and of a voxel of the bricks that these are made from; of a point with what its colour is looked up by.
@@ -21,15 +27,13 @@ PIXEL, BLOCK_VOXEL = 36, 120
 TEXEL, PHOTOGRAPH_PIXEL = 140, 60
 # Of a stored voxel, what a normal map is baked from: the surface before decimation with its normals, and cells in which its faces are found.
 DENSE_VOXEL, DENSE_CELLS = 250, 8 * 256**3
+# Bytes written: of a face in all files; of a texel in its own file and in GLB; of pictures. Faces of a voxel and texels of a photograph's pixel, at most.
+WRITTEN_FACE, WRITTEN_TEXEL, SHEET, FACES, TEXELS = 180, 3, 3 * MIB // 4, 4, 4
 
 
 def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False) -> Need:
     """What it takes to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
     and with a normal map where `dense`."""
-    from efficientnerf.surface.fusion import MARGIN
-    from efficientnerf.surface.isosurface import BLOCK, pool_of
-    from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
-
     views = CAPTURED + ORBIT + FUSED
     pool = pool_of(volume_of(tree))
     cells = [-(-side // pool) + 2 for side in tree.resolution]
@@ -43,3 +47,22 @@ def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: in
     optional = {"points": POINT * points, "the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
                 "the normal map": (DENSE_VOXEL * len(tree.density_values) + DENSE_CELLS) if dense else 0}  # fmt: skip
     return Need(terms | {what: count for what, count in optional.items() if count})
+
+
+def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
+    """What the stage mesh takes."""
+    texture = 0 if settings.texture == "off" else settings.texture_size
+    return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
+
+
+def memory_needed(known: Known) -> Need:
+    """`needed` for the whole asset."""
+    return needed(asset_of(known), known.settings["mesh"], known.inputs(MeshInputs))
+
+
+def space_needed(known: Known) -> int:
+    """Mesh files, textures and pictures."""
+    own, views = known.settings["mesh"], views_of(load(known.inputs(MeshInputs).poses.folder), "train")
+    faces = min(int(str(own.max_faces).replace("k", "000")), FACES * len(asset_of(known).density_values))
+    texels = 0 if own.texture == "off" else min(own.texture_size**2, TEXELS * count_pixels(views)) * (1 + own.normal_map)
+    return SHEET + WRITTEN_FACE * faces + WRITTEN_TEXEL * texels

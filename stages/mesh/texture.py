@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.surface.mesh import Mesh
-    from efficientnerf.surface.texturing.photographs import Photograph
-    from stages.artifacts import MeshInputs
-    from stages.io.scene import View
-    from stages.mesh.run import MeshSettings
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.mesh import Mesh, Texture
+from efficientnerf.surface.shading import vertex_colours
+from efficientnerf.surface.texturing.asset import texture_of_asset
+from efficientnerf.surface.texturing.atlas import atlas_of
+from efficientnerf.surface.texturing.filling import texture_from
+from efficientnerf.surface.texturing.normal_map import Dense, with_normal_map
+from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, photograph, survey, texels_wanted
+from stages.artifacts import MeshInputs
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import View, load, views_of
+from stages.train.averaged import averaged_views
 
 Progress = Callable[[int, int, str], None]
 
@@ -27,9 +32,6 @@ def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, larges
     largest   texels along a side, at most
     progress  is called often; what it raises stops the work
     """
-    from efficientnerf.surface.shading import vertex_colours
-    from efficientnerf.surface.texturing.asset import texture_of_asset
-
     if choice == "off":
         return mesh
     found = None if choice == "asset" else _from_photographs(mesh, inputs, largest, progress)
@@ -40,13 +42,6 @@ def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, larges
 
 def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Progress) -> Mesh | None:
     """Textured by the training photographs; None where there are none."""
-    from efficientnerf.surface.mesh import Texture
-    from efficientnerf.surface.texturing.atlas import atlas_of
-    from efficientnerf.surface.texturing.filling import texture_from
-    from efficientnerf.surface.texturing.photographs import PhotographTexture, survey, texels_wanted
-    from stages.io.refined_cameras import load_scene
-    from stages.io.scene import views_of
-
     views = views_of(load_scene(inputs.poses.folder, inputs.train.folder), "train")
     if not views:
         return None
@@ -76,25 +71,13 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
 
 def with_relief(mesh: Mesh, dense: list[tuple[np.ndarray, np.ndarray]], tick: Callable[[], None]) -> Mesh:
     """The textured mesh with a normal map of what it was before decimation: vertices and faces of each cascade."""
-    from efficientnerf.surface.texturing.normal_map import Dense, with_normal_map
-
     first = np.cumsum([0, *(len(vertices) for vertices, _ in dense)])
     faces = np.concatenate([part + start for (_, part), start in zip(dense, first)])
     return with_normal_map(mesh, Dense(np.concatenate([vertices for vertices, _ in dense]), faces), tick)
 
 
-def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
-    """Raise UsageError for a normal map on a mesh without texture coordinates."""
-    from pipeline.errors import UsageError
-
-    if settings.normal_map and settings.texture == "off":
-        raise UsageError("mesh.normal_map lies on the coordinates of a texture, and mesh.texture is off. Set one of them otherwise.")
-
-
 def largest_photograph(inputs: MeshInputs, choice: str) -> int:
     """Pixels of the largest photograph that a texture is made of; none where it is not made of any."""
-    from stages.io.scene import load, views_of
-
     if choice in ("off", "asset"):
         return 0
     return max((view.camera.width * view.camera.height for view in views_of(load(inputs.poses.folder), "train")), default=0)
@@ -102,9 +85,6 @@ def largest_photograph(inputs: MeshInputs, choice: str) -> int:
 
 def photographs(inputs: MeshInputs, views: tuple[View, ...]) -> Iterator[Photograph]:
     """The photographs of views, read when they are asked for; where training learned their exposure, as if all had been exposed alike."""
-    from efficientnerf.surface.texturing.photographs import photograph
-    from stages.train.averaged import averaged_views
-
     read = averaged_views(inputs.poses.folder, inputs.train.folder)
     for view in views:
         yield photograph(view.camera, *read(view))

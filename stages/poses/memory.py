@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
 
-from pipeline.executors.memory import available_now
+from efficientnerf.settings import given
+from pipeline.errors import PipelineError
 from pipeline.stage import Job
+from stages.cores import count_cores
+from stages.formats.importers import detect
+from stages.formats.importers.source import IMAGE_SUFFIXES
+from stages.io.capture import FOREGROUND
 from stages.io.photo import working_size
-from stages.memory.need import IMAGING, MIB, Need, refuse_what_does_not_fit
+from stages.io.pictures import UnreadableImage, read_header
+from stages.memory.forecast import Known, files_below, sizes_below
+from stages.memory.need import IMAGING, MIB, Need, most_threads, refuse_what_does_not_fit
+from stages.sfm.ladder import features_for
+from stages.sfm.learned.matches import AT_ONCE
+from stages.sfm.learned.networks import LONGEST
+from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
+from stages.sfm.pairs import BLOCK_SIZE
+from stages.video.panorama import VIEWS
+from stages.video.reading import UnreadableVideo, opened
 
 # Bytes. Of a pixel of the photograph that is decoded, turned, reduced and written; of a pixel of a photograph in which features are detected, on a thread
 # of its own (SIFT's first octave), four times as many where that is twice as large; of an image's descriptors while they are matched.
@@ -15,12 +33,16 @@ DECODED, SIFT, DESCRIPTOR = 26, 80, 640
 NETWORK = 2400  # of a pixel of a picture in a network that detects features: ALIKED-T16 took 1,200, and the larger ones have twice its channels
 FRAME = 60  # of a pixel of a video: what its decoder keeps, 16 frames of 10 bits, and the frame that is looked at or written
 COLMAP = 200 * MIB  # the process in which structure from motion runs
+# Bytes written. Of a pixel of a working image; of a feature with its matches. Times a photograph's file: what it takes as PNG.
+WRITTEN, FEATURE, AS_PNG = 2, 400, 8
+ASPECT = 0.75  # of the longer side of a picture: the shorter
+HEADERS = 150  # of photographs that are read, evenly spaced
 REMEDY = "Lower poses.feature_image_size, or reduce the largest photographs."
 
 
-def decoding_needed(sizes: Sequence[tuple[int, int]]) -> Need:
-    """What it takes to read photographs of these sizes, one at a time."""
-    return Need({"a photograph": DECODED * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
+def decoding_needed(sizes: Sequence[tuple[int, int]], threads: int = 1) -> Need:
+    """What it takes to read photographs of these sizes, one at a time on each thread."""
+    return Need({"a photograph": DECODED * threads * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
 
 
 def video_needed(sizes: Sequence[tuple[int, int]]) -> Need:
@@ -35,11 +57,6 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     features  of a photograph, at most
     networks  whether photographs without a camera are matched by networks
     """
-    from stages.sfm.learned.matches import AT_ONCE
-    from stages.sfm.learned.networks import LONGEST
-    from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
-    from stages.sfm.pairs import BLOCK_SIZE
-
     reduced = {working_size(*size, max_side) for size in sizes}
     most = max((width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced), default=0)
     decoded = decoding_needed(sizes).terms
@@ -53,36 +70,76 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     })  # fmt: skip
 
 
-def refuse_large_photographs(job: Job, sizes: Sequence[tuple[int, int]]) -> None:
-    """UsageError where the largest photograph does not fit into memory while it is decoded."""
-    refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
-
-
-def refuse_large_videos(job: Job, sizes: Sequence[tuple[int, int]]) -> None:
-    """UsageError where the frames of a video do not fit into memory while it is decoded."""
-    refuse_what_does_not_fit(job, video_needed(sizes), "Export the video at a lower resolution.")
-
-
 def reading_threads(job: Job, sizes: Sequence[tuple[int, int]], threads: int) -> int:
     """On how many of the threads photographs of these sizes are read: as many as fit into memory."""
-    if job.memory is None:
-        return threads
-    now, needed = available_now(), decoding_needed(sizes).terms
-    room = (job.memory.bytes if now is None else min(job.memory.bytes, now)) - needed["libraries"]
-    return int(min(threads, max(1, room // max(1, needed["a photograph"]))))
+    return most_threads(job, threads, lambda count: decoding_needed(sizes, count))
 
 
 def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int, *, networks: bool = False) -> int:
     """On how many of the threads features are detected: as many as fit. Each image's features depend on that image alone. UsageError where one does not fit."""
-    now = available_now()
-    fewer = threads
-    if job.memory is not None:
-        room = job.memory.bytes if now is None else min(job.memory.bytes, now)
-        while fewer > 1 and features_needed(sizes, max_side, features, fewer, networks=networks).total > room:
-            fewer -= 1
-    refuse_what_does_not_fit(job, features_needed(sizes, max_side, features, fewer, networks=networks), REMEDY)
+    need = partial(features_needed, sizes, max_side, features, networks=networks)
+    fewer = most_threads(job, threads, need)
+    refuse_what_does_not_fit(job, need(fewer), REMEDY)
     if fewer < threads:
         job.warn(
             f"features are detected on {fewer} of {threads} threads: more do not fit into memory. Give more by --memory, or lower poses.feature_image_size."
         )
     return fewer
+
+
+def memory_needed(known: Known) -> Need:
+    """As if no cameras were known: of a set with cameras less is taken."""
+    own, (pictures, sizes) = known.settings["poses"], _pictures(known.sources)
+    films = [] if pictures else _films(known.sources)
+    count = len(pictures) or own.frames
+    largest = max([*sizes, *films], key=lambda size: size[0] * size[1], default=(0, 0))
+    features = given(own.max_features) or features_for(count)
+    needs = [features_needed([largest] * count, own.feature_image_size, features, count_cores(), networks=own.features_model != "off"), video_needed(films)]
+    if own.mask_from == FOREGROUND:
+        from stages.masking.first_training import FIRST, RAYS, SIDE  # without it the stage needs no torch
+        from stages.train.memory import first_training_needed  # likewise
+
+        needs.append(first_training_needed(count, SIDE, FIRST, RAYS))
+    return max(needs, key=lambda need: need.total)
+
+
+def space_needed(known: Known) -> int:
+    """Working images, and what structure from motion reads: copies of photographs, or the frames of videos. Videos count where there are no images."""
+    own, (pictures, sizes) = known.settings["poses"], _pictures(known.sources)
+    count = (len(pictures) or own.frames) * (VIEWS if own.lens == "equirectangular" else 1)
+    found = _cameras_are_found(own, known.sources)
+    sides = (own.max_image_size, own.feature_image_size) if found else (own.max_image_size,)
+    pixels = [sum(width * height for width, height in (working_size(*size, side) for side in sides)) for size in sizes]
+    mean = sum(pixels) / len(pixels) if pixels else ASPECT * sum(side**2 for side in sides)
+    images = WRITTEN * mean * count
+    if pictures:
+        images = min(images, len(sides) * AS_PNG * sum(sizes_below(pictures)))
+    return int(images) + (FEATURE * (given(own.max_features) or features_for(count)) * count if found else 0)
+
+
+def _pictures(sources: Sequence[Path]) -> tuple[list[Path], list[tuple[int, int]]]:
+    """All photographs below the sources, and the sizes of some of them."""
+    pictures = [path for source in sources for path in files_below(source) if path.suffix.lower() in IMAGE_SUFFIXES]
+    sizes = []
+    for path in pictures[:: -(-len(pictures) // HEADERS) or 1]:
+        with contextlib.suppress(UnreadableImage, OSError):  # the stage says so
+            sizes.append(read_header(path).size)
+    return pictures, sizes
+
+
+def _films(sources: Sequence[Path]) -> list[tuple[int, int]]:
+    """The sizes of all videos below the sources."""
+    sizes = []
+    for path in (path for source in sources for path in files_below(source)):
+        with contextlib.suppress(UnreadableVideo), opened(path) as video:
+            sizes.append(video.stored)
+    return sizes
+
+
+def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
+    """Whether structure from motion has to find them, as far as can be told before."""
+    if own.format != "auto" or len(sources) != 1:
+        return own.format in ("auto", "photographs")
+    with contextlib.suppress(PipelineError, OSError):  # the stage says so
+        return detect(sources[0], own.allow_outside, own.llff_factor) == "photographs"
+    return True

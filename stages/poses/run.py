@@ -9,127 +9,41 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Any
 
-from msgspec import Meta
+import numpy as np
 
 from efficientnerf.geometry.cameras import resized
-from efficientnerf.settings import Auto, PositiveInt, given, setting
+from efficientnerf.settings import given
 from pipeline.errors import BadInput
 from pipeline.files import write_json
-from pipeline.stage import Job, Stage
+from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.cores import count_cores, in_order
+from stages.figures.contact_sheet import write_contact_sheet
 from stages.formats import importers
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
+from stages.framing import training_frame
+from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
+from stages.io import working_images
 from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
+from stages.io.pictures import UnreadableImage
 from stages.io.scene import SPLITS, Scene, View, save, save_points
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from stages.io.silhouettes import SmallPictures
-
-    Format = str
-else:
-    Format = Literal[importers.FORMATS]  # the names of the table of importers
+from stages.io.silhouettes import SmallPictures
+from stages.masking.photographs import cameras_of_photographs, mask_choice, masks_made_for
+from stages.masking.polarity import capture_kept_white
+from stages.memory.need import refuse_what_does_not_fit
+from stages.poses.memory import decoding_needed, reading_threads
+from stages.poses.settings import PosesSettings
+from stages.verdict.writing import judge
 
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
 
 
-@dataclass(frozen=True)
-class PosesSettings:
-    """How a source is read and framed."""
-
-    format: Format = setting("auto", "Format of the source; auto: found out from its files.")
-    max_image_size: Annotated[int, Meta(ge=32, le=16384)] = setting(
-        1024, "Longest side of the images that later stages read; larger ones are reduced.", unit="pixels"
-    )
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "Axis of the capture's frame that points up; auto: estimated.")
-    crop_box: tuple[float, float, float, float, float, float] | Auto = setting(
-        "auto", "Crop box in the capture's frame: x y z of one corner, then of the opposite one; auto: estimated."
-    )
-    box_margin: Annotated[float, Meta(ge=0.0, le=2.0)] = setting(
-        0.05, "Margin on each side of an estimated crop box, as a fraction of its longest side.", advanced=True
-    )
-    space: Literal["auto", "box", "contracted", "ndc"] = setting(
-        "auto",
-        "Space of the field: the box alone, with a background without depth beyond it (box); all of an unbounded scene (contracted); or normalised device"
-        " coordinates, for forward-facing captures (ndc); auto: ndc for forward-facing LLFF folders, box for objects with alpha, else contracted.",
-    )
-    masks: Literal["auto", "silhouette", "ignore"] = setting(
-        "auto",
-        "What masks and alpha channels mean: outside of them is background, and the object alone is trained, on random colours (silhouette), or pixels outside"
-        " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
-    )
-    mask_from: Annotated[
-        str,
-        Meta(
-            pattern="^(auto|off|foreground|static|green|white|#[0-9a-fA-F]{6})$",
-            description="auto, off, foreground, static, green, white or a colour as #rrggbb",
-        ),
-    ] = setting(
-        "auto",
-        "What silhouettes are made from where photographs have no masks: the subject as a first quick training of the scene finds it (foreground), a background"
-        " that stands still while the object turns (static), a screen of one colour (green, white, #rrggbb), or nothing (off); auto: static where cameras found"
-        " by the object alone show that it turned.",
-        advanced=True,
-    )
-    mask_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
-        "off", "ONNX file of a network that tells a subject from its background (as rembg has them), by which silhouettes are made; off: none.", advanced=True
-    )
-    features_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
-        "off",
-        "ONNX file of a network that detects features (ALIKED), by which photographs are matched that have no camera else; off: none.",
-        advanced=True,
-    )
-    matcher_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
-        "off", "ONNX file of a network that matches these features (LightGlue); off: none.", advanced=True
-    )
-    mask_polarity: Literal["auto", "white", "black"] = setting(
-        "auto",
-        "What is kept of given masks: what is not black in them (white), or what is (black); auto: white, unless black shows one compact object in nearly all.",
-        advanced=True,
-    )
-    test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
-    llff_factor: PositiveInt | Auto = setting(
-        "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
-    )
-    frames: Annotated[int, Meta(ge=3, le=10_000)] = setting(
-        150, "Most frames that are chosen of videos, of all of them together: the sharpest ones that differ.", advanced=True
-    )
-    strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
-    allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
-    lens: Literal["auto", "perspective", "fisheye", "equirectangular"] = setting(
-        "auto",
-        "What photographs and videos show: what a usual lens projects (perspective), a fisheye lens (fisheye), or 360 degrees (equirectangular), which are cut"
-        " into views of pinhole cameras; auto: fisheye where EXIF names such a lens, 360 degrees where a picture is twice as wide as high and XMP says so.",
-        advanced=True,
-    )
-    matching: Literal["auto", "exhaustive", "retrieval", "sequential"] = setting(
-        "auto",
-        "Which photographs are matched: all pairs (exhaustive), each with those that look most like it (retrieval), or with those that follow (sequential);"
-        " auto: exhaustive for up to 60, else retrieval.",
-    )
-    max_features: Annotated[int, Meta(ge=256, le=65536)] | Auto = setting(
-        "auto", "Most features detected in a photograph; auto: 4096, of more than 60 photographs 2048.", advanced=True
-    )
-    feature_image_size: Annotated[int, Meta(ge=320, le=8192)] = setting(
-        1600, "Longest side of the photographs in which features are detected.", unit="pixels", advanced=True
-    )
-    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = setting(0, "Seed of every random choice in finding cameras.", advanced=True)
-
-
 def run(job: Job) -> None:
     """Write scene.json, images/, masks/, points.safetensors, verdict.json, pictures and report.json. Raises BadInput."""
-    from stages.figures.contact_sheet import write_contact_sheet
-    from stages.framing import training_frame
-    from stages.io.silhouettes import SmallPictures
-    from stages.poses.memory import refuse_large_photographs
-    from stages.verdict.writing import judge
-
     settings: PosesSettings = job.settings
     if job.source is None:
         raise BadInput("the poses stage needs a source: name a folder of photographs, a video, or a posed data set.")
@@ -141,7 +55,8 @@ def run(job: Job) -> None:
 
     capture = read(job, settings, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
-    refuse_large_photographs(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos])
+    sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
+    refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
     small = SmallPictures()
     capture, mask_facts = with_mask_use(job, capture, small, warn)
     capture, written = _write_images(job, capture, warn)
@@ -175,7 +90,7 @@ def run(job: Job) -> None:
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
 
-def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], framed: Any) -> tuple[View, ...]:
+def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], framed: training_frame.TrainingFrame) -> tuple[View, ...]:
     """Of the photographs, in the training frame."""
     world = framed.world_from_capture
     return tuple(
@@ -197,21 +112,8 @@ def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
         warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
 
 
-def files(source: Path, settings: PosesSettings) -> list[Path]:
-    """What the scene depends on: files of the source, and the networks that masks are made and photographs matched by."""
-    networks = [Path(path) for path in (settings.mask_model, settings.features_model, settings.matcher_model) if path != "off"]
-    return [*importers.files(source, settings), *networks]
-
-
-STAGE = Stage(name="poses", version=14, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
-
-
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
-    from stages.masking.foreground import with_foreground_masks
-    from stages.masking.photographs import cameras_of_photographs, masks_made_for
-    from stages.masking.polarity import capture_kept_white
-
     assert job.source is not None
     possible = _formats(job, settings)
     name = possible[0]
@@ -227,6 +129,8 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     else:
         capture = cameras_of_photographs(job, warn)
     if settings.mask_from == FOREGROUND:
+        from stages.masking.foreground import with_foreground_masks  # trains a field, for which the stage needs no torch else
+
         capture = with_foreground_masks(job, capture, warn)
     if settings.strict and capture.rejected:
         which = abbreviated([f"{image} ({why})" for image, why in capture.rejected])
@@ -251,16 +155,13 @@ def _format_of(capture: Capture) -> str:
 
 def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
     """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
-    from stages.framing.mask_use import doubts, find_mask_use, without_silhouette
-    from stages.masking.photographs import mask_choice
-
     renders = _may_be_renders(capture)
     use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, small, job.safe_point)
     for sentence in use.sentences:
         job.say(sentence)
     for sentence in doubts(use):
         warn(sentence)
-    names = set(without_silhouette(capture.photos, use.silhouettes, renders))
+    names = set(without_silhouette(capture.photos, use.silhouettes))
     if names:
         warn(f"{len(names)} of {len(capture.photos)} images have no silhouette, and the others do: {abbreviated(sorted(names))}. They are left out.")
     kept = [index for index, photo in enumerate(capture.photos) if photo.camera.name not in names]
@@ -272,10 +173,6 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
 
 def with_points_of_object(capture: Capture, small: SmallPictures) -> Capture:
     """Without the sparse points that lie outside of silhouettes."""
-    import numpy as np
-
-    from stages.framing.mask_use import points_of_object
-
     if not capture.silhouettes or capture.points is None:
         return capture
     return replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, small))))
@@ -287,10 +184,6 @@ def _may_be_renders(capture: Capture) -> bool:
 
 def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[Any]]:
     """Write the working images. Returns the capture without the images that cannot be decoded, and what was written for the others."""
-    from stages.io import working_images
-    from stages.io.pictures import UnreadableImage
-    from stages.poses.memory import reading_threads
-
     relative = working_images.image_paths([photo.camera for photo in capture.photos])
     how: dict[str, Any] = {"max_side": job.settings.max_image_size, "silhouettes": capture.silhouettes, "may_be_empty": _may_be_renders(capture)}
     kept: list[int] = []

@@ -9,11 +9,13 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
 from typing import Any
 
 from pipeline.executors.child import end_with
 from pipeline.library_output import warnings_for_users
+from pipeline.stage import ByName
+
+TASKS = {"pairs": ByName("stages.sfm.pair_workers:match_for"), "cameras": ByName("stages.sfm.reconstruction:capture_for")}
 
 
 class Stopped(Exception):
@@ -68,7 +70,7 @@ def main() -> None:
     end_with(request["parent"])
     try:
         with warnings_for_users(channel.warn):
-            value = _work(request["task"])(request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
+            value = TASKS[request["task"]](request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
     except BaseException as error:
         if not _was_stopped(error):
             _send_error(channel, error)
@@ -76,16 +78,6 @@ def main() -> None:
         channel.send("result", value=value)
     sys.stderr.flush()
     os._exit(0)  # libraries that take the process down while they are unloaded have no say
-
-
-def _work(task: str) -> Callable[..., Any]:
-    if task == "pairs":
-        from stages.sfm.pair_workers import match_for
-
-        return match_for
-    from stages.sfm.reconstruction import capture_for
-
-    return capture_for
 
 
 def _was_stopped(error: BaseException | None) -> bool:

@@ -28,10 +28,10 @@ def import_pycolmap() -> Any:
     another library has set, and works in the main thread only.
     """
     if "pycolmap" not in sys.modules:
-        import zlib  # noqa: F401
+        import zlib  # noqa: F401 (see above)
 
-        import numpy  # noqa: F401
-        import PIL.Image  # noqa: F401
+        import numpy  # noqa: F401 (see above)
+        import PIL.Image  # noqa: F401 (see above)
 
         libc = ctypes.CDLL(None)
         handlers = [(number, ctypes.create_string_buffer(_SIGACTION_BYTES)) for number in _GLOG_SIGNALS]
@@ -40,12 +40,12 @@ def import_pycolmap() -> Any:
         # A SIGTERM that arrives meanwhile is delivered to the restored handler.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         try:
-            import pycolmap
+            import pycolmap  # see above
         finally:
             for number, handler in handlers:
                 libc.sigaction(int(number), handler, None)
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-    import pycolmap
+    import pycolmap  # see above
 
     return pycolmap
 

@@ -13,7 +13,7 @@ from typing import Annotated, TypedDict, Unpack
 import msgspec
 import numpy as np
 
-from pipeline.files import open_plain, remove, write_atomically
+from pipeline.files import SafePoint, open_plain, remove, write_atomically
 from stages.cores import in_order
 from stages.io.photo import DecodedPhoto, read_mask_file, read_photo
 from stages.io.pictures import UnreadableImage
@@ -24,7 +24,6 @@ LAYOUT = 5  # of the work folder; raise it when what is written there changes me
 
 Side = Annotated[int, msgspec.Meta(ge=1, le=2**20)]  # pixels
 Progress = Callable[..., None]
-SafePoint = Callable[[], None]
 
 
 class Callables(TypedDict):

@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any
 
 from efficientnerf.geometry.cameras import Similarity
-from pipeline.files import remove
+from pipeline.files import SafePoint, remove
 from stages.sfm import mapping, matches, merging, pairs
 from stages.sfm.database import FEATURES, PAIRS, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, pair_id_of
-from stages.sfm.images import Progress, SafePoint, WorkImage
+from stages.sfm.images import Progress, WorkImage
 from stages.sfm.intrinsics import zoom
 from stages.sfm.learned.matches import add_matches, pairs_of
 from stages.verdict.verdict import DOUBTFUL

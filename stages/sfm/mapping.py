@@ -13,10 +13,10 @@ import numpy as np
 
 from efficientnerf.capture.moving_parts import moving_parts
 from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
-from pipeline.files import remove
+from pipeline.files import SafePoint, remove
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts
-from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
+from stages.sfm.images import Progress, WorkImage, images_of
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.files import SafePoint
 from stages.cores import count_cores
 from stages.io.png import FAST, write_png
 from stages.sfm import feature_cache, pair_workers
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, pair_id_of, record, verified_pairs
-from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
+from stages.sfm.images import Progress, WorkImage, images_of
 from stages.sfm.pairs import Pair, aggregated, in_blocks, likeness_of, ordered
 
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md

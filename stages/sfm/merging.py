@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity, closest_similarity, rays
-from pipeline.files import remove
+from pipeline.files import SafePoint, remove
 from stages.sfm import mapping
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts
-from stages.sfm.images import SafePoint, WorkImage, images_of
+from stages.sfm.images import WorkImage, images_of
 
 LEAST, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
 TOLERANCE = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart

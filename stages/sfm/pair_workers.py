@@ -12,11 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.files import remove, write_atomically
+from pipeline.files import SafePoint, remove, write_atomically
 from stages.sfm import process
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, attached, copy_rows, database_path, pair_id_of, record
-from stages.sfm.images import SafePoint
 
 GUIDED_RATIO = 0.88  # of the distances of the two best; COLMAP's own is 0.8
 LOOK = 0.1  # seconds between two looks at the workers

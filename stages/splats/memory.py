@@ -2,30 +2,71 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
-from stages.memory.need import Need, libraries
-from stages.memory.rendering import tree_bytes
+import numpy as np
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree
+from stages.artifacts import SplatsInputs
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import views_of
+from stages.memory.forecast import Known
+from stages.memory.need import MIB, Need, libraries
+from stages.memory.tree import asset_of, tree_bytes
+from stages.splats.pictures import render_cameras
+from stages.splats.settings import SplatsSettings
 
 # Bytes. Of a parameter: value, gradient, two moments, and one more while Gaussians are merged and written; of a stored voxel while they are merged; of a
 # pixel of a picture: its colours and mask; of a pixel of the one that is drawn: colours, transmittance, gradients and the Gaussians that cover its tile.
 PARAMETER, VOXEL, PIXEL, DRAWN = 20, 100, 4, 400
+WRITTEN_FLOAT, SPZ, SHEET = 4, 64, MIB // 4  # bytes of a parameter in PLY; of a Gaussian in SPZ; of a picture of them
 
 
-def splats_needed(tree: NerfTree, count: int, sh_degree: int, pixels: int, largest: int) -> Need:
-    """What it takes to make so many Gaussians and to fit them to pictures.
+def most_gaussians(settings: SplatsSettings, pixels: Sequence[int]) -> int:
+    """How many are made at most, for pictures of so many pixels each."""
+    return min(settings.count, max(1, int(np.median(pixels)))) if pixels else settings.count
 
-    pixels   of all pictures
-    largest  of one of them, at most
-    """
-    parameters = 11 + 3 * (sh_degree + 1) ** 2
+
+def parameters_of(settings: SplatsSettings) -> int:
+    """Of a Gaussian."""
+    return 11 + 3 * (settings.sh_degree + 1) ** 2
+
+
+def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None) -> Need:
+    """What it takes to make Gaussians of a tree and to fit them to pictures; `captured` as for `pixels_of`."""
+    pixels = pixels_of(tree, settings, captured)
     return Need({
-        "Gaussians": PARAMETER * parameters * count,
+        "Gaussians": PARAMETER * parameters_of(settings) * most_gaussians(settings, pixels),
         "merging": VOXEL * len(tree.density_values),
-        "pictures": PIXEL * pixels + DRAWN * largest,
+        "pictures": PIXEL * sum(pixels) + DRAWN * max(pixels, default=0),
         "the asset": tree_bytes(tree),
         "libraries": libraries(),
     })  # fmt: skip
+
+
+def pixels_of(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None) -> list[int]:
+    """Pixels of each picture that Gaussians are fitted to.
+
+    captured  folders of the stages poses and train, whose photographs these are; None: the tree's own renders
+    """
+    own = captured is None or settings.pictures == "asset" or settings.region == "foreground"
+    cameras = render_cameras(tree) if own or captured is None else [view.camera for view in views_of(load_scene(*captured), "train")]
+    return [camera.width * camera.height for camera in cameras]
+
+
+def memory_needed(known: Known) -> Need:
+    """`needed` for the whole asset."""
+    if known.settings["splats"].make == "off":
+        return Need({"libraries": libraries()})
+    inputs = known.inputs(SplatsInputs)
+    return needed(asset_of(known), known.settings["splats"], (inputs.poses.folder, inputs.train.folder))
+
+
+def space_needed(known: Known) -> int:
+    """Files of the Gaussians, and a picture."""
+    own, inputs = known.settings["splats"], known.inputs(SplatsInputs)
+    if own.make == "off":
+        return 0
+    count = most_gaussians(own, pixels_of(asset_of(known), own, (inputs.poses.folder, inputs.train.folder)))
+    return SHEET + (WRITTEN_FLOAT * (3 + parameters_of(own)) + SPZ) * count  # with a normal

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.splats.build import View
-    from stages.io.scene import Scene
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.splats.build import View
+from stages.formats.exporters.frames import frame_from_rendering
+from stages.framing.camera_paths import turntable_cameras
+from stages.framing.captured import captured_of
+from stages.io.scene import Scene, views_of
+from stages.train.averaged import averaged_views
 
 LONGER_SIDE = 640  # pixels, of renders at most
 ORBIT = 36  # cameras round an asset that keeps none of its capture
@@ -25,10 +27,6 @@ def photographs(folder: Path, scene: Scene, trained: Path) -> list[View]:
     folder   of the scene
     trained  of the stage train: where it learned the photographs' exposure, they are as if all had been exposed alike
     """
-    from efficientnerf.splats.build import View
-    from stages.io.scene import views_of
-    from stages.train.averaged import averaged_views
-
     found, read = [], averaged_views(folder, trained)
     for view in views_of(scene, "train"):
         pixels, mask = read(view)
@@ -41,10 +39,6 @@ def photographs(folder: Path, scene: Scene, trained: Path) -> list[View]:
 
 def renders(tree: NerfTree, cameras: list[Camera], tick: Callable[[int, int, str], None]) -> list[View]:
     """The asset's own, transparent where it is; opaque before an environment map."""
-    from efficientnerf.asset.rendering import render
-    from efficientnerf.splats.build import View
-    from stages.formats.exporters.frames import frame_from_rendering
-
     found = []
     for number, camera in enumerate(cameras):
         seen = render(tree, camera, normals=False)
@@ -57,10 +51,6 @@ def renders(tree: NerfTree, cameras: list[Camera], tick: Callable[[int, int, str
 
 def render_cameras(tree: NerfTree) -> list[Camera]:
     """The captured cameras that an asset keeps, at most LONGER_SIDE wide or high; else a turntable's."""
-    from efficientnerf.geometry.cameras import Camera
-    from stages.framing.camera_paths import turntable_cameras
-    from stages.framing.captured import captured_of
-
     captured = captured_of(tree.metadata)
     if captured is None:
         return turntable_cameras(tree, frames=ORBIT, width=LONGER_SIDE, height=3 * LONGER_SIDE // 4)

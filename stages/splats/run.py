@@ -8,59 +8,38 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from pathlib import Path
 
 import numpy as np
-from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Seed, given, setting
+from efficientnerf.asset.format import load
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.settings import given
+from efficientnerf.splats import rendering
+from efficientnerf.splats.build import Budget, NothingToShow, gaussians_of_asset
+from efficientnerf.splats.gaussians import Gaussians
+from efficientnerf.splats.refit import PIXELS
 from pipeline.errors import StageFailed, UsageError
 from pipeline.files import write_json
-from pipeline.stage import Job, Stage
-from stages.artifacts import PosesOutputs, SplatsInputs, SplatsOutputs, TrainOutputs, inputs_of, needs_of
+from pipeline.stage import Job
+from stages.artifacts import PosesOutputs, SplatsInputs, SplatsOutputs, TrainOutputs, inputs_of
 from stages.compiling import compiling_kernels
+from stages.figures.plots import to_uint8
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.splats.frames import in_capture
+from stages.formats.exporters.writing import source_frame
+from stages.framing.camera_paths import turntable_cameras
+from stages.framing.restriction import restricted
+from stages.io.png import write_png
+from stages.io.refined_cameras import load_scene
+from stages.memory.need import refuse_what_does_not_fit
+from stages.splats.memory import most_gaussians, needed
+from stages.splats.pictures import photographs, render_cameras, renders
+from stages.splats.settings import SplatsSettings
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.splats.build import Budget
-    from efficientnerf.splats.gaussians import Gaussians
-    from stages.memory.need import Need
-
-MOST = 5_000_000  # Gaussians: beyond that no program opens them
 PASSES, FEWEST_STEPS, MOST_STEPS = 4, 300, 900  # docs/experiments/splats.md
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
-
-
-@dataclass(frozen=True)
-class SplatsSettings:
-    """How the asset becomes 3D Gaussians."""
-
-    make: Literal["auto", "on", "off"] = setting(
-        "auto",
-        "Whether the run makes 3D Gaussians of its asset; auto: where there is memory for it and something shows; 'enerf export RUN --splats' makes them in any"
-        " case.",
-        advanced=True,
-    )
-    region: Literal["foreground", "all"] = setting(
-        "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject with what supports it (foreground).", advanced=True
-    )
-    count: Annotated[int, Meta(ge=1, le=MOST)] = setting(200_000, "Most Gaussians; no more are made than a picture has pixels.", advanced=True)
-    sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
-    iterations: Count | Auto = setting(
-        "auto",
-        "Steps in which they are fitted to pictures, each of a picture or of rows of a large one; 0: none; auto: four passes over all pixels, at least 300 and"
-        " at most 900.",
-        advanced=True,
-    )
-    pictures: Literal["photographs", "asset"] = setting(
-        "photographs",
-        "What they are fitted to: the training photographs, or the asset's own renders, as in any case where region is foreground.",
-        advanced=True,
-    )
-    seed: Seed = setting(0, "Seed of the order of the pictures.", advanced=True)
 
 
 def gaussians_of(
@@ -72,10 +51,6 @@ def gaussians_of(
 
     Raises StageFailed where nothing shows.
     """
-    from efficientnerf.splats.build import NothingToShow, gaussians_of_asset
-    from stages.io.refined_cameras import load_scene
-    from stages.splats.pictures import photographs, render_cameras, renders
-
     if captured is None or settings.pictures == "asset" or settings.region == "foreground":
         views = renders(tree, render_cameras(tree), progress)
     else:
@@ -88,35 +63,14 @@ def gaussians_of(
 
 def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
     """What Gaussians are made and fitted with, for pictures of so many pixels each."""
-    from efficientnerf.splats.build import Budget
-    from efficientnerf.splats.refit import PIXELS
-
     steps = given(settings.iterations)
     if steps is None:
         steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, MOST_STEPS))
-    return Budget(min(settings.count, max(1, int(np.median(pixels)))) if pixels else settings.count, settings.sh_degree, steps, settings.seed)
-
-
-def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None) -> Need:
-    """What `gaussians_of` takes of memory."""
-    from stages.io.refined_cameras import load_scene
-    from stages.io.scene import views_of
-    from stages.splats.memory import splats_needed
-    from stages.splats.pictures import render_cameras
-
-    own = captured is None or settings.pictures == "asset" or settings.region == "foreground"
-    cameras = render_cameras(tree) if own or captured is None else [view.camera for view in views_of(load_scene(*captured), "train")]
-    pixels = [camera.width * camera.height for camera in cameras]
-    return splats_needed(tree, budget_of(settings, pixels).count, settings.sh_degree, sum(pixels), max(pixels, default=0))
+    return Budget(most_gaussians(settings, pixels), settings.sh_degree, steps, settings.seed)
 
 
 def preview(tree: NerfTree, gaussians: Gaussians) -> np.ndarray:
     """(H, W, 3) uint8: the asset and its Gaussians side by side, from the first camera of a turntable, on white."""
-    from efficientnerf.asset.rendering import render
-    from efficientnerf.splats import rendering
-    from stages.figures.plots import to_uint8
-    from stages.framing.camera_paths import turntable_cameras
-
     camera = turntable_cameras(tree, frames=1, width=PREVIEW[0], height=PREVIEW[1])[0]
     white = None if tree.environment is not None else (1.0, 1.0, 1.0)
     own, theirs = render(tree, camera, background=white, normals=False), rendering.render(gaussians, camera, white)
@@ -141,14 +95,6 @@ def run(job: Job) -> None:
 
 def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     """Raises UsageError where memory is too small, StageFailed where nothing shows."""
-    from efficientnerf.asset.format import load
-    from stages.formats.exporters import SPLAT_EXPORTERS
-    from stages.formats.exporters.splats.frames import in_capture
-    from stages.formats.exporters.writing import source_frame
-    from stages.framing.restriction import restricted
-    from stages.io.png import write_png
-    from stages.memory.need import refuse_what_does_not_fit
-
     started = time.monotonic()
     tree = restricted(load(inputs_of(SplatsInputs, job.inputs).bake.asset), settings.region)
     captured = job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage]
@@ -164,6 +110,3 @@ def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     sizes = {"ply_bytes": outputs.ply.stat().st_size, "spz_bytes": outputs.spz.stat().st_size}
     write_json(outputs.report, {"gaussians": len(gaussians), "made": True, "sh_degree": gaussians.degree, "region": settings.region, **sizes})
     job.say(f"{len(gaussians)} Gaussians in {time.monotonic() - started:.0f} s", gaussians=len(gaussians))
-
-
-STAGE = Stage(name="splats", version=5, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.training.exposure.model import Exposure, averaged_image, image_as_taken
 from stages.io.field_file import load_exposure
 from stages.io.scene import View, read_image, read_mask
-
-if TYPE_CHECKING:
-    from efficientnerf.training.exposure.model import Exposure
 
 Taken = Callable[[View, np.ndarray, int], np.ndarray]
 ReadView = Callable[[View], tuple[np.ndarray, np.ndarray | None]]  # (H, W, 3 or 4) uint8, and (H, W) bool or None
@@ -32,7 +29,6 @@ def averaged_views(folder: Path, trained: Path) -> ReadView:
         image, mask = read_image(folder, view), read_mask(folder, view)
         if known is None or view.image not in known[0]:
             return image, mask
-        from efficientnerf.training.exposure.model import averaged_image
 
         return averaged_image(image, mask, known[0][view.image], known[1])
 
@@ -47,8 +43,6 @@ def as_taken(trained: Path) -> Taken | None:
         return None
 
     def taken(view: View, image: np.ndarray, stride: int) -> np.ndarray:
-        from efficientnerf.training.exposure.model import image_as_taken
-
         if view.image not in known[0]:
             return image
         return image_as_taken(image, known[0][view.image], known[1], (view.camera.width, view.camera.height), stride)

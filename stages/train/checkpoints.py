@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
+import torch
 
+from efficientnerf.training.loop import Trainer, restore, state_of
 from pipeline.errors import CorruptArtifact
 from pipeline.files import remove
+from pipeline.stage import Job
 from pipeline.text import printable
-
-if TYPE_CHECKING:
-    from efficientnerf.training.loop import Trainer
-    from pipeline.stage import Job
-    from stages.train.log import TrainLog
+from stages.io.field_file import read_tensors, write_tensors
+from stages.train.log import TrainLog
 
 KEPT = 2
 MAX_SECONDS = 1e10  # three centuries
@@ -50,9 +50,6 @@ class Checkpoints:
 
     def save(self, t: Trainer, log: TrainLog) -> None:
         """The trainer after its step, and the log up to it."""
-        from efficientnerf.training.loop import state_of
-        from stages.io.field_file import write_tensors
-
         log.flush()
         write_tensors(state_of(t), {"step": t.step, "seconds": log.seconds}, self.job.work / _name(t.step))
         for old in self.paths()[:-KEPT]:
@@ -78,11 +75,6 @@ class Checkpoints:
 
 def _restore(t: Trainer, path: Path, last: int) -> float:
     """Restore a checkpoint: all of it, or nothing where this raises."""
-    import torch
-
-    from efficientnerf.training.loop import restore
-    from stages.io.field_file import read_tensors
-
     tensors, about = read_tensors(path)
     try:
         about = msgspec.convert({"step": about.get("step"), "seconds": about.get("seconds")}, _About)

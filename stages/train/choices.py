@@ -7,19 +7,17 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
 
+from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
 from stages.artifacts import TrainOutputs
 from stages.io.json_file import read_json
+from stages.io.scene import Scene
 from stages.io.scene_schema import decoded
-
-if TYPE_CHECKING:
-    from efficientnerf.training.settings import TrainSettings
-    from stages.io.scene import Scene
 
 FORMAT = 1
 AGAIN = "Train again."

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
+from efficientnerf.training.sparse_depth import SparseDepthRays
+from pipeline.errors import UsageError
+from stages.io import scene
+from stages.io.scene import Scene, View
 from stages.scratch import Warn
-
-if TYPE_CHECKING:
-    from efficientnerf.training.pixels import PixelRows, Pixels
-    from efficientnerf.training.sparse_depth import SparseDepthRays
-    from stages.io.scene import Scene, View
+from stages.train.averaged import averaged_views, exposures_of
+from stages.train.settings import refuse_planes_out_of_order
 
 MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
 MOST_OBSERVATIONS = 2**20  # of sparse points that are used; of more, those of points drawn at random
@@ -26,7 +27,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their whole parts, f
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
 
 
-def with_camera_refinement(settings: TrainSettings, s: Scene) -> TrainSettings:
+def with_camera_refinement(settings: TrainSettings) -> TrainSettings:
     """The settings with "on" or "off" for `camera_refinement`."""  # docs/experiments/photographs.md
     choice = "off" if settings.camera_refinement == "auto" else settings.camera_refinement
     return replace(settings, camera_refinement=choice)
@@ -38,10 +39,6 @@ def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = No
     rows     where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
     trained  of the stage train, where it learned the photographs' exposure: they are as if all had been exposed alike; None: as they are
     """
-    from efficientnerf.training.pixels import Pixels
-    from stages.io import scene
-    from stages.train.averaged import averaged_views, exposures_of
-
     images = (scene.read_image(folder, view) for view in views)
     masks = (scene.read_mask(folder, view) for view in views)
     if trained is not None and exposures_of(trained) is not None:
@@ -58,8 +55,6 @@ def count_pixels(views: tuple[View, ...]) -> int:
 
 def channels_of(folder: Path, views: tuple[View, ...]) -> int:
     """3, or 4 where any view has alpha."""
-    from stages.io import scene
-
     return 4 if any(scene.has_alpha(folder, view) for view in views) else 3
 
 
@@ -78,8 +73,6 @@ def depth_range(s: Scene, pixels: Pixels, settings: TrainSettings, warn: Warn = 
 
 def stated_planes(s: Scene, settings: TrainSettings) -> tuple[float, float]:
     """train.near_plane and train.far_plane in the training frame; UsageError where the scene has none, or they are not in order."""
-    from pipeline.errors import UsageError
-
     if s.background is None:
         raise UsageError("train.near_plane and train.far_plane are for scenes on a constant background; this one is unbounded. Leave them auto.")
     if s.contracted:
@@ -94,8 +87,6 @@ def stated_planes(s: Scene, settings: TrainSettings) -> tuple[float, float]:
 def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
     """UsageError where the stated planes, in the training frame, leave out all of what the views have of the scene: the field would be empty. A warning where
     they leave out more than CUT_SHARE of it in most views."""
-    from pipeline.errors import UsageError
-
     first, last = np.array([(view.near, view.far) for view in s.views], np.float64).T
     scale = float(s.world_from_capture.scale)
     stated, own = (f"{a / scale:.3g} to {b / scale:.3g}" for a, b in ((near, far), (first.min(), last.max())))
@@ -107,19 +98,6 @@ def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
         warn(f"{ranges}: rays miss a part of it. Leave both auto, or state planes around it.")
 
 
-def refuse_planes_out_of_order(settings: TrainSettings) -> None:
-    """UsageError where one of train.near_plane and train.far_plane is stated without the other, for N_c samples lie between both; or where they are not in
-    order."""
-    from pipeline.errors import UsageError
-
-    near, far = given(settings.near_plane), given(settings.far_plane)
-    if near is None and far is None:
-        return
-    if near is None or far is None or near >= far:
-        found = f"train.near_plane={settings.near_plane}, train.far_plane={settings.far_plane}"
-        raise UsageError(f"{found}: expected two numbers, the second one greater, or auto for both.")
-
-
 def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | None:
     """Rays to the sparse points that are registered in training images, from the cameras of these and from between each and the nearest of the others that see
     the point, where held-out views may lie and nothing else keeps fog away; None: there are none.
@@ -127,9 +105,6 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | 
     Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
     or in it, too. Where they are observed more than `MOST_OBSERVATIONS` times, `seed` draws the points.
     """
-    from efficientnerf.training.sparse_depth import SparseDepthRays
-    from stages.io import scene
-
     if not s.points:
         return None
     xyz, counts, observers = scene.read_observations(folder)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
-if TYPE_CHECKING:
-    from efficientnerf.training.exposure.fit import ExposureFit
-    from efficientnerf.training.exposure.model import Exposure
-    from efficientnerf.training.pixels import Pixels
-    from stages.io.scene import Scene
+from efficientnerf.geometry.cameras import project
+from efficientnerf.rendering.colour import linear_from_srgb
+from efficientnerf.training.exposure.fit import ExposureFit, fit_exposure
+from efficientnerf.training.exposure.model import SCALE, VIGNETTING, Exposure, camera_numbers, exposure_of, squared_radius
+from efficientnerf.training.pixels import Pixels
+from stages.io import scene
+from stages.io.scene import Scene, views_of
 
 MOST_OBSERVATIONS = 2**18  # of sparse points that exposures are compared by
 DARKEST, BRIGHTEST = 8, 247  # levels between which a colour tells of exposure
@@ -22,11 +24,6 @@ BORDER = 1  # pixels round that of an observation whose mean is taken
 
 def observed_light(folder: Path, s: Scene, pixels: Pixels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What the training photographs show of sparse points: logarithms of linear light (O, 3), the point (O,), the photograph (O,), and r^2 (O,) in it."""
-    from efficientnerf.geometry.cameras import project
-    from efficientnerf.rendering.colour import linear_from_srgb
-    from efficientnerf.training.exposure.model import squared_radius
-    from stages.io import scene
-
     xyz, counts, observers = scene.read_observations(folder)
     number = np.cumsum([view.split == "train" for view in s.views]) - 1
     in_training = np.array([view.split == "train" for view in s.views])
@@ -66,10 +63,6 @@ def begin_exposure(
     choice  train.exposure
     say     is told where it is learned
     """
-    from efficientnerf.training.exposure.fit import fit_exposure
-    from efficientnerf.training.exposure.model import camera_numbers, exposure_of
-    from stages.io.scene import views_of
-
     if choice == "off" or s.background is not None or (choice == "auto" and not s.points):
         return None
     cameras = [view.camera for view in views_of(s, "train")]
@@ -97,11 +90,6 @@ def stops_apart(fit: ExposureFit) -> float:
 def saved_exposure(e: Exposure | None, s: Scene) -> tuple[list[str], Exposure] | None:
     """What is kept of it: the images of the scene's views, and the exposure of each. That of held-back views is the mean, in the camera that took them; where
     that took no training photograph, they have none."""
-    import torch
-
-    from efficientnerf.training.exposure.model import Exposure, camera_numbers
-    from stages.io.scene import views_of
-
     if e is None:
         return None
     train = views_of(s, "train")
@@ -118,8 +106,6 @@ def saved_exposure(e: Exposure | None, s: Scene) -> tuple[list[str], Exposure] |
 
 def exposure_facts(e: Exposure | None) -> dict[str, float] | None:
     """For the report: by how many stops photographs lie from the mean, and corners of the images below their middle; None where nothing was learned."""
-    from efficientnerf.training.exposure.model import SCALE, VIGNETTING
-
     if e is None:
         return None
     stops = e.log_gains().detach().mean(dim=1) / np.log(2)

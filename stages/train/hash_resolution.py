@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from efficientnerf.settings import given
 from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 from stages.bake.resolution import ndc_pixel
-
-if TYPE_CHECKING:
-    from stages.io.scene import Scene
+from stages.io.field_file import space_of
+from stages.io.scene import Scene
 
 # docs/experiments/hash-grid.md
 PIXELS_PER_ENTRY = 6  # training pixels to an entry of a level's table in normalised device coordinates
@@ -32,8 +30,6 @@ def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSett
 
     pixels  of all training images
     """
-    from stages.io.field_file import space_of
-
     finest, entries = FINEST, LOG2_TABLE + math.log2(max(pixels, 1) / BASE_PIXELS) / 2
     if s.forward is not None:
         entries = math.log2(max(pixels, 1) / PIXELS_PER_ENTRY)

@@ -7,15 +7,14 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import msgspec
 
+from efficientnerf.training.loop import Progress
 from pipeline.files import atomic, remove, write_atomically
+from stages.figures.plots import curve
 from stages.scratch import opened
-
-if TYPE_CHECKING:
-    from efficientnerf.training.loop import Progress
 
 EVERY = 10  # steps
 SMOOTHING = 0.95  # of the running mean of the loss
@@ -130,8 +129,6 @@ def continue_log(path: Path, step: int) -> None:
 
 def draw_curve(path: Path, log: Path, more: Iterable[dict[str, Any]] = ()) -> None:
     """Draw PSNR over steps, of the training rays and of the previews, of a log's lines and those that are not written yet."""
-    from stages.figures.plots import curve
-
     lines = [*read_lines(log), *more]
     known = [x for x in lines if x["psnr"] is not None]
     series = {"training rays, running mean": ([x["step"] for x in known], [x["psnr"] for x in known])}

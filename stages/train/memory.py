@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from efficientnerf.fields.hash import FEATURES, grids, level_sizes
 from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.spaces import Space, space_from
 from efficientnerf.settings import given
+from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE, PixelRows
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs
-from stages.io.scene import View
+from stages.artifacts import PosesOutputs, TrainInputs
+from stages.io.field_file import space_of
+from stages.io.scene import View, load, views_of
+from stages.memory.forecast import Known
 from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
 from stages.train.data import MOST_OBSERVATIONS, channels_of, count_pixels
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.pixels import PixelRows
+from stages.train.hash_resolution import with_auto_sizes
+from stages.train.pixel_file import PixelFile
 
 PIXELS = "training pixels"
 # Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes;
@@ -27,6 +31,10 @@ DIRECTION, DENSITY_VOXEL = 220, 26
 TABLES, SAVED = 4, 6  # of float32 for each parameter: itself, its gradient, Adam's moments; and while a checkpoint is written, three of these twice
 POINTS, OBSERVATION = 4, 250
 DECODED = 3  # images at a time while they are read: as decoded, and as they are put in rows
+# Bytes written. Of a parameter in the field's file, and in a checkpoint, with Adam's moments; of a density voxel in either; of a training pixel. Checkpoints
+# that are there while the newest is written.
+WRITTEN, CHECKPOINT, WRITTEN_VOXEL, CHANNELS = 4, 12, 5, 4
+KEPT = 3
 
 
 def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict[str, int]:
@@ -34,8 +42,6 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
 
     stored  whether the pixels are in a file
     """
-    from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE
-
     cameras = [view.camera for view in views]
     total = count_pixels(tuple(views))
     lenses = {(camera.width, camera.height, camera.model, camera.params) for camera in cameras}
@@ -53,8 +59,6 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
 
 def parameters(settings: TrainSettings) -> int:
     """Parameters of both fields, about."""
-    from efficientnerf.fields.hash import FEATURES, grids, level_sizes
-
     hidden = settings.num_layers * settings.hidden_dim**2 + settings.coarse_num_layers * settings.coarse_hidden_dim**2
     if settings.field != "hash":
         return hidden
@@ -79,26 +83,22 @@ def sample_bytes(settings: TrainSettings) -> int:
     return 2 * settings.hidden_dim * settings.num_layers + 4 * (4 * 63 + 6 * outputs + 32)
 
 
-def needed(
-    settings: TrainSettings, views: Sequence[View], channels: int, intervals: int, voxels: int, *, stored: bool, device: str = "cpu", points: int = 0
-) -> Need:
+def needed(settings: TrainSettings, views: Sequence[View], channels: int, space: Space, *, stored: bool, device: str = "cpu", points: int = 0) -> Need:
     """What training takes.
 
-    settings   with numbers for what is "auto" (`stages.train.hash_resolution`)
-    channels   of the pixels
-    intervals  on a ray, at most
-    voxels     D, density voxels along a side
-    stored     whether the pixels are in a file
-    points     bytes of the file of sparse points
+    settings  with numbers for what is "auto" (`stages.train.hash_resolution`)
+    channels  of the pixels
+    stored    whether the pixels are in a file
+    points    bytes of the file of sparse points
     """
     pixels = pixels_needed(views, channels, stored=stored)
     reading = pixels["reading images"] + pixels["directions of pixels"]
-    step = samples_of(settings, intervals) * sample_bytes(settings)
+    intervals = space.max_intervals(space.sampled_length(None) / (given(settings.num_coarse_samples) or space.num_coarse_samples))
     return Need({
         PIXELS: pixels[PIXELS],
-        "a step's samples, or reading images": max(step, reading),
+        "a step's samples, or reading images": max(samples_of(settings, intervals) * sample_bytes(settings), reading),
         "parameters and checkpoints": 4 * (TABLES + SAVED) * parameters(settings),
-        "density voxels": DENSITY_VOXEL * voxels**3,
+        "density voxels": DENSITY_VOXEL * (given(settings.occupancy_resolution) or space.occupancy_resolution) ** 3,
         "sparse points": POINTS * points + OBSERVATION * min(MOST_OBSERVATIONS, points // 8),
         "libraries": libraries(device),
     })  # fmt: skip
@@ -111,8 +111,6 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
     remedy  as for `refuse_what_does_not_fit`
     stored  whether in a file
     """
-    from stages.train.pixel_file import PixelFile
-
     refuse_what_does_not_fit(job, need, remedy)
     if not stored:
         return None
@@ -135,16 +133,32 @@ def rows_for_training(job: Job, folder: Path, views: tuple[View, ...], settings:
 
 
 def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space, *, stored: bool, device: str) -> Need:
-    """What the stage train takes; `settings` and `stored` as for `needed`.
-
-    folder  of the scene
-    """
-    coarse_samples = given(settings.num_coarse_samples) or space.num_coarse_samples
-    intervals = space.max_intervals(space.sampled_length(None) / coarse_samples)
-    voxels = given(settings.occupancy_resolution) or space.occupancy_resolution
+    """What the stage train takes, `folder` being the scene's; the rest as for `needed`."""
     file = PosesOutputs(folder).points
     points = file.stat().st_size if file.is_file() else 0
-    return needed(settings, views, channels_of(folder, views), intervals, voxels, stored=stored, device=device, points=points)
+    return needed(settings, views, channels_of(folder, views), space, stored=stored, device=device, points=points)
+
+
+def memory_needed(known: Known) -> Need:
+    """What the stage train takes."""
+    return training_needed(known.inputs(TrainInputs).poses.folder, *_before(known), stored=False, device=known.device)
+
+
+def space_needed(known: Known) -> int:
+    """The field, its checkpoints, and pixels that do not fit into memory."""
+    views, own, space = _before(known)
+    pixels = CHANNELS * count_pixels(views)
+    saved = KEPT if own.time_budget != "off" else min(KEPT, 1 + (own.iterations - 1) // own.checkpoint_every)
+    voxels = WRITTEN_VOXEL * (given(own.occupancy_resolution) or space.occupancy_resolution) ** 3
+    stored = pixels if known.memory is not None and pixels > known.memory // 2 else 0
+    return (WRITTEN + saved * CHECKPOINT) * parameters(own) + (1 + saved) * voxels + stored + known.pictures()
+
+
+def _before(known: Known) -> tuple[tuple[View, ...], TrainSettings, Space]:
+    """Views that are trained on, settings without "auto" as for `needed`, and the field's space."""
+    s = load(known.inputs(TrainInputs).poses.folder)
+    views = views_of(s, "train")
+    return views, with_auto_sizes(known.settings["train"], s, count_pixels(views)), space_of(s)
 
 
 FIELD_SAMPLES = 300  # bytes of a ray in which a first training's subject is looked for
@@ -157,13 +171,8 @@ def first_training_needed(count: int, side: int, settings: TrainSettings, rays: 
     settings  without "auto" where `stages.train.hash_resolution` has numbers
     rays      in which the subject is looked for
     """
-    import numpy as np
-
-    from efficientnerf.geometry.spaces import space_from
-
     space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=True)
     camera = Camera("", side, side, "SIMPLE_PINHOLE", (side, side / 2, side / 2), np.eye(4))
-    intervals = space.max_intervals(space.sampled_length(None) / (given(settings.num_coarse_samples) or space.num_coarse_samples))
     view = View("", None, "train", camera, camera, 0.1, 1.0)
-    need = needed(settings, [view] * count, 3, intervals, given(settings.occupancy_resolution) or space.occupancy_resolution, stored=False)
+    need = needed(settings, [view] * count, 3, space, stored=False)
     return Need({**need.terms, "samples of the field": FIELD_SAMPLES * rays})

@@ -6,17 +6,18 @@ import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.evaluation.metrics import WINDOW, psnr, ssim
+from efficientnerf.geometry.cameras import Camera
 from pipeline.files import is_denied
 from pipeline.text import printable
+from stages.evaluate.views import ground_truth, subsample_camera
+from stages.figures.plots import to_uint8
+from stages.io.png import read_png, write_png
+from stages.io.scene import Scene, View, views_of
 from stages.scratch import Warn, digest_of, once
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from stages.io.scene import Scene, View
 
 SIDE = 200  # longest side of a preview, pixels
 
@@ -48,10 +49,6 @@ class Previews:
         """Render; the PSNR, None where there is no view to draw."""
         if self.view is None:
             return None
-        from efficientnerf.evaluation.metrics import WINDOW, psnr, ssim
-        from stages.evaluate.views import ground_truth, subsample_camera
-        from stages.figures.plots import to_uint8
-        from stages.io.png import write_png
 
         stride = max(1, math.ceil(max(self.view.camera.width, self.view.camera.height) / SIDE))
         truth = ground_truth(self.poses, self.view, self.background, stride).colour
@@ -64,8 +61,6 @@ class Previews:
 
     def publish(self, folder: Path, warn: Warn) -> None:
         """Copy all previews, those of earlier attempts too, into `folder`, which is made if there are any; without such as can't be read."""
-        from stages.io.png import read_png
-
         warn = once(warn)
         for path in sorted(self.work.glob("preview_*.png")):
             try:
@@ -82,7 +77,5 @@ class Previews:
 
 def preview_view(s: Scene) -> View | None:
     """A validation view if there is one, so that the test views stay unread until the end; None: there are neither."""
-    from stages.io.scene import views_of
-
     views = views_of(s, "val") or views_of(s, "test")
     return views[len(views) // 2] if views else None

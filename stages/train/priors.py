@@ -13,20 +13,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.model import Model
+from efficientnerf.sampling.occupancy import mask_cells
 from efficientnerf.settings import given
+from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
-from stages.framing.view_coverage import MAX_CONTRADICTED
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.model import Model
-    from pipeline.stage import Job
-    from stages.framing.view_coverage import Masks
-    from stages.io.scene import View
+from stages.framing.near_planes import reliable_points
+from stages.framing.view_coverage import MAX_CONTRADICTED, Masks, cells_before_near, cells_below_min_views, cells_without_view, contradicted, kept_pixels
+from stages.io import scene
+from stages.io.scene import View
 
 MIN_VIEWS, NEAR_PLANES, MASKS = "min_views", "near_planes", "masks"
 
@@ -48,8 +48,6 @@ class Prior:
 
 def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> tuple[Prior, ...]:
     """Mask the density voxels of a scene's model by the priors that hold; a warning says which the sparse points refute."""
-    from stages.framing.view_coverage import kept_pixels
-
     if not m.space.contracted and all(view.mask is None for view in views):
         return ()
     job.progress(0, m.settings.iterations, "computing view coverage")
@@ -69,11 +67,6 @@ def mask_cells_by(
     m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None = None
 ) -> tuple[Prior, ...]:
     """The same by the views' cameras and near planes, what their masks keep, and the reliable sparse points (F, 3)."""
-    import torch
-
-    from efficientnerf.sampling.occupancy import mask_cells
-    from stages.framing.view_coverage import contradicted
-
     found = []
     for name, cells in _cells_of_priors(m, cameras, near, masks, filled):
         against = 0.0 if name == MASKS or filled is None else contradicted(cells, m.space, filled)
@@ -87,8 +80,6 @@ def _cells_of_priors(
     m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None
 ) -> Iterator[tuple[str, np.ndarray]]:
     """The names of the priors that a scene calls for, and the density voxels (D, D, D) bool that each masks."""
-    from stages.framing.view_coverage import cells_before_near, cells_below_min_views, cells_without_view
-
     few, side = given(m.settings.min_views) if m.space.contracted else None, m.voxels.side
     if few is not None:
         yield MIN_VIEWS, cells_below_min_views(m.space, cameras, few, side, masks)
@@ -103,9 +94,6 @@ def filled_points(folder: Path, views: int) -> np.ndarray | None:
 
     views  number of photographs
     """
-    from stages.framing.near_planes import reliable_points
-    from stages.io import scene
-
     if not PosesOutputs(folder).points.exists():
         return None
     points = scene.read_points(folder)

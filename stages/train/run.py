@@ -14,37 +14,40 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.model import model
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.settings import given
+from efficientnerf.training import loop
+from efficientnerf.training.loop import Trainer
+from efficientnerf.training.readback import AsyncOccupancy
 from efficientnerf.training.settings import TrainSettings
-from pipeline.errors import UsageError
-from pipeline.stage import Job, Stage
-from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
+from efficientnerf.training.sparse_depth import SparseDepthRays
+from pipeline.stage import Job
+from stages.artifacts import TrainInputs, TrainOutputs, inputs_of
 from stages.compiling import clock, compiling_kernels
 from stages.cores import use_all_cores
+from stages.io import field_file, refined_cameras, scene
+from stages.io.scene import Scene, View
 from stages.train.budget import UNKNOWN, Budget, training_budget
 from stages.train.checkpoints import Checkpoints
 from stages.train.checks.watch import Watch
 from stages.train.checks.wrong_views import cameras_of, draw_wrong_views, findings_of, left_out_of, train_and_check
-from stages.train.data import count_pixels, depth_range, pixels_of, refuse_planes_out_of_order, sparse_depth_of, with_camera_refinement
+from stages.train.data import count_pixels, depth_range, pixels_of, sparse_depth_of, with_camera_refinement
 from stages.train.exposure import begin_exposure, exposure_facts, saved_exposure
+from stages.train.hash_resolution import with_auto_sizes
 from stages.train.log import TrainLog
+from stages.train.memory import rows_for_training
 from stages.train.previews import Previews
 from stages.train.priors import Prior, mask_uncovered_cells
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.rendering.field_renderer import FieldRenderer
-    from efficientnerf.training.loop import Trainer
-    from efficientnerf.training.sparse_depth import SparseDepthRays
-    from stages.io.scene import Scene, View
 
 
 @compiling_kernels
@@ -56,19 +59,12 @@ def run(job: Job) -> None:
 def trained(job: Job) -> bool:
     """Train and write the outputs; False where training has to begin again, with what `stages.train.checks.watch` has chosen."""
     began = clock()
-    from efficientnerf.model import model
-    from efficientnerf.rendering.field_renderer import FieldRenderer
-    from efficientnerf.training import loop
-    from efficientnerf.training.readback import AsyncOccupancy
-    from stages.io import field_file, scene
-    from stages.train.hash_resolution import with_auto_sizes
-    from stages.train.memory import rows_for_training
 
     use_all_cores()
     folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
     s = (watch := Watch(job, scene.load(folder), folder)).scene
     views = scene.views_of(s, "train")
-    settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views)), s), field_file.space_of(s)
+    settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views))), field_file.space_of(s)
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views, rows_for_training(job, folder, views, settings, space))
     near, far = depth_range(s, pixels, settings, job.warn)
@@ -115,14 +111,6 @@ def trained(job: Job) -> bool:
     return True
 
 
-def check(settings: Mapping[str, Any]) -> None:
-    """UsageError where near and far planes are stated that cannot be used."""
-    own, poses = settings["train"], settings.get("poses")
-    refuse_planes_out_of_order(own)
-    if own.far_plane != "auto" and poses is not None and poses.space == "contracted":
-        raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
-
-
 def colours_seen(renderer: FieldRenderer, camera: Camera) -> np.ndarray:
     """Colours (H, W, 3) that a camera sees."""
     return renderer.render(camera).colour
@@ -157,8 +145,6 @@ def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
 def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
     """The training cameras, where they were refined or replaced, the views that were left out, and what these two show; `folder` is the scene's."""
     if (cameras := cameras_of(t)) is not None:
-        from stages.io import refined_cameras
-
         refined_cameras.write(views, cameras, outputs.cameras, left_out_of(t, views))
         draw_wrong_views(outputs.wrong_views, t, views, folder, renderer)
 
@@ -195,15 +181,3 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
     c = t.cameras
     pixels = np.array([camera.intrinsics["fx"] for camera in c.given])[:, None] * np.abs(c.pose[:, :2] - c.pose[:, [4, 3]] * [1, -1])
     return {"mean_pixels": round(float(pixels.mean()), 4), "max_pixels": round(float(pixels.max()), 4), "focal_factor": round(float(np.exp(c.focal[0])), 6)}
-
-
-STAGE = Stage(
-    name="train",
-    version=10,
-    settings=TrainSettings,
-    needs=needs_of(TrainInputs),
-    run=run,
-    uses_device=True,
-    check=check,
-    volatile=(TrainOutputs.log, TrainOutputs.curve, f"{TrainOutputs.previews}/*", TrainOutputs.report),
-)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from efficientnerf.capture.compression import block_steps, is_strong
@@ -72,8 +73,6 @@ def look_at(path: Path, source: Path | None = None) -> Look:
 def grey_of(path: Path) -> np.ndarray:
     """(H, W) uint8 of a photograph as it is meant to be seen, of a longest side of SIDE or more where it has that; what is transparent is grey. Raises
     UnreadableImage."""
-    import cv2
-
     with opened(path) as image:
         image.draft("RGB", (SIDE, SIDE))
         orientation = orientation_of(image)
@@ -89,8 +88,6 @@ def look(grey: np.ndarray, quality: int | None = None) -> Look:
     grey     (H, W) uint8, sRGB
     quality  of the JPEG that it comes from
     """
-    import cv2
-
     scale = SIDE / max(grey.shape)
     size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
     picture = (grey if scale >= 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)).astype(np.float32)
@@ -108,8 +105,6 @@ def look(grey: np.ndarray, quality: int | None = None) -> Look:
 
 def _sharpness(picture: np.ndarray) -> float:
     """The lesser of both axes: a camera that is moved blurs along one."""
-    import cv2
-
     picture = cv2.GaussianBlur(picture, (0, 0), NOISE)
     found = []
     for axis in (0, 1):
@@ -128,8 +123,6 @@ def _squares(picture: np.ndarray, step: int, axis: int) -> float:
 
 def _noise(picture: np.ndarray) -> float:
     """The standard deviation by the median of the difference of two Laplacians (Immerkaer 1996) in each block, whose lower quartile has little texture."""
-    import cv2
-
     rows, columns = (size // BLOCK for size in picture.shape)
     if rows * columns < LEAST_BLOCKS:
         return 0.0

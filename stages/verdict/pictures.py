@@ -7,6 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from stages.figures.plots import grid_sheet
+from stages.io.photo import apply_exif_orientation
+from stages.io.pictures import UnreadableImage, opened, orientation_of
+from stages.io.png import write_png
 
 PANEL = 520  # px
 MARGIN = 16
@@ -25,10 +31,6 @@ def camera_plot(centres: np.ndarray, forward: np.ndarray, points: np.ndarray, lo
     points            (N, 3) sparse points
     lost              (L, 3) about where photographs without a camera were taken
     """
-    from PIL import Image, ImageDraw, ImageFont
-
-    from stages.io.png import write_png
-
     sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + 3 * MARGIN + 20), PAPER)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
     draw.text((MARGIN, MARGIN), title, INK, font)
@@ -87,10 +89,6 @@ def lost_places(names: Sequence[str], centres: np.ndarray, lost: Sequence[str], 
 
 def match_picture(names: Sequence[str], lost: Sequence[str], overlaps: Sequence[tuple[str, str, int]], path: Path) -> None:
     """Write a PNG of a square a pair of photographs, in order of name: the darker, the more matches; rows and columns of lost ones are red."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    from stages.io.png import write_png
-
     place = {name: index for index, name in enumerate(names)}
     counts = np.zeros((len(names), len(names)))
     for a, b, count in overlaps:
@@ -117,10 +115,6 @@ def match_picture(names: Sequence[str], lost: Sequence[str], overlaps: Sequence[
 
 def sharpness_sheet(files: Mapping[str, Path], sharpness: Mapping[str, float], blurred: Sequence[str], path: Path) -> None:
     """Write a sheet of photographs, the most blurred first; of many all that are blurred, as far as they fit, and an even choice of the others."""
-    from stages.figures.plots import grid_sheet
-    from stages.io.photo import apply_exif_orientation
-    from stages.io.pictures import UnreadableImage, opened, orientation_of
-
     ordered = sorted((name for name in files if name in sharpness), key=lambda name: (sharpness[name], name))
     chosen = [name for name in ordered if name in set(blurred)][: MOST_SHEET // 2]
     others = [name for name in ordered if name not in set(chosen)]

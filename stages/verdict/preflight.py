@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from efficientnerf.settings import given
@@ -24,8 +25,13 @@ from stages.formats.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.capture import FOREGROUND
 from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
+from stages.masking.first_training import FIRST, RAYS
+from stages.masking.first_training import SIDE as SIDE_OF_FIRST
 from stages.masking.turning import masks_of_turning_subject
+from stages.poses.memory import decoding_needed, features_needed
 from stages.sfm import ladder, pairs
+from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
+from stages.train.memory import first_training_needed
 from stages.verdict import looks, run_forecast
 from stages.verdict.grades import GRADES
 from stages.verdict.verdict import FEW, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, worded, zooms
@@ -129,8 +135,6 @@ def _small(path: Path, grey: np.ndarray) -> Small:
     """
     grey  (H, W) uint8, the photograph as it is meant to be seen
     """
-    import cv2
-
     with opened(path) as image:
         size = image.size
         focal = focal_from_exif(dict(exif_of(image).get_ifd(_EXIF)), *size)
@@ -173,8 +177,6 @@ def _overlaps(small: Sequence[Small], seed: int) -> dict[pairs.Pair, Overlap]:
 
 def overlap_of(one: Small, other: Small) -> Overlap | None:
     """None where too few matches fit one geometry."""
-    import cv2
-
     if min(len(one.descriptors), len(other.descriptors)) < OVERLAP:
         return None
     matched = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one.descriptors.astype(np.float32), other.descriptors.astype(np.float32), k=2)
@@ -285,12 +287,6 @@ def forecast(
 
     joined  share of the photographs that overlap, in the largest component
     """
-    from stages.masking.first_training import FIRST, RAYS
-    from stages.masking.first_training import SIDE as SIDE_OF_FIRST
-    from stages.poses.memory import decoding_needed, features_needed
-    from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
-    from stages.train.memory import first_training_needed
-
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
     features = given(settings.max_features) or ladder.features_for(count)
     before, rgb = time.thread_time(), np.zeros((1, 1, 3), np.uint8)
@@ -350,10 +346,6 @@ def _forecast_of_run(
 
 def count_features(rgb: np.ndarray) -> int:
     """About as many as structure from motion detects in a photograph's copy, (H, W, 3) uint8, without a limit."""
-    import cv2
-
-    from stages.sfm.matches import UPSAMPLE_BELOW
-
     grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
     if max(grey.shape) >= UPSAMPLE_BELOW:  # OpenCV's SIFT doubles any picture
         grey = cv2.resize(grey, (max(1, grey.shape[1] // 2), max(1, grey.shape[0] // 2)), interpolation=cv2.INTER_AREA)

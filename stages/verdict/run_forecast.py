@@ -43,7 +43,7 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
         return {}
     steps = given(bake.refine_steps)
     if steps is None:
-        steps = usual_steps(_voxels(bake), bake.refine_rays_per_batch, whole=whole)
+        steps = usual_steps(_voxels(bake), bake.refine_rays_per_batch, int((1 - TEST_SHARE) * 1e6 * megapixels) if whole else None)
     frames = turntable.frames * turntable.width * turntable.height * turntable.supersample**2 / 1e6
     processor = {
         "train": train.iterations * A_TRAIN_STEP * train.sample_batch_size / 65536,

@@ -10,6 +10,8 @@ import numpy as np
 
 from efficientnerf.capture.frame_choice import BLUR, CHOSEN
 from stages.figures.drawing import new_figure
+from stages.figures.plots import contact_sheet
+from stages.io.png import read_png
 
 SHOWN = 24  # thumbnails of a video
 COLUMNS = 8
@@ -21,9 +23,6 @@ def write_frames_sheet(record: Sequence[Mapping[str, Any]], paths: Mapping[str, 
 
     record, paths  as of `stages.video.frames.Chosen`
     """
-    from stages.figures.plots import contact_sheet
-    from stages.io.png import read_png
-
     rows: list[list[np.ndarray | None]] = []
     labels: list[list[str]] = []
     for video in record:

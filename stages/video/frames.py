@@ -13,9 +13,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
+from PIL import Image
 
 from efficientnerf.capture import frame_choice as choice
+from efficientnerf.capture.frame_motion import DETAIL, TRACKED, Motion, sharpness
 from pipeline.files import atomic, remove
 from stages.io.png import FAST
 from stages.scratch import note, noted, once
@@ -139,10 +142,6 @@ def look(path: Path, reader: Reader) -> Looked:
 
 
 def _look(path: Path, reader: Reader, threads: int) -> Looked:
-    import cv2
-
-    from efficientnerf.capture.frame_motion import DETAIL, TRACKED, Motion, sharpness
-
     motion = Motion()
     rows: list[tuple[int, float, float, float]] = []
     with opened(path, threads) as video:
@@ -192,8 +191,6 @@ def _same(numbers: list[int], found: list[int], outputs: object) -> None:
 
 
 def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> None:
-    from PIL import Image
-
     exif = Image.Exif()
     exif[_MAKER] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
     with atomic(path, durable=False) as temporary:

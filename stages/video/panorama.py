@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
+from PIL import Image
 
 from pipeline.files import atomic, remove
 from stages.io.photo import read_photo
@@ -50,8 +52,6 @@ def directions(side: int, view: int) -> np.ndarray:
 
 def cut(panorama: np.ndarray, side: int, view: int) -> np.ndarray:
     """(side, side, 3) uint8: one view of a panorama (H, 2 H, 3), its focal length half a side."""
-    import cv2
-
     height, width = panorama.shape[:2]
     x, y, z = np.moveaxis(directions(side, view), -1, 0)
     # pixels' centres are at whole numbers here; a column of the other end on each side
@@ -97,8 +97,6 @@ def _same(names: list[str], found: list[str], outputs: object) -> None:
 
 
 def _write(pixels: np.ndarray, path: Path) -> None:
-    from PIL import Image
-
     side = len(pixels)
     exif = Image.Exif()
     exif[_MAKER] = "panorama"

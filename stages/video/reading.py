@@ -14,13 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av
+import cv2
 import numpy as np
+from av.stream import Disposition
+from av.video.reformatter import Colorspace, Interpolation
 
 from pipeline.text import printable
+from stages.io.photo import working_size
 from stages.io.pictures import MAX_PIXELS, MAX_SIDE, NOT_THE_FILES_FAULT
+from stages.video import KNOWN
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".webm", ".mkv", ".avi")
-KNOWN = "mp4, mov, webm, mkv or avi"
 MAX_FRAMES = 1_000_000  # that are looked at
 MAX_DAMAGED = 1_000  # packets that cannot be decoded, after which the rest is not tried
 FASTEST = 240.0  # frames a second that a file is believed to have; WebM that browsers record states no rate, and FFmpeg takes that of its clock, 1000, for it
@@ -56,8 +60,6 @@ class Frame:
 
     def grey(self, longest: int) -> np.ndarray:
         """(h, w) uint8 luminance, as stored, reduced until the longest side is at most `longest`."""
-        from av.video.reformatter import Interpolation
-
         scale = min(1.0, longest / max(self.size))
         width, height = (max(2, round(side * scale)) for side in self.size)
         exact = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.BITEXACT
@@ -66,11 +68,6 @@ class Frame:
 
     def rgb(self, longest: int) -> np.ndarray:
         """(h, w, 3) uint8 sRGB, upright, with square pixels, reduced by area until the longest side is at most `longest`."""
-        import cv2
-        from av.video.reformatter import Interpolation
-
-        from stages.io.photo import working_size
-
         exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.BITEXACT | Interpolation.FULL_CHR_H_INT
         found = self._decoded.reformat(format="rgb24", interpolation=exact, threads=1, **self._colours(), dst_color_range=_FULL_RANGE).to_ndarray()
         pixels = np.ascontiguousarray(upright(np.asarray(found), self._matrix))
@@ -80,8 +77,6 @@ class Frame:
         return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if pixels.shape[1] >= size[0] else cv2.INTER_LINEAR))
 
     def _colours(self) -> dict[str, Any]:
-        from av.video.reformatter import Colorspace
-
         frame = self._decoded
         ours = {"src_color_range": frame.color_range or (_FULL_RANGE if frame.format.name.startswith("yuvj") else _STUDIO_RANGE)}
         if frame.colorspace == _UNSPECIFIED:
@@ -134,8 +129,6 @@ class Video:
                 return
 
     def _decoded(self) -> Iterator[Any]:
-        import av
-
         try:
             for packet in self._container.demux(self._stream):
                 try:
@@ -162,8 +155,6 @@ class Video:
 @contextmanager
 def opened(path: Path, threads: int = 1) -> Iterator[Video]:
     """A video file. Raises UnreadableVideo, also for a file without a stream of pictures; OSError where it cannot be read now."""
-    import av
-
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb") as file:
@@ -196,8 +187,6 @@ def _format(head: bytes) -> str:
 
 def _pictures(container: Any) -> Any:
     """The largest stream of pictures that is no cover."""
-    from av.stream import Disposition
-
     streams = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic and each.codec_context is not None]
     if not streams:
         raise UnreadableVideo("unreadable: no stream of pictures in it")

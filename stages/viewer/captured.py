@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
+from PIL import Image
 
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from stages.io.scene import Scene, View
+from efficientnerf.geometry.cameras import Camera, project, rays, resized
+from stages.io.refined_cameras import LEFT_OUT, load_scene
+from stages.io.scene import View, read_image
 
 CAMERAS = 240  # at most: more frusta hide one another
 PHOTOGRAPHS = 32  # at most: a second's work, a megabyte
@@ -24,14 +25,12 @@ def captured_views(poses: Path, train: Path, background: tuple[float, float, flo
 
     Raises CorruptArtifact, and BadInput where there is no scene.
     """
-    from stages.io.refined_cameras import LEFT_OUT, load_scene
-
     scene = load_scene(poses, train)
     known = [view for view in scene.views if view.split != LEFT_OUT]
     views = [known[n] for n in _spread(len(known), CAMERAS)]
     behind = background or scene.background or (1.0, 1.0, 1.0)
     shown = [views[n] for n in _spread(len(views), PHOTOGRAPHS)]
-    return [_pinhole(view.camera) for view in views], {view.camera.name: photograph(scene, poses, view, behind) for view in shown}
+    return [_pinhole(view.camera) for view in views], {view.camera.name: photograph(poses, view, behind) for view in shown}
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -45,14 +44,8 @@ def _pinhole(camera: Camera) -> Camera:
     return replace(camera, model="PINHOLE", params=tuple(float(lens[key]) for key in ("fx", "fy", "cx", "cy")))
 
 
-def photograph(scene: Scene, folder: Path, view: View, background: tuple[float, float, float]) -> bytes:
+def photograph(folder: Path, view: View, background: tuple[float, float, float]) -> bytes:
     """JPEG of a view, small, as its camera without distortion takes it; black where that sees past the image's border."""
-    import cv2
-    from PIL import Image
-
-    from efficientnerf.geometry.cameras import project, rays, resized
-    from stages.io.scene import read_image
-
     pixels = read_image(folder, view)
     size = min(1.0, SIDE / max(view.camera.width, view.camera.height))
     width, height = max(1, round(view.camera.width * size)), max(1, round(view.camera.height * size))

@@ -8,25 +8,28 @@ from __future__ import annotations
 
 import base64
 import functools
-import hashlib
 import json
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import jinja2
+import jinja2
+import numpy as np
+from markupsafe import Markup
 
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
+from efficientnerf.asset.format import contents, load, serialize
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
+from pipeline.files import write_atomically
+from pipeline.text import printable
+from stages.viewer.html import json_for_html, policy_hash
 
 FOLDER = Path(__file__).parent
 MODULES = ("sha256", "asset", "payload", "volume", "shader", "renderer", "camera", "controls", "main")  # each after those that it imports
 NAME = "viewer.html"
 PART = 3 * 2**18  # bytes of compressed data in an element of the page; a multiple of 3
-LARGEST = 192_000_000  # bytes of an asset that a page is made of by itself: its textures fill what a graphics card of 1 GB has for them
 
 
 def write_viewer(
@@ -40,8 +43,6 @@ def write_viewer(
 
     Raises FormatError for a file that is no asset.
     """
-    from pipeline.files import write_atomically
-
     page = viewer_page(compact_bytes(asset), cameras=cameras, photographs=photographs, title=title or asset.stem)
     write_atomically(target, page)
     return len(page)
@@ -49,8 +50,6 @@ def write_viewer(
 
 def compact_bytes(asset: Path) -> bytes:
     """The asset's file in the layout `compact`, checked. Raises FormatError."""
-    from efficientnerf.asset.format import contents, load, serialize
-
     tree: NerfTree = load(asset)
     if contents(asset)[0]["layout"].endswith("compact"):
         return asset.read_bytes()
@@ -61,10 +60,6 @@ def viewer_page(
     asset: bytes, *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene"
 ) -> bytes:
     """The page of the bytes of an asset in the layout `compact`, which the page checks."""
-    from markupsafe import Markup
-
-    from pipeline.text import printable
-
     title = printable(title, 200)
     entries = [_camera(camera, (photographs or {}).get(camera.name)) for camera in cameras] or _captured_path(asset)
     facts = {"title": title, "bytes": len(asset), "cameras": entries, "home": None}
@@ -84,8 +79,6 @@ def policy() -> str:
 
 @functools.cache
 def _template() -> jinja2.Template:
-    import jinja2
-
     return jinja2.Environment(loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined).get_template("viewer.html.j2")
 
 
@@ -108,20 +101,7 @@ def _parts(asset: bytes) -> Iterator[bytes]:
         yield base64.b64encode(packed[begin : begin + PART])
 
 
-def policy_hash(text: str) -> str:
-    """As a Content-Security-Policy names a script."""
-    return base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
-
-
-def json_for_html(value: Any) -> str:
-    """JSON that ends no element and begins no comment, whatever its texts hold."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
 def _camera(camera: Camera, photograph: bytes | None) -> dict[str, Any]:
-    from pipeline.text import printable
-
     lens = camera.intrinsics
     return {
         "name": printable(camera.name, 200),
@@ -136,10 +116,6 @@ def _camera(camera: Camera, photograph: bytes | None) -> dict[str, Any]:
 
 def _captured_path(asset: bytes) -> list[dict[str, Any]]:
     """The cameras of the asset's captured path, as far as it is one: FORMAT.md states no rule for it that a reader checks."""
-    import numpy as np
-
-    from efficientnerf.geometry.cameras import Camera
-
     try:
         header = json.loads(asset[8 : 8 + int.from_bytes(asset[:8], "little")])
         found = json.loads(header["__metadata__"]["nerftree"])["captured_path"]

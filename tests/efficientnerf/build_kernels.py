@@ -109,8 +109,8 @@ def images() -> None:
 
 
 def fit() -> None:
-    from efficientnerf.backends.layout import Hyperparameters, Moments, RayTargets
-    from efficientnerf.backends.triton import tree_gradients, tree_packets, tree_steps
+    from efficientnerf.backends.layout import Hyperparameters, Moments
+    from efficientnerf.backends.triton import tree_gradients, tree_steps
     from tests.efficientnerf.trees import random_cascades, random_tree
 
     rays = tree_gradients.Rays(torch.zeros(8, 3), torch.ones(8, 3), torch.ones(8, 3))
@@ -123,8 +123,6 @@ def fit() -> None:
         outputs = tree_gradients.forward(g, rays, *values)
         tree_gradients.backward(g, rays, *values, outputs, (outputs[0], outputs[1]), sums, stamp, 7)
         tree_gradients.max_contributions(g, rays, values[0], outputs[1], squares[0])
-        seen, first = RayTargets(rays.views, rays.views, outputs[1], outputs[1], 0.5), torch.tensor([0, 8])
-        tree_packets.loss_and_gradients(g, first, rays, *values, seen, sums, stamp, 7)
         for momentum, total_variation in ((0.0, 0.0), (0.9, 0.1)):
             rule = Hyperparameters(0.1, 0.1, 0.5, 0.9, 1e-10, momentum, total_variation)
             neighbours = tree_steps.Neighbours(torch.zeros(count), torch.zeros(count, 6, dtype=torch.int32))

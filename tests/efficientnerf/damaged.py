@@ -14,8 +14,7 @@ import numpy as np
 from efficientnerf.asset.cascades import cascade_grids
 from efficientnerf.asset.file.container import DTYPES
 from efficientnerf.asset.format import LAYOUTS, serialize
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, Region
 from tests.efficientnerf.trees import LOW, random_cascades, random_tree
 
 SIMILARITY = {"scale": 0.5, "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "translation": [1, 2, 3]}
@@ -32,7 +31,6 @@ def tiny(degree: int = 0, **more: Any) -> NerfTree:
 def tiny_scene(degree: int = 0) -> NerfTree:
     """Two cascades with an environment map and a region of some bricks."""
     tree = random_cascades(6, count=2, brick=1, degree=degree, share=0.1, metadata=METADATA)
-    assert tree.environment is not None
     region = Region(np.stack([LOW, LOW + 0.3]), 0.1, 0.05, np.arange(len(tree.voxel_index)) % 3 > 0)
     return replace(tree, environment=tree.environment[:2, :4], region=region)
 

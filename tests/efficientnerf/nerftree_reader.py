@@ -125,7 +125,6 @@ class Tree:
         return (colour if self.environment is None else colour + light * self.behind(direction)), 1 - light
 
     def behind(self, direction: np.ndarray) -> np.ndarray:
-        assert self.environment is not None
         rows, columns, _ = self.environment.shape
         column = (math.atan2(direction[1], direction[0]) / (2 * math.pi) + 0.5) * columns - 0.5
         row = min(max(math.acos(direction[2]) / math.pi * rows - 0.5, 0), rows - 1)

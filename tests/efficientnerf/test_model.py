@@ -81,18 +81,6 @@ def test_training_explores_intervals_without_a_pivot_and_rendering_does_not() ->
     assert int(none.pivotal.sum()) <= int((none.coarse_weight > m.settings.pivotal_threshold).sum())
 
 
-def test_rays_that_meet_nothing_show_the_background() -> None:
-    for field in ("hash", "mlp"):
-        m = untrained(field=field)
-        m.voxels.values.fill_(-1.0)
-        seen = seen_by(m)
-        assert len(seen.coarse.start) == len(seen.fine.start) == 0
-        assert (seen.fine_colour == 1).all()
-        assert (seen.fine_opacity == 0).all()
-        origins, directions, *rest = bundle()
-        assert (seen_by(m, prune=False, rays=(origins, -directions, *rest)).fine_colour == 1).all()
-
-
 @pytest.mark.parametrize("field", ["hash", "mlp"])
 def test_the_same_settings_give_the_same_numbers(field: str) -> None:
     first, again, other = untrained(field=field), untrained(field=field), untrained(field=field, seed=1)
@@ -120,12 +108,6 @@ def test_the_papers_model_has_the_papers_sizes() -> None:
     assert m.voxels.threshold == 0
     assert float(m.voxels.values.max()) == 10
     assert m.step == pytest.approx(2 * math.sqrt(3) / 64)
-
-
-def test_the_maximum_rules_threshold_is_an_absorption_over_an_interval() -> None:
-    m = untrained(occupancy_rule="maximum", occupancy_alpha_threshold=0.01)
-    assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.01)
-    assert m.voxels.occupied == 1.0
 
 
 def test_states_are_restored_and_what_does_not_fit_is_named() -> None:

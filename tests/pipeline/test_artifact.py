@@ -57,7 +57,7 @@ def test_outputs_that_are_refused(tmp_path: Path, kind: str) -> None:
         os.mkfifo(tmp_path / "a")
     elif kind == "manifest":
         (tmp_path / "manifest.json").write_text("{}")
-    with pytest.raises(StageFailed, match="train: left"):
+    with pytest.raises(StageFailed, match="train"):
         artifact.outputs_of(tmp_path, STAGE)
 
 
@@ -67,74 +67,42 @@ def test_differences_name_what_is_altered_missing_and_too_much(tmp_path: Path) -
     outputs = read_manifest(run / "train").outputs
     assert artifact.differences(run / "train", outputs) == artifact.Differences()
     (run / "train" / "a.txt").write_text("number 2")
-    (run / "train" / "sub" / "b.txt").unlink()
+    (run / "train" / "sub").rename(tmp_path / "elsewhere")
+    (run / "train" / "sub").symlink_to(tmp_path / "elsewhere")
+    assert artifact.differences(run / "train", outputs).damaged == ("a.txt", "sub/b.txt"), "what is behind a link is no output"
+    (run / "train" / "sub").unlink()
+    (run / "train" / "sub").mkdir()
     (run / "train" / "sub" / "c.txt").write_text("")
     found = artifact.differences(run / "train", outputs)
     assert found == artifact.Differences(("a.txt",), ("sub/b.txt",), ("sub/c.txt",))
-    assert found.damaged == ("a.txt", "sub/b.txt")
     assert found.text() == "a.txt altered; sub/b.txt gone"
-
-
-def test_an_output_behind_a_link_is_not_an_output(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    published(run, 1)
-    outputs = read_manifest(run / "train").outputs
-    shutil.move(run / "train" / "sub", tmp_path / "elsewhere")
-    (run / "train" / "sub").symlink_to(tmp_path / "elsewhere")
-    assert artifact.differences(run / "train", outputs).missing == ("sub/b.txt",)
-    (run / "train" / "sub").unlink()
-    (run / "train" / "sub").mkdir()
     (run / "train" / "sub" / "b.txt").symlink_to(tmp_path / "elsewhere" / "b.txt")
-    assert artifact.differences(run / "train", outputs).altered == ("sub/b.txt",)
-
-
-def test_long_lists_are_cut_short() -> None:
-    assert artifact.listed("abc") == "a, b, c"
+    assert artifact.differences(run / "train", outputs).altered == ("a.txt", "sub/b.txt")
     assert artifact.listed("abcdefg") == "a, b, c and 4 more"
-
-
-def test_publishing_replaces_and_clears_up(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    published(run, 1)
-    published(run, 2)
-    assert contents(run) == {"train/a.txt": b"number 2", "train/sub/b.txt": b"number 2"}
-    assert os.listdir(run / artifact.WORK) == []
 
 
 def test_a_new_request_drops_the_scratch_of_another_and_keeps_its_own(tmp_path: Path) -> None:
     work = tmp_path / artifact.WORK
     one, two = artifact.workplace(tmp_path, "train", request(1)), artifact.workplace(tmp_path, "train", request(2))
     assert artifact.prepare(one, work) is False
+    (one.out / "half").write_text("1")
+    artifact.abandon(one, work)
+    assert os.listdir(work) == []
+    artifact.prepare(one, work)
     (one.scratch / "checkpoint").write_text("1")
     (one.out / "half").write_text("1")
     assert artifact.prepare(one, work) is True
     assert files.is_empty(one.out)
+    (one.out / "half").write_text("1")
+    artifact.abandon(one, work)
+    assert contents(work) == {f"train/{one.request}/scratch/checkpoint": b"1"}
     assert artifact.prepare(two, work) is False
     assert not one.folder.exists()
-
-
-def test_after_a_failure_only_checkpoints_stay(tmp_path: Path) -> None:
-    work = tmp_path / artifact.WORK
-    place = artifact.workplace(tmp_path, "train", request(1))
-    artifact.prepare(place, work)
-    (place.out / "half").write_text("1")
-    artifact.abandon(place, work)
-    assert os.listdir(work) == []
-    artifact.prepare(place, work)
-    (place.out / "half").write_text("1")
-    (place.scratch / "checkpoint").write_text("1")
-    artifact.abandon(place, work)
-    assert contents(work) == {f"train/{place.request}/scratch/checkpoint": b"1"}
 
 
 def both(run: Path) -> None:
     published(run, 2)
     shutil.copytree(run / "train", run / artifact.WORK / "old-train")
-
-
-def neither(run: Path) -> None:
-    run.mkdir()
-    sealed(run, 2)
 
 
 def only_old(run: Path) -> None:
@@ -158,22 +126,14 @@ def old_and_something_else_in_its_place(run: Path) -> None:
     (run / "train" / "junk").write_text("")
 
 
-@pytest.mark.parametrize(
-    ("state", "number", "said"),
-    [
-        (both, 2, "deleted"),
-        (only_old, 1, "undone"),
-        (old_and_a_whole_new_one, 2, "completed"),
-        (old_and_half_a_new_one, 1, "undone"),
-        (old_and_something_else_in_its_place, 1, "undone"),
-    ],
-)
-def test_recovery_from_each_state(tmp_path: Path, state: Callable[[Path], None], number: int, said: str) -> None:
+STATES = [(both, 2), (only_old, 1), (old_and_a_whole_new_one, 2), (old_and_half_a_new_one, 1), (old_and_something_else_in_its_place, 1)]
+
+
+@pytest.mark.parametrize(("state", "number"), STATES)
+def test_recovery_from_each_state(tmp_path: Path, state: Callable[[Path], None], number: int) -> None:
     run = tmp_path / "run"
     state(run)
-    (text,) = artifact.recover(run, ["train"])
-    assert text.startswith("train: ")
-    assert said in text
+    assert len(artifact.recover(run, ["train"])) == 1
     made = read_manifest(run / "train")
     assert made.request.settings["number"] == number
     assert not artifact.differences(run / "train", made.outputs).damaged
@@ -183,14 +143,11 @@ def test_recovery_from_each_state(tmp_path: Path, state: Callable[[Path], None],
 
 def test_nothing_to_recover(tmp_path: Path) -> None:
     assert artifact.recover(tmp_path, ["train"]) == []
-    neither(tmp_path / "run")
+    (tmp_path / "run").mkdir()
+    place = sealed(tmp_path / "run", 2)
     assert artifact.recover(tmp_path / "run", ["train"]) == []
     assert not (tmp_path / "run" / "train").exists()
-    assert artifact.finished(artifact.workplace(tmp_path / "run", "train", request(2)), "train") is not None
-
-
-def test_a_finished_output_that_was_damaged_is_not_finished(tmp_path: Path) -> None:
-    place = sealed(tmp_path, 1)
+    assert artifact.finished(place, "train") is not None
     (place.out / "a.txt").write_text("number 9")
     assert artifact.finished(place, "train") is None
 
@@ -215,17 +172,16 @@ def test_publishing_killed_before_every_step(tmp_path: Path) -> None:
     assert seen == {1, 2}
 
 
-def test_recovery_killed_before_every_step(tmp_path: Path) -> None:
-    for state, number in ((both, 2), (only_old, 1), (old_and_a_whole_new_one, 2), (old_and_half_a_new_one, 1)):
-        for moment in itertools.count(1):
-            run = tmp_path / f"{state.__name__}{moment}"
-            state(run)
-            killed = run_and_kill(lambda run=run: artifact.recover(run, ["train"]), moment)  # type: ignore[misc]
-            artifact.recover(run, ["train"])
-            made = read_manifest(run / "train")
-            assert made.request.settings["number"] == number
-            assert not artifact.differences(run / "train", made.outputs).damaged
-            assert not list((run / artifact.WORK).glob("old-*"))
-            assert not list((run / artifact.WORK).glob("trash-*"))
-            if not killed:
-                break
+@pytest.mark.parametrize(("state", "number"), STATES[:4])
+def test_recovery_killed_before_every_step(tmp_path: Path, state: Callable[[Path], None], number: int) -> None:
+    for moment in itertools.count(1):
+        run = tmp_path / str(moment)
+        state(run)
+        killed = run_and_kill(lambda run=run: artifact.recover(run, ["train"]), moment)  # type: ignore[misc]
+        artifact.recover(run, ["train"])
+        made = read_manifest(run / "train")
+        assert made.request.settings["number"] == number
+        assert not artifact.differences(run / "train", made.outputs).damaged
+        assert not [path for path in (run / artifact.WORK).iterdir() if path.name.startswith(("old-", "trash-"))]
+        if not killed:
+            break

@@ -15,11 +15,11 @@ GIB = 2**30
 
 
 @pytest.mark.parametrize(
-    ("text", "size"),
-    [("512m", 512 * 2**20), ("8g", 8 * GIB), ("8G", 8 * GIB), ("1.5GiB", 3 * GIB // 2), ("2 TB", 2**41), ("100000000", 10**8), ("7b", 7), (" 64kib ", 2**16)],
+    ("text", "size"), [("512m", 512 * 2**20), ("8G", 8 * GIB), ("1.5GiB", 3 * GIB // 2), ("2 TB", 2**41), ("100000000", 10**8), ("7b", 7), (" 64kib ", 2**16)]
 )
 def test_a_size_is_read(text: str, size: int) -> None:
     assert parse_size(text) == size
+    assert (size_text(1.5 * GIB), size_text(300 * 2**20), size_text(1)) == ("1.5 GiB", "300 MiB", "1 MiB")
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1g", "8x", "g", "1e9", "nan", "inf", "8 g b", "9" * 400, "1" + "0" * 19 + "t", "٣g", "8g\x1b[31m", "0.1"])
@@ -27,10 +27,6 @@ def test_what_is_no_size_is_refused_in_one_printable_line(text: str) -> None:
     with pytest.raises(UsageError, match="--memory") as caught:
         parse_size(text)
     assert str(caught.value).isprintable()
-
-
-def test_sizes_in_words() -> None:
-    assert (size_text(1.5 * GIB), size_text(300 * 2**20), size_text(1)) == ("1.5 GiB", "300 MiB", "1 MiB")
 
 
 def machine(root: Path, *, cgroup: str = "0::/\n", **limits: str) -> Path:
@@ -52,34 +48,28 @@ def usable(root: Path) -> tuple[int, str]:
     return round(found.bytes / (1 - KEPT_BACK) / GIB), found.whose
 
 
-def test_without_control_groups_it_is_the_machines(tmp_path: Path) -> None:
-    assert usable(machine(tmp_path)) == (16, "the machine")
+NESTED = {"memory-max": "max\n", "a__memory-max": f"{4 * GIB}\n", "a__b__memory-max": f"{6 * GIB}\n", "a__b__c__memory-max": "max\n", "z__memory-max": "1"}
+POD = "5:cpu,memory:/pod\n0::/\n"
+UNLIMITED = str(2**63 - 4096)  # version 1's number for no limit
 
 
-def test_the_smallest_limit_on_the_way_up_counts(tmp_path: Path) -> None:
-    limits = {"memory-max": "max\n", "a__memory-max": f"{4 * GIB}\n", "a__b__memory-max": f"{6 * GIB}\n", "a__b__c__memory-max": "max\n", "z__memory-max": "1"}
-    assert usable(machine(tmp_path, cgroup="0::/a/b/c\n", **limits)) == (4, "the control group /a")
-
-
-def test_version_1_and_its_number_for_no_limit(tmp_path: Path) -> None:
-    groups = "5:cpu,memory:/pod\n0::/\n"
-    unlimited = machine(tmp_path / "one", cgroup=groups, **{"memory__pod__memory-limit_in_bytes": str(2**63 - 4096)})
-    assert usable(unlimited) == (16, "the machine")
-    limited = machine(tmp_path / "two", cgroup=groups, **{"memory__pod__memory-limit_in_bytes": str(3 * GIB)})
-    assert usable(limited) == (3, "the control group /pod")
-
-
-def test_version_2_beside_version_1(tmp_path: Path) -> None:
-    assert usable(machine(tmp_path, cgroup="4:cpu:/\n0::/u\n", **{"unified__u__memory-max": str(5 * GIB)})) == (5, "the control group /u")
-
-
-def test_a_container_that_sees_the_path_of_its_host(tmp_path: Path) -> None:
-    assert usable(machine(tmp_path, cgroup="0::/docker/0123\n", **{"memory-max": str(2 * GIB)}))[0] == 2
-    assert usable(machine(tmp_path / "up", cgroup="0::/../../x\n", **{"memory-max": str(2 * GIB)}))[0] == 2
-
-
-def test_nonsense_in_the_files_of_the_system_counts_as_no_limit(tmp_path: Path) -> None:
-    assert usable(machine(tmp_path, cgroup="\n:::\n0::\nx\n", **{"memory-max": "??"}))[0] == 16
+@pytest.mark.parametrize(
+    ("cgroup", "limits", "expected"),
+    [
+        ("0::/a/b/c\n", NESTED, (4, "the control group /a")),
+        (POD, {"memory__pod__memory-limit_in_bytes": UNLIMITED}, (16, "the machine")),
+        (POD, {"memory__pod__memory-limit_in_bytes": str(3 * GIB)}, (3, "the control group /pod")),
+        ("4:cpu:/\n0::/u\n", {"unified__u__memory-max": str(5 * GIB)}, (5, "the control group /u")),
+        ("0::/docker/0123\n", {"memory-max": str(2 * GIB)}, (2, None)),  # a container that sees the path of its host
+        ("0::/../../x\n", {"memory-max": str(2 * GIB)}, (2, None)),
+        ("\n:::\n0::\nx\n", {"memory-max": "??"}, (16, None)),
+        ("0::/\n", {}, (16, "the machine")),
+    ],
+)
+def test_the_smallest_limit_on_the_way_up_counts(tmp_path: Path, cgroup: str, limits: dict[str, str], expected: tuple[int, str | None]) -> None:
+    size, whose = usable(machine(tmp_path, cgroup=cgroup, **limits))
+    assert size == expected[0]
+    assert whose == expected[1] or expected[1] is None
 
 
 def test_what_is_available_now_heeds_other_programs_and_the_control_group(tmp_path: Path) -> None:

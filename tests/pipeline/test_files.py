@@ -23,50 +23,33 @@ def test_names_that_leave_or_are_not_the_only_spelling(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"", "empty"),
-        (b"{", "not valid JSON"),
-        (b"\xff\xfe", "not valid JSON"),
-        (b"[NaN]", "NaN"),
-        (b"[" * 100_000, "nested too deeply"),
-        (b"1" * 5000, "not valid JSON"),
-        (b" " * 30000, "larger than"),
-        (b"[1e999]", "no number"),
-        (b"[" * 101 + b"]" * 101, "nested too deeply"),
-        (b"[" + b"[]," * 2**21 + b"[]]", "too many lists"),
-    ],
+    "data",
+    [b"", b"{", b"\xff\xfe", b"[NaN]", b"[" * 100_000, b"1" * 5000, b" " * 30000, b"[1e999]", b"[" * 101 + b"]" * 101, b"[" + b"[]," * 2**21 + b"[]]"],
+    ids=range(10),
 )
-def test_json_from_anybody(tmp_path: Path, data: bytes, message: str) -> None:
+def test_json_from_anybody(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "a.json"
     path.write_bytes(data)
-    with pytest.raises(files.Unreadable, match=message) as caught:
+    with pytest.raises(files.Unreadable) as caught:
         files.read_json(path, limit=20_000_000 if data.startswith(b"[[") else 20_000)
     assert "\n" not in str(caught.value)
-
-
-def test_a_folder_in_place_of_a_file_is_unreadable(tmp_path: Path) -> None:
-    with pytest.raises(files.Unreadable, match="is a folder, expected a plain file"):
+    with pytest.raises(files.Unreadable):
         files.read_json(tmp_path)
     with pytest.raises(FileNotFoundError):
         files.read_json(tmp_path / "none.json")
 
 
-def test_canonical_json_has_one_spelling() -> None:
-    assert files.canonical_json({"b": (1, 2.0), "a": "é"}) == b'{"a":"\\u00e9","b":[1,2.0]}'
+def test_write_atomically_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    for value in ({}, {"b": (1, 2.0), "a": "é"}):
+        files.write_atomically(path, files.canonical_json(value))
+    assert path.read_bytes() == b'{"a":"\\u00e9","b":[1,2.0]}'
+    assert os.listdir(tmp_path) == ["a.json"]
     with pytest.raises(ValueError, match="JSON"):
         files.canonical_json(float("inf"))
 
 
-def test_write_atomically_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    files.write_atomically(path, b"1")
-    files.write_atomically(path, b"2")
-    assert path.read_bytes() == b"2"
-    assert os.listdir(tmp_path) == ["a.json"]
-
-
-def test_walk_names_files_and_links_but_does_not_follow(tmp_path: Path) -> None:
+def test_links_are_named_or_removed_and_not_followed(tmp_path: Path) -> None:
     (tmp_path / "in" / "sub").mkdir(parents=True)
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside" / "secret").write_text("x")
@@ -74,15 +57,10 @@ def test_walk_names_files_and_links_but_does_not_follow(tmp_path: Path) -> None:
     (tmp_path / "in" / "sub" / "b").write_text("x")
     (tmp_path / "in" / "link").symlink_to(tmp_path / "outside")
     assert sorted(name for name, _ in files.walk(tmp_path / "in")) == ["a", "link", "sub/b"]
-
-
-def test_remove_takes_a_link_and_leaves_its_target(tmp_path: Path) -> None:
-    target = tmp_path / "target"
-    target.mkdir()
-    (tmp_path / "link").symlink_to(target)
-    files.discard(tmp_path / "link", tmp_path)
-    assert os.listdir(tmp_path) == ["target"]
-    files.discard(tmp_path / "none", tmp_path)
+    for name in ("link", "none"):
+        files.discard(tmp_path / "in" / name, tmp_path)
+    assert sorted(os.listdir(tmp_path / "in")) == ["a", "sub"]
+    assert os.listdir(tmp_path / "outside") == ["secret"]
 
 
 @pytest.mark.parametrize("error", [OSError("1501528 requested and 475104 written"), RuntimeError("encoder error -2"), ValueError()])

@@ -30,7 +30,7 @@ def thawed() -> Iterator[None]:
     gc.freeze()
 
 
-def test_what_a_stage_finds_is_not_looked_at_again_and_garbage_before_it_is_gone(tmp_path: Path) -> None:
+def test_a_stage_begins_without_garbage_and_former_objects_are_frozen(tmp_path: Path) -> None:
     kept = [[number] for number in range(1000)]
     garbage = weakref.ref(Knot())
     before, seen = gc.get_freeze_count(), []

@@ -22,7 +22,7 @@ from pipeline.locks.lock import holder_of
 from pipeline.run import Run
 from pipeline.runner import run_stages, verify
 from pipeline.stage import settings_from
-from tests.pipeline.toy import COUNT, STAGES, CountSettings, actions, make_run
+from tests.pipeline.toy import COUNT, STAGES, CountSettings, make_run
 
 
 def nested(depth: int) -> Any:
@@ -38,7 +38,7 @@ VALUES: list[Any] = [
 ]  # fmt: skip
 
 
-TEXTS = [b'{"a": 1e999}', b"[" * 50_000, b'{"a":' * 50_000, b"9" * 400, b"9" * 5000, b"\xff", b'"\\ud800"', b"\0", b"-", b"{}{}"]
+TEXTS = [b'{"a": 1e999}', b"[" * 50_000, b"9" * 5000, b"\xff", b'"\\ud800"', b"\0", b"{}{}"]
 
 
 def mutants(value: Any) -> Iterator[Any]:
@@ -147,16 +147,6 @@ def test_any_holder(run: Run) -> None:
         pass
 
 
-def test_any_memory_of_hashes(run: Run) -> None:
-    good = {"format": "enerf-hashes-2", "files": {"k": [1, 2, 3, 4, "a" * 64]}}
-    for value in [*mutants(good), *({**good, "files": {"k": [1, 2, 3, each, "a" * 64]}} for each in VALUES)]:
-        run.cache.write_text(json.dumps(value))
-        hashes = Hashes(run.cache)
-        assert hashes.digest("k", run.path / "list" / "list.txt") == hashlib.sha256((run.path / "list" / "list.txt").read_bytes()).hexdigest()
-        hashes.forget("x")
-    assert set(actions(run_stages(run, STAGES)).values()) == {"skipped"}
-
-
 @pytest.mark.parametrize("name", ["steps", "rate", "name"])
 def test_settings_of_any_value(run: Run, name: str) -> None:
     """They are checked by the stage that has them, wherever they come from: a usage error, or a value that it can work with."""
@@ -164,18 +154,12 @@ def test_settings_of_any_value(run: Run, name: str) -> None:
         with contextlib.suppress(UsageError):
             assert abs(settings_from(CountSettings, {name: value}, where="count").steps) < 2**63
         assert refused([lambda value=value: settings_from(CountSettings, {name: value}, where="count")]) <= {2}  # type: ignore[misc]
-    with pytest.raises(UsageError, match="whole number"):
-        settings_from(CountSettings, {"steps": 10**400})
     with pytest.raises(UsageError):
         settings_from(CountSettings, {"\x1b[31m\ud800" * 1000: 1})
-
-
-def test_recorded_settings_of_any_value_end_as_a_usage_error(run: Run) -> None:
     run.update(settings={**run.settings, "count": {"steps": "many"}})
-    with pytest.raises(UsageError, match=r"count\.steps"):
-        decide(COUNT, Run.open(run.path))
-    with pytest.raises(UsageError, match=r"count\.steps"):
-        run_stages(Run.open(run.path), STAGES)
+    for action in (decide, lambda _, run: run_stages(run, STAGES)):
+        with pytest.raises(UsageError, match=r"count\.steps"):
+            action(COUNT, Run.open(run.path))  # type: ignore[operator]
 
 
 def test_a_file_larger_than_any_is_not_read(run: Run) -> None:

@@ -7,9 +7,6 @@ import errno
 import fcntl
 import json
 import os
-import random
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +19,8 @@ from pipeline.locks import lease
 from pipeline.locks.lease import EXPIRY, Held, Lease, acquire
 from pipeline.locks.lock import holder_of, lock
 from pipeline.run import Run
+from pipeline.runner import run_stages
+from tests.pipeline.toy import STAGES, make_run
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,7 +42,10 @@ def age(folder: Path, seconds: float) -> None:
 
 def test_another_machine_waits_until_the_lease_has_expired(tmp_path: Path) -> None:
     with on("a"):
-        held = acquire(tmp_path, decisive=True)
+        acquire(tmp_path, decisive=True).release()
+        held = acquire(tmp_path, decisive=True)  # what was given back is free at once
+    age(tmp_path, EXPIRY + 1)
+    held.beat()  # and is young again
     with on("b"):
         with pytest.raises(Held):
             acquire(tmp_path, decisive=True)
@@ -53,30 +55,16 @@ def test_another_machine_waits_until_the_lease_has_expired(tmp_path: Path) -> No
         assert EXPIRY - 6 < found.value.age < EXPIRY
         age(tmp_path, 6)
         other = acquire(tmp_path, decisive=True)
+    assert [path.name for path in (tmp_path / ".lease").iterdir()] == ["3"]
     held.beat()
-    assert "took its lease over" in (held.lost() or "")
+    assert held.lost()
     held.release()  # touches nothing of the other's
     other.beat()
     assert other.lost() is None
+    other.path.unlink()
+    other.beat()
+    assert other.lost()
     other.release()
-
-
-def test_what_was_given_back_is_free_at_once(tmp_path: Path) -> None:
-    with on("a"):
-        acquire(tmp_path, decisive=True).release()
-    with on("b"):
-        acquire(tmp_path, decisive=True).release()
-    assert [path.name for path in (tmp_path / ".lease").iterdir()] == ["2"]
-
-
-def test_a_renewed_lease_is_young_again(tmp_path: Path) -> None:
-    with on("a"):
-        held = acquire(tmp_path, decisive=True)
-    age(tmp_path, EXPIRY + 1)
-    held.beat()
-    with on("b"), pytest.raises(Held):
-        acquire(tmp_path, decisive=True)
-    held.release()
 
 
 def test_who_has_this_machines_lock_takes_over_from_a_dead_process_at_once(tmp_path: Path) -> None:
@@ -89,7 +77,7 @@ def test_who_has_this_machines_lock_takes_over_from_a_dead_process_at_once(tmp_p
     dead.release()
 
 
-def test_who_saw_an_old_lease_and_was_slow_does_not_get_a_number_that_was_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_taker_of_an_old_lease_gets_no_number_that_was_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between its look and its link others take over twice, and remove the lower numbers: its own link succeeds, and counts for nothing."""
     with on("a"):
         acquire(tmp_path, decisive=True).release()
@@ -111,7 +99,13 @@ def test_who_saw_an_old_lease_and_was_slow_does_not_get_a_number_that_was_passed
     later[0].release()
 
 
-def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("links", [True, False])
+def test_of_many_at_once_one_gets_it(tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*arguments: object, **more: object) -> None:
+        raise OSError(errno.EPERM, "no links here")
+
+    if not links:
+        monkeypatch.setattr(os, "link", refused)
     barrier, got = threading.Barrier(12), []
 
     def take() -> None:
@@ -119,7 +113,7 @@ def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
         with contextlib.suppress(Held):
             got.append(acquire(tmp_path, decisive=False))
 
-    for _ in range(5):
+    for _ in range(3):
         threads = [threading.Thread(target=take) for _ in range(12)]
         for thread in threads:
             thread.start()
@@ -127,17 +121,6 @@ def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
             thread.join()
         assert len(got) == 1
         got.pop().release()
-
-
-def test_without_links_one_gets_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*arguments: object, **more: object) -> None:
-        raise OSError(lease.errno.EPERM, "no links here")
-
-    monkeypatch.setattr(os, "link", refused)
-    held = acquire(tmp_path, decisive=True)
-    with on("b"), pytest.raises(Held):
-        acquire(tmp_path, decisive=True)
-    held.release()
 
 
 def test_a_lease_that_cannot_be_renewed_is_given_up_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,29 +132,11 @@ def test_a_lease_that_cannot_be_renewed_is_given_up_in_time(tmp_path: Path, monk
 
     with monkeypatch.context() as patch:
         patch.setattr(lease.os, "utime", failing)
-        patch.setattr(lease.time, "monotonic", lambda: now + EXPIRY - 1)
-        held.beat()
-        assert held.lost() is None
-        patch.setattr(lease.time, "monotonic", lambda: now + EXPIRY + 1)
-        held.beat()
-    assert "could not be renewed" in (held.lost() or "")
+        for late in (-1, 1):
+            patch.setattr(lease.time, "monotonic", lambda late=late: now + EXPIRY + late)
+            held.beat()
+            assert bool(held.lost()) == (late > 0)
     held.release()
-
-
-def test_a_removed_lease_is_lost(tmp_path: Path) -> None:
-    held = acquire(tmp_path, decisive=True)
-    held.path.unlink()
-    held.beat()
-    assert held.lost() == "its lease was removed"
-    held.release()
-
-
-@pytest.mark.parametrize("name", ["9" * 18, "1" + "0" * 15])
-def test_a_number_that_no_count_reaches_is_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / ".lease").mkdir()
-    (tmp_path / ".lease" / name).write_text("{}")
-    with pytest.raises(CorruptArtifact, match="no number of a lease"):
-        acquire(tmp_path, decisive=True)
 
 
 def test_what_a_stranger_left_in_it_is_no_lease(tmp_path: Path) -> None:
@@ -181,15 +146,17 @@ def test_what_a_stranger_left_in_it_is_no_lease(tmp_path: Path) -> None:
     held = acquire(tmp_path, decisive=True)
     assert held.number == 1
     held.release()
+    (tmp_path / ".lease" / ("1" + "0" * 15)).write_text("{}")  # a number that no count reaches
+    with pytest.raises(CorruptArtifact):
+        acquire(tmp_path, decisive=True)
 
 
-def test_a_run_says_who_holds_it_and_since_when_its_lease_was_renewed(tmp_path: Path) -> None:
+def test_a_run_says_who_holds_it(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "run")
     other = Run.open(run.path)
     with on("a"), run.locked():
-        # Another machine does not see this one's lock.
-        (run.path / ".lock").unlink()
-        with on("b"), pytest.raises(RunLocked, match=rf"being written by process {os.getpid()} on .* its lease was renewed \d s ago"), other.locked():
+        (run.path / ".lock").unlink()  # another machine does not see this one's lock
+        with on("b"), pytest.raises(RunLocked, match=rf"process {os.getpid()} on .* \d s ago"), other.locked():
             pass
 
 
@@ -212,7 +179,7 @@ def test_without_locks_of_the_system_the_lease_alone_decides(tmp_path: Path, mon
 
     monkeypatch.setattr(fcntl, "flock", refused)
     for _ in range(2):
-        with lock(tmp_path), pytest.raises(RunLocked, match=r"its lease was renewed \d s ago"), lock(tmp_path):
+        with lock(tmp_path), pytest.raises(RunLocked), lock(tmp_path):
             pass
     killed = acquire(tmp_path, decisive=False)
     killed._done.set()
@@ -224,9 +191,6 @@ def test_without_locks_of_the_system_the_lease_alone_decides(tmp_path: Path, mon
 
 
 def test_who_lost_the_lease_publishes_nothing(tmp_path: Path) -> None:
-    from pipeline.runner import run_stages
-    from tests.pipeline.toy import STAGES, make_run
-
     run = make_run(tmp_path)
     taken: list[Lease] = []
 
@@ -238,7 +202,7 @@ def test_who_lost_the_lease_publishes_nothing(tmp_path: Path) -> None:
             assert run._lease is not None
             run._lease.beat()
 
-    with on("a"), pytest.raises(RunLocked, match=r"no longer this process's to write.*took its lease over"):
+    with on("a"), pytest.raises(RunLocked):
         run_stages(run, STAGES, report=take_over)
     assert (run.path / "list").is_dir()
     assert not (run.path / "count").exists()
@@ -248,8 +212,11 @@ def test_who_lost_the_lease_publishes_nothing(tmp_path: Path) -> None:
 
 
 def test_a_killed_process_blocks_nobody_on_its_machine(tmp_path: Path) -> None:
-    script = "import os, sys; from pathlib import Path; from pipeline.locks.lock import lock\nwith lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
-    for _ in range(random.Random(1).randint(2, 4)):
-        assert subprocess.run([sys.executable, "-c", script, str(tmp_path)], cwd=ROOT, check=False).returncode == -9
+    for _ in range(2):
+        pid = os.fork()
+        if pid == 0:
+            with lock(tmp_path):
+                os.kill(os.getpid(), 9)
+        assert os.waitpid(pid, 0)[1] == 9
     with lock(tmp_path) as held:
         assert held.lost() is None

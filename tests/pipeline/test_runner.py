@@ -6,8 +6,8 @@ import itertools
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,16 +21,12 @@ from pipeline.run import Run
 from pipeline.runner import run_stages, verify
 from pipeline.stage import Job, Stage
 from tests.pipeline.kills import run_and_kill
-from tests.pipeline.toy import COUNT, LIST, STAGES, Events, actions, contents, make_run, raising, set_one
+from tests.pipeline.toy import COUNT, LIST, STAGES, Events, actions, contents, make_run, raising, replaced, set_one
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     return make_run(tmp_path)
-
-
-def replaced(name: str, **changes: object) -> list[Stage]:
-    return [replace(stage, **changes) if stage.name == name else stage for stage in STAGES]  # type: ignore[arg-type]
 
 
 def test_all_run_once_and_then_nothing(run: Run) -> None:
@@ -70,10 +66,8 @@ def test_only_what_changed_runs_again(run: Run) -> None:
     run_stages(run, STAGES)
     set_one(run, "count", steps=9)
     assert actions(run_stages(run, STAGES)) == {"list": "skipped", "count": "ran", "double": "ran", "report": "ran"}
-
-
-def test_a_stage_that_gives_the_same_again_leaves_the_rest_fresh(run: Run) -> None:
-    run_stages(run, STAGES)
+    (run.folder("count") / "count.txt").write_text("altered")
+    assert actions(run_stages(run, STAGES)) == {"list": "skipped", "count": "ran", "double": "skipped", "report": "skipped"}
     before = read_manifest(run.folder("count"))
     assert actions(run_stages(run, replaced("count", version=2))) == {"list": "skipped", "count": "ran", "double": "skipped", "report": "skipped"}
     after = read_manifest(run.folder("count"))
@@ -86,49 +80,38 @@ def test_until_from_and_force(run: Run) -> None:
     assert actions(run_stages(run, STAGES, start="count", until="count")) == {"list": "skipped", "count": "ran"}
     assert actions(run_stages(run, STAGES, start="double")) == {"list": "skipped", "count": "skipped", "double": "ran", "report": "ran"}
     assert set(actions(run_stages(run, STAGES, force=True)).values()) == {"ran"}
-    with pytest.raises(UsageError, match="comes first"):
-        run_stages(run, STAGES, start="double", until="list")
-    with pytest.raises(UsageError, match="single stage"):
-        run_stages(run, STAGES, only="double", until="list")
-    with pytest.raises(UsageError, match=r"cuont: no such stage\. Did you mean count\?"):
+    for selection in ({"start": "double", "until": "list"}, {"only": "double", "until": "list"}):
+        with pytest.raises(UsageError):
+            run_stages(run, STAGES, **selection)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=r"Did you mean count\?"):
         run_stages(run, STAGES, until="cuont")
 
 
 def test_a_workflow_in_the_wrong_order_is_a_mistake_of_ours(run: Run) -> None:
-    with pytest.raises(ValueError, match="count comes before list"):
-        run_stages(run, [COUNT, LIST])
-    with pytest.raises(ValueError, match="two stages are named list"):
-        run_stages(run, [LIST, LIST])
+    for stages in ([COUNT, LIST], [LIST, LIST]):
+        with pytest.raises(ValueError, match="list"):
+            run_stages(run, stages)
 
 
-def test_one_stage_alone(run: Run) -> None:
+def test_one_stage_alone_uses_what_there_is_and_warns_of_what_is_stale(run: Run) -> None:
     run_stages(run, STAGES)
     assert actions(run_stages(run, STAGES, only="double")) == {"double": "skipped"}
-    assert actions(run_stages(run, STAGES, only="double", force=True)) == {"double": "ran"}
-
-
-def test_one_stage_alone_says_that_those_before_it_are_stale_and_uses_what_there_is(run: Run) -> None:
-    run_stages(run, STAGES)
     set_one(run, "count", steps=9)
     events = Events()
     assert actions(run_stages(run, STAGES, only="report", force=True, report=events)) == {"report": "ran"}
-    warnings = events.named("warning")
-    assert [(warning["about"], warning["state"]) for warning in warnings] == [("count", "stale"), ("double", "stale")]
-    assert "steps 6 -> 9" in warnings[0]["text"]
+    assert [(warning["about"], warning["state"]) for warning in events.named("warning")] == [("count", "stale"), ("double", "stale")]
     assert read_manifest(run.folder("count")).request.settings["steps"] == 6
 
 
 def test_one_stage_alone_without_what_it_needs(run: Run) -> None:
-    with pytest.raises(BadInput, match=r"count needs list, which this run does not have\. Make it first: run the stages until count of "):
+    with pytest.raises(BadInput, match="run the stages until count of "):
         run_stages(run, STAGES, only="count")
     run_stages(run, STAGES)
-    (run.folder("count") / "count.txt").write_text("altered")
-    with pytest.raises(CorruptArtifact, match=r"double needs count, which is corrupt: count\.txt altered") as caught:
-        run_stages(run, STAGES, only="double", force=True)
-    assert caught.value.files == ("count/count.txt",)
-    (run.folder("count") / "manifest.json").write_text("{")
-    with pytest.raises(CorruptArtifact, match="double needs count, which is corrupt"):
-        run_stages(run, STAGES, only="double", force=True)
+    for name in ("count.txt", "manifest.json"):
+        (run.folder("count") / name).write_text("{")
+        with pytest.raises(CorruptArtifact) as caught:
+            run_stages(run, STAGES, only="double", force=True)
+        assert f"count/{name}" in caught.value.files
 
 
 def test_a_dry_run_says_what_would_be_done_and_does_nothing(run: Run, tmp_path: Path) -> None:
@@ -146,35 +129,19 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(run: Run, tmp_path: 
     assert not (tmp_path / "new").exists()
 
 
-def test_an_altered_output_is_made_anew(run: Run) -> None:
-    run_stages(run, STAGES)
-    (run.folder("count") / "count.txt").write_text("altered")
-    outcomes = run_stages(run, STAGES)
-    assert actions(outcomes) == {"list": "skipped", "count": "ran", "double": "skipped", "report": "skipped"}
-    assert outcomes[1].reason == "output altered on disk: count.txt altered"
-    assert outcomes[2].action == "skipped"
-
-
-def test_a_vanished_source(run: Run) -> None:
+def test_a_vanished_source(run: Run, tmp_path: Path) -> None:
     run_stages(run, STAGES)
     assert run.source is not None
     shutil.rmtree(run.source)
     events = Events()
     set_one(run, "count", steps=9)
     assert actions(run_stages(run, STAGES, report=events))["report"] == "ran"
-    assert "is not there" in events.text()
+    assert str(run.source) in events.text()
     set_one(run, "list", upper=True)
-    with pytest.raises(BadInput, match=r"list has to run \(settings changed: upper false -> true\), but .* is not there"):
-        run_stages(run, STAGES)
+    for each in (run, Run.create(tmp_path / "new", tmp_path / "none"), Run.create(tmp_path / "other")):
+        with pytest.raises(BadInput):
+            run_stages(each, STAGES)
     assert contents(run.folder("list"))
-
-
-def test_no_source_at_all(tmp_path: Path) -> None:
-    run = Run.create(tmp_path / "run", tmp_path / "none")
-    with pytest.raises(BadInput, match="none is not there, or empty"):
-        run_stages(run, STAGES)
-    with pytest.raises(BadInput, match="the run names no source"):
-        run_stages(Run.create(tmp_path / "other"), STAGES)
 
 
 def test_a_stage_sees_the_source_only_if_it_reads_it(run: Run) -> None:
@@ -203,35 +170,32 @@ def test_a_stage_that_raises(run: Run) -> None:
     assert actions(run_stages(run, STAGES))["count"] == "ran"
 
 
+def _wrapped(error: BaseException) -> RuntimeError:
+    """As a library hands it on."""
+    try:
+        raise RuntimeError("could not save") from error
+    except RuntimeError as found:
+        return found
+
+
 @pytest.mark.parametrize(
-    ("error", "kind", "message"),
+    ("error", "kind"),
     [
-        (BadInput("photos: none"), BadInput, "^photos: none$"),
-        (MemoryError(), StageFailed, "count: out of memory"),
-        (KeyError("x"), StageFailed, "count: KeyError: 'x'"),
-        (RuntimeError(), StageFailed, "count: RuntimeError$"),
-        (OSError(errno.ENOSPC, "No space left on device"), DiskFull, r"count: no space .* left in .*run \(\d+\.\d MiB free\)"),
-        (OSError(errno.EDQUOT, "Disk quota exceeded"), DiskFull, "no space"),
-        (RuntimeError("database or disk is full"), DiskFull, "no space"),
-        (FileNotFoundError(errno.ENOENT, "No such file", "x.bin"), StageFailed, "FileNotFoundError"),
+        (BadInput("photos: none"), BadInput),
+        (MemoryError(), StageFailed),
+        (RuntimeError(), StageFailed),
+        (FileNotFoundError(errno.ENOENT, "No such file", "x.bin"), StageFailed),
+        (OSError(errno.ENOSPC, "No space left on device"), DiskFull),
+        (_wrapped(OSError(errno.EDQUOT, "Disk quota exceeded", "field.bin")), DiskFull),
+        (RuntimeError("database or disk is full"), DiskFull),
     ],
 )
-def test_what_the_user_sees_of_an_error(run: Run, error: Exception, kind: type[Exception], message: str) -> None:
-    with pytest.raises(kind, match=message) as caught:
+def test_what_the_user_sees_of_an_error(run: Run, error: Exception, kind: type[Exception]) -> None:
+    with pytest.raises(kind) as caught:
         run_stages(run, replaced("count", run=raising(error)))
     assert type(caught.value) is kind
     assert "\n" not in str(caught.value)
-
-
-def test_a_full_disk_that_a_library_wrapped(run: Run) -> None:
-    def wrapped(job: Job) -> None:
-        try:
-            raise OSError(errno.ENOSPC, "No space left on device", str(job.out / "field.bin"))
-        except OSError as error:
-            raise RuntimeError("could not save") from error
-
-    with pytest.raises(DiskFull, match="out "):
-        run_stages(run, replaced("count", run=wrapped))
+    assert kind is not StageFailed or str(caught.value).startswith("count: ")
 
 
 def test_a_disk_that_fills_up_while_publishing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,16 +252,6 @@ def test_a_failed_stage_keeps_its_checkpoint_and_goes_on(run: Run) -> None:
     assert os.listdir(run.path / artifact.WORK) == []
 
 
-def test_changed_settings_start_anew(run: Run) -> None:
-    with pytest.raises(Interrupted):
-        run_stages(run, replaced("count", run=_count_until(3)))
-    set_one(run, "count", rate=2.0)
-    events = Events()
-    run_stages(run, STAGES, report=events)
-    assert not events.named("stage_started")[0]["resumed"]
-    assert b"0.5" not in contents(run.folder("count"))["count.txt"]
-
-
 def _count_until(step: int) -> object:
     def count(job: Job) -> None:
         job._stop = lambda: 2 if (job.work / "state.txt").read_text().count("\n") >= step - 1 else None
@@ -308,29 +262,27 @@ def _count_until(step: int) -> object:
 
 def test_interrupted_and_resumed_gives_the_same_bytes(run: Run, tmp_path: Path) -> None:
     events = Events()
-    with pytest.raises(Interrupted, match="Go on with: run the stages of ") as caught:
+    with pytest.raises(Interrupted) as caught:
         run_stages(run, replaced("count", run=_count_until(3)), report=events)
     assert caught.value.exit_code == 130
     assert events.named("interrupted")[0]["resume"] == run.how_to_resume()
     assert decide(COUNT, run).reason == "incomplete: cut short; it goes on where it stopped"
+    shutil.copytree(run.path, tmp_path / "changed")
     resumed = run_stages(run, STAGES)
     undisturbed = run_stages(make_run(tmp_path / "other"), STAGES)
     assert [outcome.digest for outcome in resumed] == [outcome.digest for outcome in undisturbed]
+    changed, events = Run.open(tmp_path / "changed"), Events()
+    set_one(changed, "count", rate=2.0)  # a checkpoint of other settings is of no use
+    run_stages(changed, STAGES, report=events)
+    assert not events.named("stage_started")[0]["resumed"]
+    assert b"0.5" not in contents(changed.folder("count"))["count.txt"]
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), Interrupted(15)])
-def test_an_interruption_that_a_library_wrapped(run: Run, error: BaseException) -> None:
-    def wrapped(job: Job) -> None:
-        try:
-            raise error
-        except BaseException as caught:
-            raise RuntimeError("callback failed") from caught
-
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (Interrupted(15), 143)])
+def test_an_interruption_that_a_library_wrapped(run: Run, error: BaseException, code: int) -> None:
     with pytest.raises(Interrupted) as caught:
-        run_stages(run, replaced("count", run=wrapped))
-    assert caught.value.exit_code == (143 if isinstance(error, Interrupted) else 130)
-    with pytest.raises(Interrupted, match="run the stage count of "):
-        run_stages(run, replaced("count", run=raising(error)), only="count")
+        run_stages(run, replaced("count", run=raising(_wrapped(error))))
+    assert caught.value.exit_code == code
 
 
 def test_an_interrupted_forced_run_goes_on_when_forced_again(run: Run) -> None:
@@ -393,8 +345,9 @@ def test_another_executor(run: Run) -> None:
 
 
 def test_verify_reads_everything_and_lists_what_is_damaged(run: Run) -> None:
+    assert verify(run, STAGES) == []
     run_stages(run, STAGES)
-    assert actions(verify(run, STAGES)) == {"list": "verified", "count": "verified", "double": "verified", "report": "verified"}
+    assert set(actions(verify(run, STAGES)).values()) == {"verified"}
     run_stages(run, STAGES)  # all files are now known by size, time and inode
     path = run.folder("double") / "double.txt"
     status = path.stat()
@@ -405,27 +358,13 @@ def test_verify_reads_everything_and_lists_what_is_damaged(run: Run) -> None:
     (run.folder("report") / "extra.txt").write_text("")
     (run.folder("count") / "manifest.json").write_text("")
     events = Events()
-    with pytest.raises(CorruptArtifact) as caught:
+    with pytest.raises(CorruptArtifact, match=run.how_to_resume()) as caught:
         verify(run, STAGES, events)
     assert caught.value.files == ("list/images/0.jpg", "count/manifest.json", "double/double.txt")
-    assert caught.value.exit_code == 4
-    assert "report: extra.txt not written by it" in events.text()
-    assert run.how_to_resume() in str(caught.value)
+    assert ["extra.txt"] in [event.get("extra") for event in events.named("warning")]
     assert actions(run_stages(run, STAGES))["count"] == "ran"
     run_stages(run, STAGES, only="double", force=True)
     verify(run, STAGES)
-
-
-def test_a_file_too_many_is_a_warning(run: Run) -> None:
-    run_stages(run, STAGES)
-    (run.folder("report") / "extra.txt").write_text("")
-    events = Events()
-    verify(run, STAGES, events)
-    assert [event["extra"] for event in events.named("warning")] == [["extra.txt"]]
-
-
-def test_verify_of_what_is_not_there_yet(run: Run) -> None:
-    assert verify(run, STAGES) == []
 
 
 def test_settings_that_cannot_work_are_refused_before_the_first_stage_runs(run: Run) -> None:
@@ -435,10 +374,13 @@ def test_settings_that_cannot_work_are_refused_before_the_first_stage_runs(run: 
         asked.append(dict(settings))
         raise UsageError("double cannot work with count")
 
-    stages = replaced("double", check=refuse)
-    for dry in (False, True):
+    def refused(**selection: Any) -> None:
         with pytest.raises(UsageError, match="double cannot work"):
-            run_stages(run, stages, dry_run=dry)
+            run_stages(run, stages, **selection)
+
+    stages = replaced("double", check=refuse)
+    refused()
+    refused(dry_run=True)
     assert not run.folder("list").exists()
     assert set(asked[0]) == {stage.name for stage in stages}
     assert type(asked[0]["count"]) is COUNT.settings
@@ -447,8 +389,6 @@ def test_settings_that_cannot_work_are_refused_before_the_first_stage_runs(run: 
     run_stages(run, STAGES)
     assert set(actions(run_stages(run, stages)).values()) == {"skipped"}
     set_one(run, "count", steps=9)
-    with pytest.raises(UsageError, match="double cannot work"):
-        run_stages(run, stages)
-    with pytest.raises(UsageError, match="double cannot work"):
-        run_stages(run, stages, only="double", force=True)
+    refused()
+    refused(only="double", force=True)
     assert set(asked[-1]) == {"double"}

@@ -46,48 +46,37 @@ def test_the_same_request_is_the_same_artifact(donor: Run, other: Run) -> None:
     assert not (other.path / WORK / "list").exists()
 
 
-def test_what_has_another_request_is_not_taken(donor: Run, other: Run) -> None:
+def test_what_has_another_request_is_not_taken(donor: Run, other: Run, tmp_path: Path) -> None:
     assert not take_over(other, DOUBLE, donor.path), "nobody knows its request before count is there"
     assert take_over(other, LIST, donor.path)
     assert not take_over(other, COUNT, donor.path)
     assert not take_over(other, LIST, donor.path), "it is fresh"
     assert not other.folder("count").exists()
-
-
-def test_no_stage_of_other_photographs_is_taken(donor: Run, tmp_path: Path) -> None:
     source = make_source(tmp_path / "more")
     (source / "0.jpg").write_bytes(b"another")
-    run = Run.create(tmp_path / "run", source, donor.settings)
-    assert not take_over(run, LIST, donor.path)
+    assert not take_over(Run.create(tmp_path / "run", source, donor.settings), LIST, donor.path)
 
 
 @pytest.mark.parametrize("damage", [lambda path: path.write_bytes(b"y"), lambda path: path.write_bytes(b"longer"), Path.unlink])
-def test_a_damaged_artifact_is_not_taken(donor: Run, other: Run, damage: Callable[[Path], object]) -> None:
+def test_a_damaged_artifact_is_not_taken(donor: Run, other: Run, damage: Callable[[Path], object], tmp_path: Path) -> None:
     damage(donor.folder("list") / "images" / "0.jpg")
     assert not take_over(other, LIST, donor.path)
+    (donor.folder("list") / "manifest.json").write_text("{}")
+    assert not take_over(other, LIST, donor.path)
+    assert not take_over(other, LIST, tmp_path / "nowhere")
     assert not other.folder("list").exists()
     assert actions(run_stages(other, STAGES))["list"] == "ran"
     verify(other, STAGES)
 
 
-def test_without_a_manifest_that_can_be_read_nothing_is_taken(donor: Run, other: Run, tmp_path: Path) -> None:
-    (donor.folder("list") / "manifest.json").write_text("{}")
-    assert not take_over(other, LIST, donor.path)
-    assert not take_over(other, LIST, tmp_path / "nowhere")
-
-
 def test_a_donor_that_leads_elsewhere_is_refused(donor: Run, other: Run, tmp_path: Path) -> None:
-    path = donor.folder("list") / "images" / "0.jpg"
-    (tmp_path / "secret").write_bytes(b"x")
-    path.unlink()
-    path.symlink_to(tmp_path / "secret")
-    with pytest.raises(CorruptArtifact, match="is a link"):
-        take_over(other, LIST, donor.path)
-
-
-def test_a_run_that_is_being_written_takes_nothing(donor: Run, other: Run) -> None:
-    with lock(other.path), pytest.raises(RunLocked):
+    with lock(other.path), pytest.raises(RunLocked):  # so is a run that is being written
         take_over(Run.open(other.path), LIST, donor.path)
+    path = donor.folder("list") / "images" / "0.jpg"
+    path.rename(tmp_path / "secret")
+    path.symlink_to(tmp_path / "secret")
+    with pytest.raises(CorruptArtifact):
+        take_over(other, LIST, donor.path)
 
 
 def test_where_there_are_no_hard_links_files_are_copied(donor: Run, other: Run, monkeypatch: pytest.MonkeyPatch) -> None:

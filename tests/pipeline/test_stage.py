@@ -27,70 +27,57 @@ class Settings:
 
 
 def test_values_as_json_gives_them_become_the_settings_own_types() -> None:
-    made = settings_from(Settings, {"rate": 2, "colour": [1, 0.5, 0], "sizes": [3], "mode": "b", "limit": 3})
-    assert made == Settings(rate=2.0, colour=(1.0, 0.5, 0.0), sizes=(3,), mode="b", limit=3)
-    assert type(made.rate) is float
-    assert type(made.limit) is int
-
-
-@pytest.mark.parametrize("table", ["auto", 8, 24])
-def test_a_word_is_admitted_beside_the_limits_of_a_number(table: int | str) -> None:
-    assert settings_from(Settings, {"table": table}).table == table
-
-
-def test_plain_values_and_back() -> None:
-    made = Settings(colour=(1.0, 0.0, 0.0))
-    assert settings_dict(made)["colour"] == [1.0, 0.0, 0.0]
+    made = settings_from(Settings, {"rate": 2, "colour": [1, 0.5, 0], "sizes": [3], "mode": "b", "limit": 3, "table": 8})
+    assert made == Settings(rate=2.0, colour=(1.0, 0.5, 0.0), sizes=(3,), mode="b", limit=3, table=8)
+    assert (type(made.rate), type(made.limit)) == (float, int)
+    assert settings_dict(made)["colour"] == [1.0, 0.5, 0.0]
     assert settings_from(Settings, settings_dict(made)) == made
+    assert settings_from(Settings, {"table": "auto"}).table == "auto"
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    ("name", "value", "remedy"),
     [
-        ({"iterations": 2.0}, "train.iterations: found 2.0 (float), expected a whole number, at least 1, at most 1000."),
-        ({"iterations": True}, "train.iterations: found True (bool), expected a whole number"),
-        ({"iterations": "5"}, "found '5' (str)"),
-        ({"iterations": 0}, "at least 1"),
-        ({"iterations": 10**400}, "at most 1000"),
-        ({"iterations": 1001}, "at most 1000"),
-        ({"rate": float("nan")}, "expected a finite number"),
-        ({"rate": float("inf")}, "expected a finite number"),
-        ({"rate": True}, "expected a number"),
-        ({"strict": 1}, "expected true or false"),
-        ({"up": "Z"}, "expected one of auto, x, y, z"),
-        ({"up": "aut"}, "Did you mean auto?"),
-        ({"colour": [1, 2]}, "expected a list of 3"),
-        ({"colour": "red"}, "or none"),
-        ({"sizes": [1, -1]}, "each a whole number, at least 0"),
-        ({"sizes": 3}, "expected a list"),
-        ({"table": 7}, "train.table: found 7 (int), expected a whole number, at least 8, at most 24, or auto."),
-        ({"table": 0}, "or auto"),
-        ({"table": "off"}, "or auto"),
-        ({"budget": 0}, "train.budget: found 0 (int), expected a number, more than 0, or off."),
-        ({"mode": "c"}, "one of a, b"),
-        ({"strict": None}, "found none"),
+        ("iterations", 2.0, "whole number"),
+        ("iterations", True, "at least 1"),
+        ("iterations", 0, "at least 1"),
+        ("iterations", 1001, "at most 1000"),
+        ("iterations", 10**400, "at most 1000"),
+        ("rate", float("nan"), "finite"),
+        ("strict", 1, "true or false"),
+        ("strict", None, "true or false"),
+        ("up", "Z", "auto, x, y, z"),
+        ("up", "aut", "Did you mean auto?"),
+        ("colour", [1, 2], "3"),
+        ("colour", "red", "none"),
+        ("sizes", [1, -1], "at least 0"),
+        ("sizes", 3, "list"),
+        ("table", 7, "at least 8, at most 24, or auto"),
+        ("table", "off", "or auto"),
+        ("budget", 0, "more than 0, or off"),
     ],
 )
-def test_a_wrong_value_is_refused_and_named(values: dict[str, object], message: str) -> None:
+def test_a_wrong_value_is_refused_and_named(name: str, value: object, remedy: str) -> None:
     with pytest.raises(UsageError) as caught:
-        settings_from(Settings, values, where="train")
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert caught.value.exit_code == 2
+        settings_from(Settings, {name: value}, where="train")
+    text = str(caught.value)
+    assert text.startswith(f"train.{name}: ")
+    assert remedy in text
+    assert "\n" not in text
 
 
 def test_an_unknown_setting_names_the_nearest() -> None:
-    with pytest.raises(UnknownSetting, match=r"train\.iteration: no such setting\. Did you mean train\.iterations\?"):
+    with pytest.raises(UnknownSetting, match=r"train\.iterations\?"):
         settings_from(Settings, {"iteration": 5}, where="train")
-    with pytest.raises(UnknownSetting, match="There are: iterations, rate"):
+    with pytest.raises(UnknownSetting, match="iterations, rate"):
         settings_from(Settings, {"qqq": 5})
-    with pytest.raises(UsageError, match="expected a table"):
+    with pytest.raises(UsageError, match="train"):
         settings_from(Settings, [1], where="train")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", ".work", "A", "1st", "old-train"])
 def test_a_stage_name_is_a_folder_name(name: str) -> None:
-    with pytest.raises(ValueError, match="stage name"):
+    with pytest.raises(ValueError, match="name"):
         Stage(name, 1, NoSettings, (), lambda job: None)
 
 
@@ -100,9 +87,7 @@ def test_a_job_made_by_hand(tmp_path: Path) -> None:
     job.warn("careful", file="a")
     job.progress(1, 2)
     job.safe_point()
-    assert job.out.is_dir()
-    assert job.work.is_dir()
-    assert job.device == "cpu"
+    assert (job.out.is_dir(), job.work.is_dir(), job.device) == (True, True, "cpu")
 
 
 def test_progress_is_thinned_but_the_first_and_the_last_arrive(tmp_path: Path) -> None:
@@ -117,15 +102,11 @@ def test_progress_is_thinned_but_the_first_and_the_last_arrive(tmp_path: Path) -
 
 
 def test_a_safe_point_raises_once_a_signal_has_arrived(tmp_path: Path) -> None:
-    job = Job(settings=None, out=tmp_path / "o", work=tmp_path / "w", stop=lambda: 15)
+    events = Events()
+    job = Job(settings=None, out=tmp_path / "o", work=tmp_path / "w", report=events, stop=lambda: 15)
     with pytest.raises(Interrupted) as caught:
         job.safe_point()
     assert caught.value.exit_code == 143
-
-
-def test_what_is_reached_is_said_before_a_stop(tmp_path: Path) -> None:
-    events = Events()
-    job = Job(settings=None, out=tmp_path / "o", work=tmp_path / "w", report=events, stop=lambda: 2)
     with pytest.raises(Interrupted):
         job.reached(3, 4, "walking")
     assert [(event["done"], event["text"]) for event in events] == [(3, "walking")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -126,3 +126,8 @@ def raising(error: BaseException) -> Callable[[Job], None]:
         raise error
 
     return run
+
+
+def replaced(name: str, **changes: Any) -> list[Stage]:
+    """The stages, one of them with other fields."""
+    return [replace(stage, **changes) if stage.name == name else stage for stage in STAGES]

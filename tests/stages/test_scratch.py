@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import msgspec
 import pytest
 
-from stages.scratch import digest_of, note, noted, once, opened
+from stages.scratch import note, noted, opened
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,6 @@ def left(folder: Path) -> Path:
 def read(path: Path) -> tuple[Thing | None, list[str]]:
     said: list[str] = []
     return noted(path, Thing, said.append), said
-
-
-def test_what_was_noted_is_known_again(tmp_path: Path) -> None:
-    assert read(left(tmp_path)) == (Thing("\udcff", 3), [])
-    assert read(tmp_path / "other.json") == (None, [])
 
 
 def test_a_note_cut_or_zeroed_anywhere_does_not_count(tmp_path: Path) -> None:
@@ -94,25 +89,3 @@ def test_odd_values_with_the_right_checksum(tmp_path: Path, value: Any) -> None:
     assert found is None
     assert len(said) == 1
     assert len(said[0]) < 400
-
-
-def test_files_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:
-    (tmp_path / "work").mkdir()
-    (tmp_path / "secret").write_bytes(b"x")
-    note(tmp_path / "thing.json", {"name": "a", "size": 1}, [tmp_path / "secret"])
-    text = (tmp_path / "thing.json").read_text()
-    (tmp_path / "work" / "thing.json").write_text(text.replace("secret", "../secret"))
-    assert read(tmp_path / "work" / "thing.json")[0] is None
-    assert digest_of(tmp_path / "secret")
-
-
-def test_what_a_check_raises_is_told_of(tmp_path: Path) -> None:
-    note(tmp_path / "thing.json", {"name": "a", "size": 1})
-    said: list[str] = []
-
-    def check(value: Thing, outputs: Any) -> None:
-        raise struct_error
-
-    struct_error = ArithmeticError("of another\nphotograph")
-    assert noted(tmp_path / "thing.json", Thing, once(said.append), check) is None
-    assert said == ["thing.json of an earlier attempt can't be used (of another\\nphotograph); what it stands for is made again"]

@@ -10,8 +10,8 @@ import pytest
 from tests.workflows.command import Result
 from tests.workflows.fleet_child import CHILD, PRESETS
 from tests.workflows.toys import TOYS
-from workflows.asset import Workflow
 from workflows.cli.main import main
+from workflows.workflow import Workflow
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pipeline.executors.serving import serve
 from tests.workflows.toys import TOYS
-from workflows.asset import Workflow
 from workflows.fleet.program import WorkflowProgram
+from workflows.workflow import Workflow
 
 CHILD = "tests.workflows.fleet_child"
 PRESETS = "ENERF_TOY_PRESETS"

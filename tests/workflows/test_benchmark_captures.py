@@ -7,12 +7,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks import captures as benchmark
-from stages.figures.plots import contact_sheet
 from tests.stages import captures
 
 TINY = ["--preset", "tiny", "--iterations", "8", "--set", "bake.refine_steps=1", "--set", "evaluate.captured_path_frames=2", "--set", "turntable.frames=1"]
@@ -37,13 +34,10 @@ def test_a_row_is_what_the_run_says(made: Path) -> None:
     metrics = json.loads((run / "evaluate/metrics.json").read_text())
     assert (row["error"], row["missing"], row["preset"], row["iterations"]) == (None, [], "tiny", 8)
     assert [row[kind]["psnr"] for kind in ("network", "asset", "mesh")] == [metrics[kind]["psnr"] for kind in ("network", "asset", "mesh")]
-    assert (row["holes"], row["floaters"]) == (metrics["holes"], metrics["floaters"])
     assert set(row["seconds"]) == set(row["peak_mib"]) == set(benchmark.STAGES)
     assert row["asset_bytes"] == (run / "bake/asset.nerftree").stat().st_size
     for grade, stage in ((row["cameras"]["grade"], "poses"), (row["result"]["grade"], "evaluate")):
         assert grade == json.loads((run / stage / "verdict.json").read_text())["grade"]
-    assert row["result"]["grade"] in ("poor", "failed"), "after eight steps"
-    assert all((run / problem["picture"]).is_file() for problem in json.loads((run / "evaluate/verdict.json").read_text())["problems"])
     assert benchmark.percent_off(run, made / "source/transforms.json") == pytest.approx(0, abs=0.01)
     assert (made / "out" / row["picture"]).stat().st_size <= benchmark.MOST_BYTES
 
@@ -54,11 +48,9 @@ def test_a_source_that_fails_has_a_row_and_the_others_stay(made: Path, tmp_path:
     assert benchmark.main([str(tmp_path / "empty"), "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), *TINY]) == 1
     rows = rows_of(tmp_path / "out")
     assert rows["source"] == rows_of(made / "out")["source"]
-    assert rows["empty"]["error"].startswith("exit code 2")
-    assert rows["empty"]["asset"]["psnr"] is None
+    assert (rows["empty"]["error"].startswith("exit code 2"), rows["empty"]["asset"]["psnr"]) == (True, None)
     lines = [line for line in (tmp_path / "out/captures.md").read_text().splitlines() if line.startswith("|")]
-    assert len(lines) == 4
-    assert {line.count("|") for line in lines} == {len(benchmark.COLUMNS) + 1}
+    assert [line.count("|") for line in lines] == [len(benchmark.COLUMNS) + 1] * 4
 
 
 def test_what_is_measured_before_is_not_run_again(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,60 +63,3 @@ def test_what_is_measured_before_is_not_run_again(made: Path, monkeypatch: pytes
     assert benchmark.main([*where, "--out", str(made / "again"), *TINY, "--set", "turntable.frames=2"]) == 0
     assert [options[-1] for options in ran] == ["turntable.frames=2"]
     assert rows_of(made / "again")["source"]["options"] != rows_of(made / "out")["source"]["options"]
-
-
-def test_a_run_goes_on_from_its_poses_without_the_photographs(made: Path, tmp_path: Path) -> None:
-    shutil.copytree(made / "runs/source", tmp_path / "source")
-    settings = json.loads((tmp_path / "source/run.json").read_text())
-    assert str(made / "source") in json.dumps(settings)
-    (made / "source").rename(made / "elsewhere")
-    try:
-        assert benchmark.run_capture(made / "source", tmp_path / "source", ["--set", "turntable.frames=2"]) is None
-    finally:
-        (made / "elsewhere").rename(made / "source")
-    assert len(list((tmp_path / "source/turntable").glob("frame_*.png"))) == 2
-
-
-def test_existing_runs_are_tabulated_and_compared(made: Path, tmp_path: Path) -> None:
-    shutil.copytree(made / "runs", tmp_path / "runs")
-    run, before = tmp_path / "runs/source", tmp_path / "before.json"
-    (run / "evaluate/verdict.json").write_text(json.dumps({"grade": "poor", "summary": "Fog.", "problems": [{"what": "fog"}]}))
-    report = json.loads((run / "train/report.json").read_text())
-    report |= {"priors": {"near_planes": {"applied": False}, "min_views": {"applied": True}}, "chosen": "exposure"}
-    (run / "train/report.json").write_text(json.dumps(report))
-    rows = rows_of(made / "out")
-    arguments = [str(made / "source"), "--from", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), "--before", str(before)]
-    for gain, code in ((0.05, 0), (0.2, 1)):
-        worse = json.loads(json.dumps(rows))
-        worse["source"]["asset"]["psnr"] += gain
-        before.write_text(json.dumps({"rows": worse}))
-        assert benchmark.main(arguments) == code
-    row = rows_of(tmp_path / "out")["source"]
-    assert row["asset"] == rows["source"]["asset"]
-    assert row["result"] == {"grade": "poor", "summary": "Fog.", "problems": ["fog"]}
-    assert (row["refuted_priors"], row["second_chance"]) == (["near_planes"], "exposure")
-    assert "poor (fog)" in (tmp_path / "out/captures.md").read_text()
-
-
-def test_a_picture_is_photograph_asset_and_mesh_of_the_median_view(tmp_path: Path) -> None:
-    colours = [(200, 0, 0), (0, 0, 0), (0, 200, 0), (0, 0, 200)]  # photograph, network, asset, mesh
-    (tmp_path / "evaluate").mkdir()
-    for name, shift in (("median", 0), ("worst", 40)):
-        panels = [np.full((450, 600, 3), np.add(colour, shift), np.uint8) for colour in colours]
-        contact_sheet([panels], [["label"] * 4], tmp_path / f"evaluate/strip_{name}.png", thumbnail=600)
-    assert benchmark.write_picture(tmp_path, tmp_path / "out/picture.webp")
-    with Image.open(tmp_path / "out/picture.webp") as picture:
-        assert picture.height == 225
-        found = [picture.convert("RGB").getpixel((x, 112)) for x in (150, 454, 758)]
-    np.testing.assert_allclose(found, [colours[0], colours[2], colours[3]], atol=6)
-    assert not benchmark.write_picture(tmp_path / "out", tmp_path / "out/none.webp")
-
-
-def test_sets_are_found_by_name(tmp_path: Path) -> None:
-    found = benchmark.sources_of(["fern", "snowmiku"], [tmp_path / "mine", tmp_path / "cup/images"], tmp_path)
-    assert found == {
-        "fern": tmp_path / "fern_4/images_4", "snowmiku": tmp_path / "snowmiku/photos", "mine": tmp_path / "mine", "cup": tmp_path / "cup/images",
-    }  # fmt: skip
-    assert list(benchmark.sources_of([], [], tmp_path)) == list(benchmark.SETS)
-    with pytest.raises(SystemExit, match="nothing: no such set"):
-        benchmark.sources_of(["nothing"], [], tmp_path)

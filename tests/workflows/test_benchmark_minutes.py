@@ -26,69 +26,42 @@ def test_a_row_takes_the_place_of_its_own_kind_alone() -> None:
     rows: list[dict[str, Any]] = []
     for each in (row(budget=5), row(), row(method="nerfacto"), row(options="--seed 1"), row("bench")):
         rows = minutes.with_row(rows, each)
-    assert [(r["set"], r["method"], r["options"], r["minutes"]) for r in rows] == [
-        ("bench", minutes.OURS, "", 1), ("chair", minutes.OURS, "", 1), ("chair", minutes.OURS, "", 5), ("chair", minutes.OURS, "--seed 1", 1),
-        ("chair", "nerfacto", "", 1),
-    ]  # fmt: skip
+    assert [(r["set"], r["options"], r["minutes"]) for r in rows] == [
+        ("bench", "", 1),
+        ("chair", "", 1),
+        ("chair", "", 5),
+        ("chair", "--seed 1", 1),
+        ("chair", "", 1),
+    ]
     again = minutes.with_row(rows, row(budget=5, psnr=40.0))
     assert [r["psnr"] for r in again] == [33.456, 33.456, 40.0, 33.456, 33.456]
-    assert len(rows) == 5
-
-
-def test_every_source_counts_as_a_version_and_nothing_else(tmp_path: Path) -> None:
-    for package in minutes.PACKAGES:
-        (tmp_path / package / "__pycache__").mkdir(parents=True)
-        (tmp_path / package / "a.py").write_text("1")
-    seen = {minutes.code_version(tmp_path)}
-    (tmp_path / "stages/__pycache__/a.py").write_text("1")
-    (tmp_path / "stages/notes.md").write_text("1")
-    assert minutes.code_version(tmp_path) in seen
-    for change in (
-        lambda: (tmp_path / "stages/a.py").write_text("2"),
-        lambda: (tmp_path / "workflows/b.toml").touch(),
-        lambda: (tmp_path / "stages/a.py").rename(tmp_path / "stages/b.py"),
-    ):
-        change()
-        assert minutes.code_version(tmp_path) not in seen
-        seen.add(minutes.code_version(tmp_path))
+    with pytest.raises(ValueError, match="once"):
+        minutes.put_between_marks(f"{minutes.END} {minutes.BEGIN}", "table")
 
 
 def test_the_table_says_what_differs_between_rows() -> None:
     rows = [row(), row(budget=5, code="two"), row(method="nerfacto", ssim=None, peak_mib=None, stride=8, load=(2.0, 1, 1))]
     lines = minutes.in_markdown(rows).splitlines()
     assert {line.count("|") for line in lines[:5]} == {len(minutes.COLUMNS) + 1}
-    assert lines[2] == "| chair | efficientnerf | 1 | 33.46 | 0.9877 | 12.3 | 1,234 | 61 | 200 views |"
-    assert lines[4] == "| chair | nerfacto | 1 | 33.46 |  | 12.3 |  | 61 | 200 views, every 8th in x and y |"
-    assert lines[6].endswith("2 versions of the code: one, two.")
-    assert lines[8] == "Other work was running at the beginning of: chair 1."
+    assert [cell.strip() for cell in lines[2].split("|")[1:-2]] == ["chair", "efficientnerf", "1", "33.46", "0.9877", "12.3", "1,234", "61"]
+    assert all(words in "\n".join(lines[5:]) for words in ("one, two", "chair 1"))
     assert len(minutes.in_markdown([row()]).splitlines()) == 3
-    measured = [row(load=(2.0, 1, 1), others=0.02), row(budget=5, others=0.94)]
-    assert minutes.in_markdown(measured).splitlines()[4:] == ["", "So many cores were busy with other work meanwhile: chair 5 (0.9)."]
+    assert "chair 5 (0.9)" in minutes.in_markdown([row(load=(2.0, 1, 1), others=0.02), row(budget=5, others=0.94)])
 
 
 @pytest.mark.skipif(not machine.STAT.exists(), reason="no /proc/stat")
-def test_what_processors_worked_grows_by_what_this_process_works() -> None:
+def test_what_processors_worked_grows_by_what_this_process_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begin, own = busy_seconds(), time.process_time()
-    assert begin is not None
-    while time.process_time() - own < 0.3:
+    while time.process_time() - own < 0.15:
         pass
     end = busy_seconds()
+    assert begin is not None
     assert end is not None
-    assert end - begin > 0.2
-
-
-@pytest.mark.parametrize("text", [None, "", "cpu one two", "cpu 1 2 3"])
-def test_where_the_system_does_not_say_what_processors_worked_there_is_no_figure(text: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if text is not None:
-        (tmp_path / "stat").write_text(text)
+    assert end - begin > 0.1
     monkeypatch.setattr(machine, "STAT", tmp_path / "stat")
-    assert busy_seconds() is None
-
-
-@pytest.mark.parametrize("text", ["", minutes.BEGIN, f"{minutes.END} {minutes.BEGIN}", f"{minutes.BEGIN}{minutes.END}{minutes.BEGIN}{minutes.END}"])
-def test_a_document_without_one_pair_of_marks_is_left_alone(text: str) -> None:
-    with pytest.raises(ValueError, match="once each and in this order"):
-        minutes.put_between_marks(text, "table")
+    for text in ("", "cpu one two", "cpu 1 2 3"):
+        assert busy_seconds() is None
+        (tmp_path / "stat").write_text(text)
 
 
 def test_rows_are_measured_once_for_a_version_of_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,19 +91,12 @@ def test_rows_are_measured_once_for_a_version_of_the_code(tmp_path: Path, monkey
     minutes.write_rows(out / quality_over_minutes.PEERS, [row("a", 1, "nerfacto")])
     quality_over_minutes.main([*call, "--minutes", "1", "--options", "--seed 1"])
     assert asked[5:] == [("a", 1, "--seed 1"), ("b", 1, "--seed 1")]
-    table = minutes.in_markdown(
-        [r for name in "ab" for r in (row(name), row(name, 5), row(name, options="--seed 1"), *([row(name, method="nerfacto")] if name == "a" else []))]
-    )
-    assert readme.read_text() == f"before\n{minutes.BEGIN}\n\n{table}\n{minutes.END}\nafter\n"
-    assert (out / "quality_over_minutes.md").read_text().endswith(table)
+    text = readme.read_text()
+    assert text.startswith(f"before\n{minutes.BEGIN}\n")
+    assert text.endswith(f"{minutes.END}\nafter\n")
+    assert (text.count("| a |"), text.count("| b |"), text.count("nerfacto")) == (4, 3, 1)
     assert (out / "quality_over_minutes.png").stat().st_size > 1000
     code = "two"
     quality_over_minutes.main([*call, "--minutes", "1"])
     assert asked[7:] == [("a", 1, ""), ("b", 1, "")]
     assert [r["minutes"] for r in json.loads((out / "quality_over_minutes.json").read_text())["rows"]] == [1, 5, 1] * 2
-
-
-def test_a_set_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"nothing: no folder .*Made scenes: object, court, window, gloss"):
-        quality_over_minutes.source_of("nothing", tmp_path, tmp_path)
-    assert quality_over_minutes.source_of("still_life", tmp_path, tmp_path)[0].is_dir()

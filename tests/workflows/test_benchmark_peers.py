@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks.minutes import read_rows
 from benchmarks.peers import __main__ as peers
 from benchmarks.scenes.__main__ import write_scene
 from benchmarks.scenes.catalogue import recipes
-from stages.formats.importers import IMPORTERS, detect
-from stages.poses.run import PosesSettings
 
 COUNTS = {"train": 3, "val": 1, "test": 2}
 # Renders the test images on white, of the pixels asked for, each a tenth nearer to grey than it is.
@@ -47,42 +41,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "object"
 
 
-def test_a_made_scene_becomes_a_data_set_as_blenders_with_the_same_cameras(scene: Path, tmp_path: Path) -> None:
-    made = peers.as_blender(scene, tmp_path / "data")
-    assert peers.as_blender(made, tmp_path / "other") == made
-    ours, theirs = (IMPORTERS[detect(folder)].read(folder, PosesSettings()) for folder in (scene, made))
-    here = {photo.camera.name: photo.camera for photo in ours.photos if photo.camera.name in {other.camera.name for other in theirs.photos}}
-    assert len(here) == len(theirs.photos) == COUNTS["train"] + COUNTS["test"]
-    for photo in theirs.photos:
-        camera = here[photo.camera.name]
-        np.testing.assert_allclose(photo.camera.world_from_camera, camera.world_from_camera, atol=1e-9)
-        assert photo.camera.intrinsics["fx"] == pytest.approx(camera.intrinsics["fx"])
-
-
-def test_what_cannot_be_made_white_is_refused(tmp_path: Path) -> None:
-    write_scene(recipes()["court"], tmp_path / "court", {"train": 1, "val": 0, "test": 1}, 16, supersample=1)
-    with pytest.raises(SystemExit, match="no alpha"):
-        peers.as_blender(tmp_path / "court", tmp_path / "data")
-
-
 @pytest.mark.parametrize("stride", [1, 3])
 def test_a_peer_that_is_a_tenth_off_has_twenty_decibels(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stride: int) -> None:
     (tmp_path / "peer.py").write_text(PEER)
     monkeypatch.setattr(peers, "SCRIPTS", {"nerfacto": tmp_path / "peer.py"})
-    call = [
-        "nerfacto",
-        "--python",
-        sys.executable,
-        "--work",
-        str(tmp_path / "work"),
-        "--sets",
-        "object",
-        "--scenes",
-        str(scene.parent),
-        "--stride",
-        str(stride),
-    ]
-    call += ["--stride", str(stride), "--minutes", "1", "--variants", "default,small", "--threads", "1", "--out", str(tmp_path / "out")]
+    options = {"python": sys.executable, "work": tmp_path / "work", "sets": "object", "scenes": scene.parent, "stride": stride, "minutes": 1}
+    options |= {"variants": "default,small", "threads": 1, "out": tmp_path / "out"}
+    call = ["nerfacto", *(text for name, value in options.items() for text in (f"--{name}", str(value)))]
     peers.main(call)
     rows = read_rows(tmp_path / "out/peers.json")
     assert [row["options"] for row in rows] == ["", "small"]
@@ -90,26 +55,9 @@ def test_a_peer_that_is_a_tenth_off_has_twenty_decibels(scene: Path, tmp_path: P
         assert row["psnr"] == pytest.approx(20, abs=1e-9)
         assert (row["ssim"] is None) == (stride > 1)
         assert (row["views"], row["stride"], row["megabytes"], row["code"], row["minutes"]) == (2, stride, 2.0, "nerfacto 9", 1.0)
-    assert not [word for word in rows[0]["settings"] if word == "--set"]
-    assert "model.num_nerf_samples_per_ray=24" in rows[1]["settings"]
+    assert ["model.num_nerf_samples_per_ray=24" in row["settings"] for row in rows] == [False, True]
     (tmp_path / "peer.py").write_text("raise SystemExit(3)")
     peers.main(call)  # measured before
-    with pytest.raises(SystemExit, match=r"nerfacto: exit code 3; see .*log\.txt"):
+    with pytest.raises(SystemExit, match="exit code 3"):
         peers.main([*call, "--again"])
     assert read_rows(tmp_path / "out/peers.json") == rows
-
-
-def test_the_truth_is_on_white_in_the_middle_of_each_stride(scene: Path, tmp_path: Path) -> None:
-    folder = peers.as_blender(scene, tmp_path / "data")
-    whole, some = peers.truth_of(folder, 1), peers.truth_of(folder, 4)
-    assert len(whole) == COUNTS["test"]
-    for all_of_it, part in zip(whole, some, strict=True):
-        np.testing.assert_array_equal(part, all_of_it[1::4, 1::4])
-    names = [frame["file_path"] for frame in json.loads((folder / "transforms_test.json").read_text())["frames"]]
-    with Image.open(folder / f"{names[0]}.png") as image:
-        clear = np.asarray(image)[..., 3] == 0
-    assert clear.any()
-    assert (whole[0][clear] == 1).all()
-    assert peers.quality(np.stack(whole), whole, True) == {"psnr": math.inf, "views": 2, "ssim": pytest.approx(1.0)}
-    with pytest.raises(SystemExit, match="1 views were rendered, 2 are there"):
-        peers.quality(np.stack(whole[:1]), whole, True)

@@ -50,7 +50,7 @@ def test_commands_of_the_readme_exist() -> None:
     calls = re.findall(r"^    enerf (\w+)(.*)$", text, flags=re.MULTILINE)
     assert len(calls) > 10
     for name, arguments in calls:
-        command = enerf.commands[name]
+        command = enerf.get_command(click.Context(enerf), name)
         command = command.commands["run"] if isinstance(command, click.Group) else command  # that of `enerf fleet SCENES`
         options = {option for parameter in command.params for option in parameter.opts}
         assert set(re.findall(r"(?<= )--[a-z-]+", arguments.partition("#")[0])) <= options

@@ -18,7 +18,7 @@ from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, SplatsOutputs
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.writing import source_frame
-from stages.splats.run import SplatsSettings
+from stages.splats.settings import SplatsSettings
 from tests.stages.formats.gaussians import read_spz, scattered
 from workflows import exporting_splats
 from workflows.cli.resolve import Settings, table_of
@@ -40,7 +40,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     format.save(tree, BakeOutputs.of_run(path).asset)
     SPLAT_EXPORTERS[".ply"](scattered(), SplatsOutputs.of_run(path).ply, source_frame(METADATA))
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(MADE))))
-    monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: fresh)
+    monkeypatch.setattr("workflows.exporting_splats.decide", lambda stage, run: fresh)
     monkeypatch.setattr(exporting_splats, "_made", lambda export, wanted, progress: pytest.fail(f"made again, with {wanted}"))
     return path
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from pathlib import Path
@@ -63,13 +62,3 @@ def test_a_part_that_fails_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     written = json.loads(out.read_text())
     assert "CUDA" in written["kernels"]["error"]
     assert "exit_code" in written["pipeline"] or "left_out" in written["pipeline"]
-
-
-def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import gpu
-
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in ("pycolmap", "msgspec", "pytest") else object())
-    assert gpu.run(tmp_path, tmp_path / "run", [], 5.0) == {"left_out": "not installed here: msgspec, pycolmap"}
-    (tmp_path / "transforms_train.json").touch()
-    assert gpu.run(tmp_path, tmp_path / "run", [], 5.0) == {"left_out": "not installed here: msgspec"}
-    assert gpu.measured("tests", argparse.Namespace(), 5.0) == {"left_out": "not installed here: pytest"}

@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks import made_captures
 from benchmarks.scenes import captures
-from benchmarks.scenes.captures import MadeCapture
 from efficientnerf.geometry.cameras import project
 from stages.formats import importers
 
@@ -30,7 +29,7 @@ def test_a_mask_over_everything_is_noticed(tmp_path: Path, monkeypatch: pytest.M
     assert made_captures.main(["--work", str(tmp_path), "--kinds", "arc", "--width", "120", "--side", "16", "--out", str(tmp_path / "out")]) == 1
 
 
-@pytest.mark.parametrize("kind", ["gamepad", "strays", "corridor"])
+@pytest.mark.parametrize("kind", ["gamepad", "corridor"])
 def test_points_lie_in_view_of_what_found_them(kind: str) -> None:
     capture = KINDS[kind]
     xyz, error, tracks = captures.sparse_points(capture, WIDTH)
@@ -39,36 +38,10 @@ def test_points_lie_in_view_of_what_found_them(kind: str) -> None:
     usual = np.flatnonzero(error <= 1.0)
     assert 0.9 < len(usual) / len(xyz) < 1  # the others are outliers
     off = []
-    for point in usual[:: max(1, len(usual) // 200)]:
+    for point in usual[:: max(1, len(usual) // 50)]:
         pixels = [project(views[view], xyz[point : point + 1])[0][0] for view in tracks[point]]
         off.append(np.max([np.abs(2 * pixel / (WIDTH, 0.75 * WIDTH) - 1).max() for pixel in pixels]))
     assert np.quantile(off, 0.95) < 1.05
-
-
-def _subject_depths(capture: MadeCapture) -> list[float]:
-    """Of each view the least distance of what it found, over that of the subject; infinite where it found nothing."""
-    xyz, error, tracks = captures.sparse_points(capture, WIDTH)
-    views = captures.cameras(capture, WIDTH)
-    middle = captures.subject_points(capture, views).mean(0)
-    found: list[list[float]] = [[] for _ in views]
-    for point, track in zip(xyz[error <= 1.0], np.array(tracks, object)[error <= 1.0], strict=True):
-        for view in track:
-            found[view].append(float(np.linalg.norm(point - views[view].centre) / np.linalg.norm(middle - views[view].centre)))
-    return [min(each, default=np.inf) for each in found]
-
-
-def test_some_views_find_nothing_near() -> None:
-    nearest = np.array(_subject_depths(KINDS["gamepad"]))
-    assert 0 < (nearest > 1.9).sum() < len(nearest) / 4
-    assert (nearest < 1.0).sum() > len(nearest) / 2
-
-
-def test_a_mirror_shows_points_behind_itself() -> None:
-    xyz, error, _ = captures.sparse_points(KINDS["mirror"], WIDTH)
-    glass = KINDS["mirror"].around[0]
-    behind = (error <= 1.0) & (xyz[:, 1] > 0.5) & (np.abs(xyz[:, 0]) < 0.4) & (xyz[:, 2] > 0.0) & (xyz[:, 2] < 0.6)
-    assert glass.material.mirror > 0.5
-    assert behind.sum() > 10
 
 
 def test_the_same_arguments_give_the_same_files_that_are_read(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from benchmarks.torture.sources import Source
 from benchmarks.torture.trap import Armed, Trap
 from tests.workflows.torment import torment
 from tests.workflows.toys import TOYS
-from workflows.asset import Workflow
+from workflows.workflow import Workflow
 
 ROOT = Path(__file__).resolve().parents[2]
 STAGES = tuple(stage.name for stage in TOYS)

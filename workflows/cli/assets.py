@@ -6,14 +6,23 @@ from pathlib import Path
 
 import click
 
+from efficientnerf.asset.format import describe
+from pipeline.errors import UsageError
 from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option, workflow
+from workflows.cli.output import closing, listing, write_json
+from workflows.cli.progress import size
+from workflows.cli.target import asset_of
+from workflows.destination import check_files, writing
+from workflows.inspection.compare import compare, in_words
+from workflows.inspection.convert import convert as convert_asset
+from workflows.viewing.serving import check_address, open_in_browser, page_of, serve
 
 DIFFERENT = 6  # exit code of `enerf diff`; 1 would be that of a defect
 # efficientnerf.asset.file.serialisation.WRITERS, which a test compares; that import is heavy
 LAYOUTS = ("compact", "packed", "small", "sparse", "full", "full32")
 
 
-@click.command(short_help="Compare two assets: metadata, tensors, renders.")
+@click.command()
 @click.argument("first", metavar="A", type=folder_type)
 @click.argument("second", metavar="B", type=folder_type)
 @click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, on the orbit of A.")
@@ -26,9 +35,6 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 
     Exit code 0 if they are equal, 6 if they differ, 4 if one is damaged.
     """
-    from workflows.cli.output import listing, write_json
-    from workflows.inspection.compare import compare, in_words
-
     found = compare(first, second, views, size)
     code = 0 if found["equal"] else DIFFERENT
     if as_json:
@@ -38,7 +44,7 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
     return code
 
 
-@click.command(short_help="Write an asset in another layout, resolution or degree.")
+@click.command()
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.argument("out", metavar="OUT", type=folder_type)
 @click.option("--layout", type=click.Choice(LAYOUTS), help="Layout of the voxels in OUT; by default that of ASSET.")
@@ -55,14 +61,6 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     16-bit floats; full: all voxels of each brick, 16-bit floats, or 32-bit ones as full32. OUT appears whole or not at all; an existing file is
     replaced with --force only, a file of a run never.
     """
-    from efficientnerf.asset.format import describe
-    from pipeline.errors import UsageError
-    from workflows.cli.output import closing, write_json
-    from workflows.cli.progress import size
-    from workflows.cli.target import asset_of
-    from workflows.destination import check_files, writing
-    from workflows.inspection.convert import convert as convert_asset
-
     if out.suffix.lower() != ".nerftree":
         raise UsageError(f"{out}: the extension {out.suffix!r} is not that of an asset; expected .nerftree. For meshes and points: enerf export")
     check_files([out], force=force, inputs=[asset_of(what)])
@@ -76,7 +74,7 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
         closing(f"{out}: {about['layout']}, {about['voxels']} voxels, degree {about['sh_degree']}, {size(about['bytes'])}")
 
 
-@click.command(short_help="Show a run or an asset in a browser.")
+@click.command()
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.option("--no-browser", is_flag=True, help="Only make the page, and say where it is.")
 @click.option("--serve", "port", metavar="PORT", type=click.IntRange(0, 65535), help="Serve the page on this port until Ctrl-C; 0: one that is free.")
@@ -92,9 +90,6 @@ def view(what: Path, no_browser: bool, port: int | None, address: str | None, fo
     With --serve, the stages, curves and previews of a RUN are shown while it trains, and the viewer once there is an asset. From another machine:
     'ssh -L 8000:localhost:PORT HOST', then http://localhost:8000/. The server reads, and answers for these pages alone.
     """
-    from workflows.cli.output import closing, write_json
-    from workflows.viewing.serving import check_address, open_in_browser, page_of, serve
-
     loopback = check_address(address, port)
     if port is None:
         page, made = page_of(what, force=force)

@@ -47,7 +47,7 @@ def has_cuda() -> bool:
 
 def _torch_sees_one() -> bool:
     """Whether torch itself finds a CUDA device; importing it takes seconds."""
-    import torch
+    import torch  # takes seconds
 
     return torch.cuda.is_available()
 

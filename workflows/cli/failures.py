@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from typing import Any
 
 import click
 
+from pipeline.errors import PipelineError
+from pipeline.failures import is_disk_full, is_of_the_path
 from pipeline.text import printable
+from workflows.cli.output import write_json
 
 INTERNAL = 1  # a defect of this program; the documented codes are those of the errors in pipeline/errors.py
 LONGEST = 4000  # characters of an error; a path may have 4096
@@ -24,8 +28,6 @@ class Reported(Exception):
 
 
 def exit_code(error: BaseException) -> int:
-    from pipeline.errors import PipelineError
-
     if isinstance(error, PipelineError):
         return int(error.exit_code)
     if isinstance(error, click.exceptions.Exit):
@@ -35,8 +37,6 @@ def exit_code(error: BaseException) -> int:
     if isinstance(error, click.ClickException):
         return 2
     if isinstance(error, OSError):
-        from pipeline.failures import is_of_the_path
-
         return 2 if is_of_the_path(error) else 3
     if isinstance(error, MemoryError):
         return 3
@@ -47,8 +47,6 @@ def exit_code(error: BaseException) -> int:
 
 def sentence(error: BaseException) -> str:
     """The error in one or two lines."""
-    from pipeline.errors import PipelineError
-
     if isinstance(error, PipelineError):
         return str(error)
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
@@ -59,8 +57,6 @@ def sentence(error: BaseException) -> str:
         context = getattr(error, "ctx", None)
         return f"{text} Try '{context.command_path} --help'." if context is not None else text
     if isinstance(error, OSError):
-        from pipeline.failures import is_disk_full
-
         if isinstance(error, FileNotFoundError) and not error.filename and _working_folder_is_gone():
             return "the working folder is gone: it was deleted or moved, and relative paths lead nowhere. Change to another folder, or give absolute paths."
         what = error.strerror or type(error).__name__
@@ -101,15 +97,11 @@ def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
     if code == 0:
         return 0
     if debug:
-        import traceback
-
         traceback.print_exception(error, file=sys.stderr)
     text = _shortened(printable(sentence(error)))
     details = [_shortened(printable(line)) for line in getattr(error, "details", ())]
     print("\n  ".join([f"enerf: {text}", *details]), file=sys.stderr, flush=True)
     if as_json:
-        from workflows.cli.output import write_json
-
         facts |= {"details": details} if details else {}
         write_json({"event": "summary", "ok": False, "error": text, "kind": type(error).__name__, **facts, "exit_code": code})
     return code

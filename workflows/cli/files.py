@@ -2,27 +2,47 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import UsageError
+from pipeline.run import Run
+from stages.figures.frames import RenderOptions, encode_frames, render_frames
+from stages.formats.exporters.frames import frame_background
+from stages.framing.camera_paths import PATHS, similarity_of
+from stages.framing.restriction import restricted, with_region
+from stages.io.camera_path import read_camera_path
+from stages.memory.need import refuse_more_than
+from stages.mesh import run as mesh
+from stages.points import run as points
+from stages.splats import run as splats
+from stages.turntable.memory import frames_needed
+from stages.turntable.run import cameras_of
+from stages.turntable.settings import TurntableSettings
+from workflows import exporting, exporting_splats
 from workflows.cli.options import common_options, crop_option, folder_type, force_option, json_option, memory_limit, memory_option, quiet_option, set_option
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
-    from stages.turntable.run import TurntableSettings
-    from workflows.cli.resolve import Settings
+from workflows.cli.output import closing, listing, write_json
+from workflows.cli.progress import display
+from workflows.cli.resolve import Settings
+from workflows.cli.target import is_run
+from workflows.destination import check_files, check_folder, check_free, writing
+from workflows.inspection.describe import describe, in_words
+from workflows.loading import load_asset
 
 TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
-REGIONS = ("foreground", "all")  # efficientnerf.asset.region.REGIONS, which a test compares; that import is heavy
+REGIONS = ("foreground", "all")
 EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
 Crop = tuple[float, float, float, float, float, float] | None
 
 
-@click.command(short_help="Write meshes, points, splats, volumes, a viewer or cameras.")
+@click.command()
 @click.argument("what", metavar="RUN|ASSET", required=False, type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
@@ -61,10 +81,6 @@ def export(
     Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. What the run's stages mesh and splats
     have made with the same settings is taken from there. Settings of the stages mesh, points and splats apply: '--set mesh.max_faces=...'.
     """
-    from pipeline.errors import UsageError
-    from workflows import exporting, exporting_splats
-    from workflows.cli.output import closing, listing, write_json
-
     if as_list:
         rows = exporting.formats()
         if as_json:
@@ -95,19 +111,11 @@ def export(
 
 
 def _surface_stages() -> dict[str, type]:
-    from stages.mesh import run as mesh
-    from stages.points import run as points
-    from stages.splats import run as splats
-
     return {"mesh": mesh.MeshSettings, "points": points.PointsSettings, "splats": splats.SplatsSettings}
 
 
 def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> Settings:
     """Settings of some stages: those that the run recorded, or the defaults for an asset file; then `--set`."""
-    from pipeline.run import Run
-    from workflows.cli.resolve import Settings
-    from workflows.cli.target import is_run
-
     settings = Settings(types)
     if is_run(what):
         recorded = Run.open(what).settings
@@ -117,7 +125,7 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
     return settings
 
 
-@click.command(short_help="Render a turntable, or the cameras of a JSON path.")
+@click.command()
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder for frame_0000.png and so on; created if missing.")
 @click.option(
@@ -150,19 +158,6 @@ def render(
     Settings of the stage turntable apply: '--set turntable.elevation=30'. Existing frames are replaced with --force only;
     DIR cannot lie in a run.
     """
-    from dataclasses import replace
-
-    from pipeline.errors import UsageError
-    from stages.figures.frames import RenderOptions, encode_frames, render_frames
-    from stages.formats.exporters.frames import frame_background
-    from stages.framing.camera_paths import PATHS
-    from stages.memory.need import refuse_more_than
-    from stages.memory.rendering import frames_needed
-    from stages.turntable.run import TurntableSettings
-    from workflows.cli.output import closing, write_json
-    from workflows.cli.target import load_asset
-    from workflows.destination import check_files, check_folder, check_free, writing
-
     if video is not None and video.suffix.lower() != ".mp4":
         raise UsageError(f"--video {video}: the extension {video.suffix!r} is not known; expected .mp4.")
     check_folder(out)
@@ -202,11 +197,6 @@ def _restricted_with_cameras(
     whole: NerfTree, settings: TurntableSettings, crop: Crop, camera_path: Path | None, width: int | None, height: int | None
 ) -> tuple[NerfTree, list[Camera], int]:
     """What of an asset is rendered, the cameras, and the frames per second."""
-    from stages.framing.camera_paths import similarity_of
-    from stages.framing.restriction import restricted, with_region
-    from stages.io.camera_path import read_camera_path
-    from stages.turntable.run import cameras_of
-
     tree = restricted(whole, settings.region, crop)
     if camera_path is None:
         return tree, cameras_of(whole if crop is None else with_region(tree), settings), settings.fps
@@ -214,16 +204,13 @@ def _restricted_with_cameras(
     return tree, list(path.cameras), path.fps or settings.fps
 
 
-@click.command(short_help="Describe an asset, a run, a data set, a mesh or points.")
+@click.command()
 @click.argument("what", metavar="FILE|FOLDER", type=folder_type)
 @json_option
 @common_options
 def inspect(what: Path, as_json: bool) -> None:
     """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, warnings; or a file that was
     exported, a mesh, points or 3D Gaussians (.ply, .spz, .glb, of other programs too)."""
-    from workflows.cli.output import listing, write_json
-    from workflows.inspection.describe import describe, in_words
-
     found = describe(what)
     if as_json:
         write_json(found, indent=1)
@@ -232,15 +219,11 @@ def inspect(what: Path, as_json: bool) -> None:
 
 
 def _shown(as_json: bool, quiet: bool) -> Any:
-    from workflows.cli.progress import display
-
     return display(as_json=as_json, quiet=quiet)
 
 
 def _progress(stage: str, show: Callable[[dict[str, Any]], None]) -> Callable[[int, int, str], None]:
     """A callable that turns (done, total, text) into events, at most ten a second."""
-    import time
-
     last = [0.0]
 
     def progress(done: int, total: int, text: str) -> None:

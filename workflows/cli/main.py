@@ -1,7 +1,6 @@
 """The command `enerf`.
 
-Only click is imported here and by the modules of the commands; what a command needs is imported when it runs, so that `--help` answers
-at once.
+The module of a command is imported when the command is asked for, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -9,23 +8,55 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from importlib import import_module
 
 import click
 
-from workflows.cli import assets, files, paper, presets, run, state
 from workflows.cli.failures import report_failure
 from workflows.cli.output import exit_code, watched
-from workflows.fleet.command import fleet
-
-if TYPE_CHECKING:
-    from workflows.asset import Workflow
-
+from workflows.workflow import Workflow
 
 INTERRUPTED = 128 + signal.SIGINT  # exit code
 
 
+COMMANDS = {  # name -> its module, and what `enerf --help` says of it
+    "run": ("workflows.cli.run", "Run all stages on photographs or a data set, or resume a run."),
+    "stage": ("workflows.cli.run", "Run one stage on the artifacts of a run."),
+    "fleet": ("workflows.fleet.command", "Run many scenes, here or on many machines; one bad scene stops no other."),
+    "check": ("workflows.inspection.command", "Say whether photographs will do, before anything is run."),
+    "status": ("workflows.cli.status", "Show for each stage whether it is up to date, and why not."),
+    "verify": ("workflows.cli.verify", "Check every file against its recorded hash."),
+    "report": ("workflows.report.command", "Write a page about a run: renders, figures, settings."),
+    "export": ("workflows.cli.files", "Write meshes, points, splats, volumes, a viewer or cameras."),
+    "render": ("workflows.cli.files", "Render a turntable, or the cameras of a JSON path."),
+    "inspect": ("workflows.cli.files", "Describe an asset, a run, a data set, a mesh or points."),
+    "diff": ("workflows.cli.assets", "Compare two assets: metadata, tensors, renders."),
+    "convert": ("workflows.cli.assets", "Write an asset in another layout, resolution or degree."),
+    "view": ("workflows.cli.assets", "Show a run or an asset in a browser."),
+    "presets": ("workflows.cli.presets", "List presets and settings with their defaults and meaning."),
+    "paper": ("workflows.paper.command", "Reproduce a table of the paper, with its figures beside ours."),
+}
+
+
+class _Commands(click.Group):
+    """The commands of the table."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = getattr(import_module(COMMANDS[cmd_name][0]), cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, COMMANDS[name][1]) for name in sorted(COMMANDS)])
+
+
 @click.group(
+    cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     epilog="Exit codes: 0 done; 2 usage or bad input; 3 a stage failed, or output could not be written; 4 corrupt artifact; 5 run locked; "
     "6 assets differ, or a result that --fail-on names; 130, 143 interrupted.",
@@ -38,26 +69,6 @@ def enerf() -> None:
     enerf run photos/ --out runs/mine      everything, from photographs to asset, turntable, mesh and points
     enerf run --out runs/mine              resume
     """
-
-
-for command in (
-    run.run,
-    run.stage,
-    fleet,
-    state.check,
-    state.status,
-    state.verify,
-    state.report,
-    files.export,
-    files.render,
-    files.inspect,
-    assets.diff,
-    assets.convert,
-    assets.view,
-    presets.presets,
-    paper.paper,
-):
-    enerf.add_command(command)
 
 
 def main(arguments: Sequence[str] | None = None, workflow: Workflow | None = None) -> int:

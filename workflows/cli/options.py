@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 
-if TYPE_CHECKING:
-    from pipeline.executors.memory import Limit
-    from workflows.asset import Workflow
+from pipeline.executors.memory import Limit, limit_for, parse_size
+from workflows.asset import WORKFLOW
+from workflows.workflow import Workflow
 
 C = TypeVar("C", bound=Callable[..., Any])
 
@@ -42,15 +42,11 @@ folder_type = PathOfAnything(path_type=Path)
 
 def memory_limit(text: str | None) -> Limit | None:
     """What --memory says, or what the machine has where it is "auto" or not given. Raises UsageError."""
-    from pipeline.executors.memory import limit_for, parse_size
-
     return limit_for(None if text in (None, "auto") else parse_size(text), None)
 
 
 def workflow() -> Workflow:
     """The workflow that `main` was given, or that of this package."""
-    from workflows.asset import WORKFLOW
-
     context = click.get_current_context(silent=True)
     given: Workflow | None = None if context is None else context.find_root().obj
     return given or WORKFLOW

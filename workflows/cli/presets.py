@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from pipeline.errors import UsageError
+from stages.settings import SettingInfo, describe_settings
 from workflows.cli.options import common_options, json_option, workflow
+from workflows.cli.output import listing, write_json
+from workflows.cli.resolve import Settings, meaning, nearest, preset_names, read_preset, shown, table_of
 
-if TYPE_CHECKING:
-    from stages.settings import SettingInfo
 
-
-@click.command(short_help="List presets and settings with their defaults and meaning.")
+@click.command()
 @click.argument("stages", nargs=-1, metavar="[STAGE]...")
 @click.option("--preset", metavar="NAME", help="Show the values of this preset in place of the defaults.")
 @json_option
 @common_options
 def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
     """List the presets and the main settings with their defaults and meaning; with STAGE... all settings of these stages."""
-    from pipeline.errors import UsageError
-    from stages.settings import describe_settings
-    from workflows.cli.output import listing, write_json
-    from workflows.cli.resolve import Settings, nearest, preset_names, read_preset, table_of
-
     folder = workflow().presets
     types = {stage.name: stage.settings for stage in workflow().stages}
     for name in stages:
@@ -65,9 +61,6 @@ def _facts(infos: list[SettingInfo], values: dict[str, Any]) -> list[dict[str, A
 
 def _list(infos: list[SettingInfo], values: dict[str, Any]) -> None:
     """A line for each setting."""
-    from workflows.cli.output import listing
-    from workflows.cli.resolve import meaning, shown
-
     for info in infos:
         choices = f" One of: {', '.join(shown(choice) for choice in info.choices)}." if info.choices and info.listed else ""
         listing(f"{info.name + ' = ' + shown(values[info.name]):<36} {meaning(info)}{choices}")

@@ -131,8 +131,8 @@ class Bars:
     """A bar with the remaining time of the running stage, on a terminal."""
 
     def __init__(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.console import Console  # a log needs none
+        from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn  # likewise
 
         self.console = Console(stderr=True, highlight=False)
         self.progress = Progress(

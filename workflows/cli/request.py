@@ -8,16 +8,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from efficientnerf.backends.kernel_cache import are_compiled
 from pipeline.artifact import listed
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit, limit_for, parse_size, size_text
 from pipeline.run import MOST_SOURCES, NAME, Run
 from pipeline.stage import Stage
-from workflows.asset import Workflow
+from stages.formats.importers import detect
+from stages.video import KNOWN, SUFFIXES
 from workflows.budget import share_budget
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, Table, read_config, read_preset, seconds_of, table_of
-from workflows.cli.target import check_names, open_run, resume_command
+from workflows.cli.target import open_run, resume_command
+from workflows.workflow import Workflow
 
 # Bytes of a process beside what stages say: docs/experiments/memory.md
 COMPILING, PAGES = 1600 * 2**20, 300 * 2**20
@@ -28,6 +31,7 @@ class Options:
     """The options of the command line; None or empty where not given.
 
     table  settings of a fleet's scene, as its manifest has them
+    share  bytes of its worker's memory that the scene's stages have
     """
 
     source: Path | None = None
@@ -47,6 +51,7 @@ class Options:
     features_model: tuple[str, str] | None = None
     device: str | None = None
     memory: str | None = None
+    share: int | None = None
     strict: bool = False
     allow_outside: bool = False
 
@@ -108,7 +113,6 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     if preset is not None:
         settings.put_table(read_preset(preset, workflow.presets).table, f"preset {preset}")
     elif standing is not None:
-        check_names(standing)
         dropped = settings.put_recorded(standing.settings)
         if dropped:
             warnings.append(f"settings that this version does not have are left out: {listed(dropped)}")
@@ -131,7 +135,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
     warnings += _without_effect(settings, config, options)
     memory, limit = _memory(options.memory, standing, warnings)
-    warnings += _beyond(limit, workflow.stages)
+    warnings += _beyond(limit if options.share is None else Limit(options.share, "its share of the worker's memory"), workflow.stages)
     run = Run(
         path,
         sources[0] if sources else None,
@@ -178,8 +182,6 @@ def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:
 
 def _format(settings: Settings, sources: Sequence[Path]) -> str | None:
     """The format that sources will be read as; None where they cannot be, which the stage poses reports."""
-    from stages.formats.importers import detect
-
     stated = settings.resolved()["poses"]
     if stated.format != "auto":
         return str(stated.format)
@@ -203,8 +205,6 @@ def _memory(given: str | None, standing: Run | None, warnings: list[str]) -> tup
 
 def _beyond(limit: Limit | None, stages: Sequence[Stage]) -> list[str]:
     """Warnings of what a run takes whatever its limit: to compile kernels, once for a machine, and to write its pages."""
-    from efficientnerf.backends.kernel_cache import are_compiled
-
     if limit is None or not any(stage.uses_device for stage in stages):
         return []
     found = []
@@ -243,8 +243,6 @@ def _sources(given: Sequence[Path], standing: Run | None) -> tuple[Path, ...]:
 
 def _check_source(given: Path) -> None:
     """BadInput for what is no source at all."""
-    from stages.video.reading import KNOWN, SUFFIXES
-
     if not given.exists():
         raise BadInput(f"{given}: no such file or folder. Give the folder of the photographs or of the data set, or a video.")
     if not given.is_dir() and given.suffix.lower() not in SUFFIXES:

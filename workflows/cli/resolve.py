@@ -18,7 +18,6 @@ from pipeline import files
 from pipeline.errors import BadInput, UnknownSetting, UsageError
 from pipeline.stage import settings_dict, settings_from
 from pipeline.text import printable
-from stages.renamed_settings import moved, updated
 from stages.settings import SettingInfo, describe_settings
 from workflows.asset import WORKFLOW
 
@@ -182,8 +181,6 @@ class Settings:
     def _info(self, stage: str, name: str, origin: str) -> SettingInfo:
         if stage not in self.about:
             raise UnknownSetting(f"{origin}: no stage {printable(stage, MAX_SHOWN)!r}.{nearest(stage, self.about)} Stages: {', '.join(self.about)}.")
-        if name not in self.about[stage] and (sentence := moved(stage, name)) is not None:
-            raise UnknownSetting(f"{origin}: {sentence}")
         if name not in self.about[stage]:
             known = [f"{stage}.{entry}" for entry in self.about[stage]]
             close = nearest(f"{stage}.{name}", known) or nearest(name, [f"{s}.{n}" for s in self.about for n in self.about[s]])
@@ -214,10 +211,10 @@ class Settings:
                 self.put(stage, name, [value], origin)
 
     def put_recorded(self, table: Table) -> list[str]:
-        """Put recorded settings under their current names; returns those that this version does not have or does not admit."""
+        """Put recorded settings; returns those that this version does not have or does not admit."""
         dropped = []
         for stage, entries in table.items():
-            for name, value in (updated(stage, self.types[stage], entries) if stage in self.types else entries).items():
+            for name, value in entries.items():
                 if name not in self.about.get(stage, {}):
                     dropped.append(f"{stage}.{name}")  # without a search for the nearest: there may be any number
                     continue

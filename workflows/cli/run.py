@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from pipeline.errors import UsageError
+from pipeline.executors.local import execute_alone
+from pipeline.library_output import kept_in, warnings_for_users
+from pipeline.run import Run
+from pipeline.runner import run_stages
+from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
 from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_option, quiet_option, set_option, workflow
-
-if TYPE_CHECKING:
-    from pipeline.run import Run
-    from workflows.cli.request import Plan
-
+from workflows.cli.output import closing, write_json
+from workflows.cli.progress import display, warning
+from workflows.cli.request import Options, Plan, plan_run
+from workflows.cli.resolve import nearest
+from workflows.cli.target import open_run
+from workflows.report.pages import has_pages, write_pages
+from workflows.report.summary import graded, in_words, summary
 
 GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 
 
-@click.command(short_help="Run all stages on photographs or a data set, or resume a run.")
+@click.command()
 @click.argument("sources", nargs=-1, type=folder_type, metavar="[SOURCE]...")
 @click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="The folder of the run.")
 @click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE; by default it is detected. See poses.format in 'enerf presets poses'.")
@@ -63,14 +72,12 @@ def run(
     The result is graded good, usable, poor or failed, in the first line and in RUN/evaluate/verdict.json with what to do; the exit code is 0 all the same,
     unless --fail-on says otherwise.
     """
-    from workflows.cli.request import Options, plan_run
-
     options |= {"format": options.pop("format_name"), "source": sources[0] if sources else None, "also": sources[1:]}
     plan = plan_run(run_folder, workflow(), Options(**options))
     return _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run, fail_on=fail_on)
 
 
-@click.command(short_help="Run one stage on the artifacts of a run.")
+@click.command()
 @click.argument("name", metavar="NAME")
 @click.argument("run_folder", metavar="RUN", type=folder_type)
 @set_option
@@ -83,11 +90,6 @@ def run(
 @common_options
 def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Run the stage NAME of RUN on the artifacts of the stages before it, which are not run again; stale ones are named."""
-    from pipeline.errors import UsageError
-    from workflows.cli.request import Options, plan_run
-    from workflows.cli.resolve import nearest
-    from workflows.cli.target import open_run
-
     names = [each.name for each in workflow().stages]
     if name not in names:
         raise UsageError(f"{name}: no such stage.{nearest(name, names)} Stages: {', '.join(names)}.")
@@ -101,17 +103,6 @@ def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool
 
 def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str | None = None, **selection: Any) -> int:
     """Run a plan, display its progress, and print the summary; returns the exit code."""
-    import time
-
-    from pipeline.executors.local import execute_alone
-    from pipeline.library_output import kept_in, warnings_for_users
-    from pipeline.runner import run_stages
-    from workflows.cli.device import resolve_device
-    from workflows.cli.output import closing, write_json
-    from workflows.cli.progress import display, warning
-    from workflows.report.pages import has_pages, write_pages
-    from workflows.report.summary import graded, in_words, summary
-
     device = resolve_device(plan.device)
     _check_stages(selection)
     started = time.monotonic()
@@ -139,9 +130,6 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
 
 def _check_stages(selection: dict[str, Any]) -> None:
     """UsageError for a stage that does not exist, before a run is created."""
-    from pipeline.errors import UsageError
-    from workflows.cli.resolve import nearest
-
     names = [stage.name for stage in workflow().stages]
     for option in ("until", "start"):
         name = selection.get(option)

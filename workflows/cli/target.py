@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from pipeline.errors import BadInput, CorruptArtifact, UnknownSetting
+from pipeline.errors import BadInput
 from pipeline.links import refuse_links
-from pipeline.run import NAME
+from pipeline.run import NAME, Run
 from stages.artifacts import BakeOutputs
-from stages.renamed_settings import moved_in
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from pipeline.run import Run
+from workflows.cli.options import workflow
 
 ASSET = BakeOutputs.asset  # the file's name
 
@@ -32,29 +27,15 @@ def resume_command(
 
 def open_run(path: Path) -> Run:
     """The run of a folder, whose messages name commands. Raises BadInput and CorruptArtifact."""
-    from pipeline.run import Run
-
     return Run.open(path, resume_command, _stage_names())
 
 
 def _stage_names() -> frozenset[str]:
-    from workflows.cli.options import workflow
-
     return frozenset(stage.name for stage in workflow().stages)
 
 
 def is_run(path: Path) -> bool:
     return (path / NAME).is_file()
-
-
-def check_names(run: Run) -> None:
-    """UnknownSetting, with the command to run, where a run recorded settings under names from before release 0.1."""
-    found = moved_in(run.settings)
-    if not found:
-        return
-    rest = f" {len(found) - 1} more have other names now." if len(found) > 1 else ""
-    again = f"{resume_command(run.path)} --preset {run.preset or 'preview'}"
-    raise UnknownSetting(f"{run.path / NAME}: made before release 0.1: {found[0]}{rest} To make its stages again with the settings of today: {again}")
 
 
 def asset_of(path: Path) -> Path:
@@ -72,30 +53,3 @@ def asset_of(path: Path) -> Path:
     if (path / ASSET).is_file():
         return path / ASSET
     raise BadInput(f"{path}: neither a run (it has no {NAME}) nor an asset. Give a run or an asset ({ASSET}).")
-
-
-def load_asset(path: Path) -> NerfTree:
-    """The asset of a run or of a file, read and checked. Raises BadInput and CorruptArtifact."""
-    from efficientnerf.asset.format import FormatError, load
-
-    found = asset_of(path)
-    try:
-        return load(found)
-    except FormatError as error:
-        raise CorruptArtifact(_with_folder(found, error), (str(found),)) from error
-
-
-def describe_asset(path: Path) -> dict[str, object]:
-    """The header of an asset file. Raises CorruptArtifact."""
-    from efficientnerf.asset.format import FormatError, describe
-
-    try:
-        return describe(path)
-    except FormatError as error:
-        raise CorruptArtifact(_with_folder(path, error), (str(path),)) from error
-
-
-def _with_folder(path: Path, error: Exception) -> str:
-    """The error's text, which names the file, with the folder before it."""
-    text = str(error)
-    return f"{path.parent / text}" if text.startswith(path.name) and str(path.parent) != "." else text

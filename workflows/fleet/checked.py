@@ -13,9 +13,10 @@ from pipeline.fleet.state import Scene
 from pipeline.run import NAME as RUN_NAME
 from pipeline.stage import Stage, settings_from
 from pipeline.text import printable
-from workflows.asset import Workflow
+from stages.formats.importers import detect
 from workflows.budget import share_budget
 from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, seconds_of
+from workflows.workflow import Workflow
 
 Table = dict[str, dict[str, Any]]
 
@@ -59,8 +60,6 @@ class Choice:
 
 def _format(poses: Mapping[str, Any], sources: Sequence[Path]) -> str | None:
     """The format that sources are read as; None where that is not known yet."""
-    from stages.formats.importers import detect
-
     stated = poses.get("format", "auto")
     if stated != "auto":
         return str(stated)

@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import msgspec
 
-from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_option, quiet_option, set_option, workflow
-
-if TYPE_CHECKING:
-    from pipeline.fleet.state import FleetState, SceneState
-    from workflows.fleet.running import Placement
+from pipeline.errors import BadInput, UsageError
+from pipeline.fleet import requests
+from pipeline.fleet.state import FleetState, SceneState, read_fleet
+from pipeline.locks.lock import holder_of
+from pipeline.text import printable
+from workflows.cli.device import resolve_device
+from workflows.cli.failures import Reported
+from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_limit, memory_option, quiet_option, set_option, workflow
+from workflows.cli.output import closing, listing, write_json
+from workflows.cli.progress import duration, size
+from workflows.cli.resolve import read_preset, read_toml
+from workflows.fleet.checked import Choice, refuse_what_cannot_work
+from workflows.fleet.display import display
+from workflows.fleet.manifest import read_manifest
+from workflows.fleet.options import settings_of
+from workflows.fleet.running import Placement, check_fleet_folder, is_running, run_fleet, scenes_to_retry
+from workflows.fleet.sweeps import read_sweeps, swept
+from workflows.fleet.table import BAD_GRADES, overview
 
 CLUSTERS = ("local", "ssh", "slurm", "pbs", "lsf", "sge", "htcondor", "oar")  # of pipeline/executors/dask.py, which --help does not import
 
@@ -25,7 +40,7 @@ class _Fleet(click.Group):
         return super().parse_args(ctx, args)
 
 
-@click.group(cls=_Fleet, short_help="Run many scenes, here or on many machines; one bad scene stops no other.")
+@click.group(cls=_Fleet)
 def fleet() -> None:
     """Many scenes by one command. Each is a run under FLEET, as 'enerf run' makes it.
 
@@ -76,13 +91,6 @@ def run(
     A scene that fails is tried again where that may help, and else set aside with the reason; the others go on. Exit code 0 where all scenes are
     done, 3 where some are not.
     """
-    from workflows.cli.resolve import read_preset
-    from workflows.fleet.checked import Choice, refuse_what_cannot_work
-    from workflows.fleet.manifest import read_manifest
-    from workflows.fleet.options import settings_of
-    from workflows.fleet.running import check_fleet_folder
-    from workflows.fleet.sweeps import read_sweeps, swept
-
     check_fleet_folder(folder)
     if preset is not None:
         read_preset(preset, workflow().presets)
@@ -98,14 +106,8 @@ def run(
 @common_options
 def status(folder: Path, as_json: bool) -> None:
     """Show the state of each scene of FLEET, and who runs it."""
-    from pipeline.fleet.state import read_fleet
-    from pipeline.locks.lock import holder_of
-    from workflows.cli.output import listing, write_json
-
     found, holder = read_fleet(folder), holder_of(folder)
     if as_json:
-        import msgspec
-
         write_json({**msgspec.to_builtins(found), "written_by": None if holder is None else holder.text()}, indent=1)
         return
     listing(*_overview(folder, found), *(_line(scene) for scene in found.scenes))
@@ -124,11 +126,6 @@ def status(folder: Path, as_json: bool) -> None:
 @common_options
 def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> int:
     """Try the failed and quarantined scenes of FLEET again, or those that are named: by the process that runs it, or here."""
-    from pipeline.fleet import requests
-    from pipeline.fleet.state import read_fleet
-    from workflows.cli.output import closing
-    from workflows.fleet.running import is_running, scenes_to_retry
-
     chosen = scenes_to_retry(read_fleet(folder).scenes, names)
     if is_running(folder):
         outcome = requests.outcome(requests.ask(folder, "retry", chosen), lambda: is_running(folder))
@@ -145,12 +142,6 @@ def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **op
 @common_options
 def cancel(folder: Path, names: tuple[str, ...]) -> None:
     """Let the process that runs FLEET, here or elsewhere, stop at the next safe point; or only the scenes that are named. What is done is kept."""
-    from pipeline.errors import BadInput
-    from pipeline.fleet import requests
-    from pipeline.fleet.state import read_fleet
-    from workflows.cli.output import closing
-    from workflows.fleet.running import is_running
-
     known = {scene.name for scene in read_fleet(folder).scenes}
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -164,12 +155,6 @@ def cancel(folder: Path, names: tuple[str, ...]) -> None:
 
 
 def _placement(jobs: int, scheduler: str | None, cluster: str | None, cluster_options: Path | None, device: str | None, memory: str | None) -> Placement:
-    from pipeline.errors import UsageError
-    from workflows.cli.device import resolve_device
-    from workflows.cli.options import memory_limit
-    from workflows.cli.resolve import read_toml
-    from workflows.fleet.running import Placement
-
     if scheduler is not None and cluster is not None:
         raise UsageError("--scheduler and --cluster: give one. --scheduler uses a Dask cluster that runs, --cluster starts one.")
     if cluster_options is not None and cluster is None:
@@ -185,14 +170,6 @@ def _placement(jobs: int, scheduler: str | None, cluster: str | None, cluster_op
 
 def _run(folder: Path, scenes: Any, *, as_json: bool, quiet: bool, retry: Any, **options: Any) -> int:
     """Run a fleet, display its progress, and print the summary; returns the exit code."""
-    from dataclasses import asdict
-
-    from pipeline.fleet.state import read_fleet
-    from workflows.cli.failures import Reported
-    from workflows.cli.output import closing, write_json
-    from workflows.fleet.display import display
-    from workflows.fleet.running import run_fleet
-
     placement = _placement(**options)
     try:
         with display(folder, as_json=as_json, quiet=quiet) as show:
@@ -207,8 +184,6 @@ def _run(folder: Path, scenes: Any, *, as_json: bool, quiet: bool, retry: Any, *
 
 
 def _overview(folder: Path, found: FleetState) -> list[str]:
-    from workflows.fleet.table import overview
-
     lines = [f"{folder}: {found.state}; {overview(found)}"]
     if found.totals.quarantined:
         lines.append(f"To try again what is quarantined: enerf fleet retry {folder}")
@@ -216,15 +191,10 @@ def _overview(folder: Path, found: FleetState) -> list[str]:
 
 
 def _is_bad(scene: SceneState) -> bool:
-    from workflows.fleet.table import BAD_GRADES
-
     return scene.state in ("failed", "quarantined") or (scene.result is not None and scene.result.grade in BAD_GRADES)
 
 
 def _line(scene: SceneState) -> str:
-    from pipeline.text import printable
-    from workflows.cli.progress import duration, size
-
     psnr = scene.metrics.get("asset", {}).get("psnr") if isinstance(scene.metrics.get("asset"), dict) else None
     grade = "" if scene.result is None else f"{printable(scene.result.grade, 10)} result"
     measures = [size(scene.bytes) if scene.bytes else "", f"{psnr:.2f} dB" if isinstance(psnr, float) else ""]

@@ -6,15 +6,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.fleet.state import FleetState
 from pipeline.text import printable
 from workflows.cli.output import write_json
 from workflows.cli.progress import duration
-
-if TYPE_CHECKING:
-    from workflows.fleet.table import LiveTable
+from workflows.fleet.pages.updates import Pages
+from workflows.fleet.table import LiveTable
 
 _BAD = ("scene_failed", "scene_quarantined", "retry", "warning")
 
@@ -26,8 +25,6 @@ class Show:
     """
 
     def __init__(self, fleet: Path, *, as_json: bool, quiet: bool, table: LiveTable | None = None) -> None:
-        from workflows.fleet.pages.updates import Pages
-
         self.as_json, self.quiet, self.table = as_json, quiet, table
         self._pages = Pages(fleet)
         self._trouble: str | None = None
@@ -82,7 +79,6 @@ def display(fleet: Path, *, as_json: bool, quiet: bool) -> Iterator[Show]:
         yield Show(fleet, as_json=as_json, quiet=quiet)
         sys.stdout.flush()
         return
-    from workflows.fleet.table import LiveTable
 
     with LiveTable() as table:
         yield Show(fleet, as_json=as_json, quiet=quiet, table=table)

@@ -13,6 +13,9 @@ from pipeline.errors import BadInput, UsageError
 from pipeline.fleet.state import MOST_SCENES, is_scene_name
 from pipeline.run import NAME as RUN
 from pipeline.text import printable
+from stages.formats.importers import IMPORTERS
+from stages.formats.importers.photographs import is_video
+from stages.formats.importers.source import images_in
 
 Found = list[tuple[str, str]]
 
@@ -22,8 +25,6 @@ _WILD = re.compile(r"[*?\[]")
 
 def folder_entries(given: str, fleet: Path) -> tuple[Found, Path | None]:
     """The folders and videos in a folder, and the folder that they may not lead out of. Raises UsageError and BadInput."""
-    from stages.formats.importers.photographs import is_video
-
     folder = Path(given)
     if not folder.exists():
         raise BadInput(f"{given}: no such file or folder. Give a manifest (.toml, .csv), a folder of scenes, or a glob in quotes.")
@@ -45,9 +46,6 @@ def folder_entries(given: str, fleet: Path) -> tuple[Found, Path | None]:
 
 def _format_of(folder: Path) -> str | None:
     """What a folder is where it is a scene by itself: a data set, or photographs. Videos in it are scenes each."""
-    from stages.formats.importers import IMPORTERS
-    from stages.formats.importers.source import images_in
-
     for name, importer in IMPORTERS.items():
         if name != "photographs" and importer.recognises(folder):
             return name
@@ -87,14 +85,10 @@ def listed_entries(given: Sequence[str]) -> tuple[Found, Path | None]:
 
 def _scenes(found: Found) -> Found:
     """Those that are folders or videos."""
-    from stages.formats.importers.photographs import is_video
-
     return [(name, path) for name, path in found if os.path.isdir(path) or is_video(Path(path))]
 
 
 def _stem(path: Path) -> str:
-    from stages.formats.importers.photographs import is_video
-
     return named(path.stem if is_video(path) else path.name)
 
 

@@ -29,11 +29,12 @@ from pipeline.errors import UsageError
 from pipeline.fleet.state import MOST_SCENES, Scene, is_scene_name
 from pipeline.run import MOST_SOURCES
 from pipeline.text import printable
-from workflows.asset import Workflow
+from stages.formats.importers.photographs import is_video
 from workflows.cli.resolve import parse_toml
 from workflows.fleet.checked import OPTIONS, Checker, Choice, Text
 from workflows.fleet.folders import folder_entries, glob_entries, listed_entries
 from workflows.fleet.lines import lines_of
+from workflows.workflow import Workflow
 
 MAX_BYTES = 4 * 2**20
 MAX_COLUMNS = 300
@@ -278,6 +279,4 @@ class _Reader:
 
 
 def _is_video(path: Path) -> bool:
-    from stages.formats.importers.photographs import is_video
-
     return is_video(path)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from workflows.asset import Workflow
 from workflows.cli.resolve import Settings
 from workflows.fleet.checked import Text
+from workflows.workflow import Workflow
 
 
 def settings_of(texts: Sequence[str], workflow: Workflow) -> dict[str, dict[str, Any]]:

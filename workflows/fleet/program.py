@@ -11,7 +11,12 @@ from pipeline.run import NAME, Run
 from pipeline.runner import refuse_what_cannot_work
 from pipeline.stage import Stage, settings_from
 from stages.artifacts import BakeOutputs
-from workflows.asset import Workflow
+from workflows.cli.request import Options, plan_run
+from workflows.cli.target import resume_command
+from workflows.inspection.status import camera_verdict, result_verdict
+from workflows.report.pages import has_pages, write_pages
+from workflows.report.summary import metrics
+from workflows.workflow import Workflow
 
 _PARTS = ("network", "asset", "mesh", "splats")
 
@@ -26,12 +31,12 @@ class WorkflowProgram:
     def stages(self) -> Sequence[Stage]:
         return self.workflow.stages
 
-    def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
+    def prepare(self, run: Path, scene: dict[str, Any], memory: int | None) -> list[str]:
         """As `enerf run` does it: of a run that is there, settings that the manifest does not have become those of its preset again."""
-        from workflows.cli.request import Options, plan_run
         preset = scene["preset"] or (self._open(run).preset if (run / NAME).is_file() else None)
         sources = [Path(source) for source in scene["sources"]]
-        options = Options(source=sources[0] if sources else None, also=tuple(sources[1:]), preset=preset, seed=scene["seed"], table=scene["settings"])
+        facts = {"preset": preset, "seed": scene["seed"], "table": scene["settings"], "share": memory}
+        options = Options(source=sources[0] if sources else None, also=tuple(sources[1:]), **facts)
         plan = plan_run(run, self.workflow, options)
         with plan.written() as written:
             refuse_what_cannot_work(self.stages, written)
@@ -39,9 +44,6 @@ class WorkflowProgram:
 
     def describe(self, run: Path) -> dict[str, Any]:
         """The verdicts on its cameras and on what was made, PSNR and SSIM of that, and the size of its asset."""
-        from workflows.inspection.status import camera_verdict, result_verdict
-        from workflows.report.summary import metrics
-
         found = metrics(run) or {}
         shown = {part: {name: found[part].get(name) for name in ("psnr", "ssim")} for part in _PARTS if found.get(part)}
         try:
@@ -59,8 +61,6 @@ class WorkflowProgram:
         return self.workflow.memory(stage, run, tuple(opened.sources.values()), settings, device)
 
     def _open(self, run: Path) -> Run:
-        from workflows.cli.target import resume_command
-
         return Run.open(run, resume_command, frozenset(stage.name for stage in self.stages))
 
     def _opened(self, run: Path) -> tuple[Run, dict[str, Any]]:
@@ -70,13 +70,9 @@ class WorkflowProgram:
         return opened, {name: settings_from(kind, opened.settings.get(name, {}), where=name) for name, kind in kinds.items()}
 
     def is_finished(self, run: Path) -> bool:
-        from workflows.report.pages import has_pages
-
         return has_pages(self._open(run), self.stages)
 
     def finish(self, run: Path) -> None:
-        from workflows.report.pages import write_pages
-
         opened = self._open(run)
         with opened.locked():
             write_pages(opened, self.stages)

@@ -11,7 +11,10 @@ from typing import Any
 
 from pipeline import files
 from pipeline.errors import BadInput, CorruptArtifact, RunLocked
+from pipeline.executors.dask import DaskWorkers
+from pipeline.executors.local import cores
 from pipeline.executors.memory import Limit
+from pipeline.executors.processes import Processes
 from pipeline.failures import cannot_write
 from pipeline.fleet import requests
 from pipeline.fleet.scheduler import Report, Scheduler, StageOf, states_for
@@ -22,8 +25,9 @@ from pipeline.links import HOLDER, LEASE, LOCK
 from pipeline.locks.lease import Lease
 from pipeline.locks.lock import lock
 from pipeline.run import NAME as RUN_NAME
-from workflows.asset import Workflow
+from workflows.cli.device import cuda_device_count
 from workflows.fleet.pages.updates import FILES as PAGES
+from workflows.workflow import Workflow
 
 _OWN = (NAME, LOCK, HOLDER, LEASE, requests.FOLDER)
 
@@ -138,13 +142,8 @@ def _lost(fleet: Path, lease: Lease) -> Callable[[], str | None]:
 
 def _workers(workflow: Workflow, placement: Placement) -> Workers:
     if placement.scheduler is not None or placement.cluster is not None:
-        from pipeline.executors.dask import DaskWorkers
-
         kind = placement.cluster or "local"
         return DaskWorkers(workflow.child, address=placement.scheduler, kind=kind, options=placement.cluster_options, slots=placement.jobs)
-    from pipeline.executors.local import cores
-    from pipeline.executors.processes import Processes
-    from workflows.cli.device import cuda_device_count
 
     gpus = tuple(range(cuda_device_count() or 1)) if placement.device == "cuda" else ()
     memory = None if placement.memory is None else placement.memory.bytes

@@ -19,8 +19,8 @@ from pipeline.files import canonical_json
 from pipeline.fleet.state import MOST_SCENES, Scene, is_scene_name
 from pipeline.stage import Stage
 from pipeline.text import printable
-from workflows.asset import Workflow
 from workflows.fleet.checked import Checker, Text
+from workflows.workflow import Workflow
 
 _MOST_VALUES = 1000  # of one setting
 _EXPECTED = "expected stage.name=VALUE,VALUE, as in --sweep train.iterations=2000,4000."

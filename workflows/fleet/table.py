@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from pipeline.fleet.state import FleetState, SceneState, Totals
 from pipeline.text import printable
 from workflows.cli.progress import duration, size
 from workflows.fleet.pages.index import quality_of
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
 
 BAR = 10  # characters
 BAD_GRADES = ("poor", "failed")  # of a result, that a fleet points out
@@ -25,9 +26,6 @@ class LiveTable:
     """Takes the scheduler's events, and the state whenever it was written. While it is open, lines that are said stand above it."""
 
     def __init__(self, console: Console | None = None) -> None:
-        from rich.console import Console
-        from rich.live import Live
-
         self.console = console or Console(stderr=True, highlight=False)
         self.state = FleetState()
         self._progress: dict[str, tuple[float, float, str]] = {}  # scene -> done, total, text
@@ -61,9 +59,6 @@ class LiveTable:
 
     def table(self) -> Table:
         """As many rows as the terminal has room for: what runs first, then what ended last."""
-        from rich.table import Table
-        from rich.text import Text
-
         made = Table(expand=True, box=None, pad_edge=False, caption=Text(overview(self.state)), caption_justify="left")
         for title in ("scene", "state", "stage", "time", "result", "PSNR", "size"):
             made.add_column(title, justify="right" if title in ("time", "PSNR", "size") else "left", no_wrap=True, overflow="ellipsis")

@@ -5,11 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from pipeline.executors.memory import Limit
-    from workflows.asset import Workflow
+from pipeline.errors import BadInput
+from pipeline.executors.memory import Limit
+from pipeline.text import printable
+from stages.cores import count_cores
+from stages.formats.importers import candidates
+from stages.io.material import find_material
+from stages.verdict.preflight import check
+from stages.video.frames import Reader, frames_of
+from stages.video.reading import UnreadableVideo
+from workflows.cli.progress import duration, size
+from workflows.cli.resolve import Settings, read_preset
+from workflows.workflow import Workflow
 
 CPU_PRESET = "preview"  # as `enerf run` has it without CUDA
 
@@ -21,11 +30,6 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
     limit  of memory, that what is needed is compared with
     Raises BadInput, UsageError.
     """
-    from pipeline.errors import BadInput
-    from stages.cores import count_cores
-    from stages.verdict.preflight import check
-    from workflows.cli.resolve import Settings, read_preset
-
     if not source.exists():
         raise BadInput(f"{source}: no such folder or file. Expected photographs, a video, or a posed data set.")
     settings = Settings({stage.name: stage.settings for stage in workflow.stages})
@@ -43,13 +47,6 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
 
 def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
     """The folder itself; for a video, or a folder of videos, one with the frames that a run would choose. Raises BadInput."""
-    from pipeline.errors import BadInput
-    from stages.cores import count_cores
-    from stages.formats.importers import candidates
-    from stages.io.material import find_material
-    from stages.video.frames import Reader, frames_of
-    from stages.video.reading import UnreadableVideo
-
     if (candidates(source, poses.allow_outside, poses.llff_factor)[0] if poses.format == "auto" else poses.format) != "photographs":
         return source
     videos = find_material({"": source}, poses.allow_outside, _nothing).videos
@@ -68,9 +65,6 @@ def _nothing(*values: object) -> None:
 
 def in_words(found: dict[str, Any]) -> list[str]:
     """Lines of text: the grade first."""
-    from pipeline.text import printable
-    from workflows.cli.progress import duration, size
-
     about = found["forecast"]
     sizes = found["sizes"]
     what = f"{found['photographs']} photographs, {', '.join(sizes[:3])}{' ...' if len(sizes) > 3 else ''}, read as {found['format']}"
@@ -90,8 +84,6 @@ def in_words(found: dict[str, Any]) -> list[str]:
 
 
 def _of_the_run(about: dict[str, Any]) -> str:
-    from workflows.cli.progress import duration, size
-
     room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are: a lower --target-mib takes less"
     memory = f"up to about {size(about['run_bytes'])} of memory{room}"
     if about["run_seconds"] is None:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.format import contents
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.evaluation.metrics import psnr
+from stages.framing.camera_paths import turntable_cameras
+from workflows.cli.target import asset_of
+from workflows.loading import load_asset
 
 PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal renders get this
 
@@ -16,9 +22,6 @@ def compare(first: Path, second: Path, views: int, size: int) -> dict[str, Any]:
 
     `equal` says that all tensors and all metadata are the same, whatever the order and the padding of the header.
     """
-    from efficientnerf.asset.format import contents
-    from workflows.cli.target import asset_of, load_asset
-
     a, b = load_asset(first), load_asset(second)  # refuses damaged files first
     (meta_a, tensors_a), (meta_b, tensors_b) = (contents(asset_of(path)) for path in (first, second))
     metadata = {key: [meta_a.get(key), meta_b.get(key)] for key in sorted({*meta_a, *meta_b}) if meta_a.get(key) != meta_b.get(key)}
@@ -42,10 +45,6 @@ def _difference(a: dict[str, Any] | None, b: dict[str, Any] | None) -> str:
 
 
 def _psnr_of_renders(a: NerfTree, b: NerfTree, views: int, size: int) -> list[float]:
-    from efficientnerf.asset.rendering import render
-    from efficientnerf.evaluation.metrics import psnr
-    from stages.framing.camera_paths import turntable_cameras
-
     background = None if a.environment is not None or b.environment is not None else a.background or (1.0, 1.0, 1.0)  # what lies beyond is compared too
     cameras = turntable_cameras(a, frames=views, width=size, height=size)
     return [min(PSNR_CAP, psnr(*(render(tree, camera, background=background, normals=False).colour.clip(0, 1) for tree in (a, b)))) for camera in cameras]
@@ -63,7 +62,5 @@ def in_words(found: dict[str, Any]) -> list[str]:
 
 
 def _short(value: Any) -> str:
-    import json
-
     text = "absent" if value is None else json.dumps(value, sort_keys=True)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -6,6 +6,12 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+from efficientnerf.asset import conversion, format
+from efficientnerf.asset.file.metadata import layout_of
+from pipeline.errors import UsageError
+from workflows.cli.target import asset_of
+from workflows.loading import load_asset
+
 
 def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None) -> None:
     """Write the asset of `what` (a run or an asset) to `out`, atomically; None keeps the value of the source.
@@ -13,11 +19,6 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     Raises UsageError for a degree or a resolution above its own and for a layout that it has no place in (FORMAT.md, section 10), BadInput and
     CorruptArtifact as `load_asset`.
     """
-    from efficientnerf.asset import conversion, format
-    from efficientnerf.asset.file.metadata import layout_of
-    from pipeline.errors import UsageError
-    from workflows.cli.target import asset_of, load_asset
-
     source = asset_of(what)
     tree = load_asset(what)
     about = format.describe(source)
@@ -43,8 +44,6 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
 
 def writer_of(about: dict[str, Any]) -> str:
     """The writer that made a file of this description, or the nearest one."""
-    from efficientnerf.asset.file.metadata import layout_of
-
     layout = layout_of(about)
     if layout == "compact":
         return "small" if max(about["sh_groups"], default=1) > 1 else "compact"

@@ -6,13 +6,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pipeline.decide import survey
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS
+from stages.formats.exporters.splats.description import describe_splats
+from stages.formats.importers.description import describe_source
+from stages.io import scene
+from stages.io.meshes.description import describe_mesh
+from stages.video import SUFFIXES
 from workflows.asset import STAGES
 from workflows.cli.output import plain
 from workflows.cli.progress import size
-from workflows.cli.target import ASSET, describe_asset, is_run, open_run
+from workflows.cli.target import ASSET, is_run, open_run
+from workflows.loading import describe_asset
+from workflows.report import documents
+from workflows.report.summary import artifacts
 
 MESHES = tuple(dict.fromkeys(each.extension for each in (*MESH_EXPORTERS.values(), *POINT_EXPORTERS.values()) if each.extra is None))
 
@@ -26,49 +35,32 @@ def describe(path: Path) -> dict[str, Any]:
     if is_run(path):
         return _describe_run(path)
     if PosesOutputs(path).scene.is_file():
-        from stages.io import scene
-
         return scene.describe(path)
     if (path / ASSET).is_file():
         return {"what": "asset", "path": str(path / ASSET), **describe_asset(path / ASSET)}
-    from stages.formats.importers.description import describe_source
 
     return describe_source(path)
 
 
 def _describe_file(path: Path) -> dict[str, Any]:
-    from stages.video.reading import SUFFIXES
-
     suffix = path.suffix.lower()
     if suffix == ".nerftree":
         return {"what": "asset", "path": str(path), **describe_asset(path)}
     if suffix in SPLAT_EXPORTERS:
-        from stages.formats.exporters.splats.description import describe_splats
-
         splats = describe_splats(path)
         if splats is not None:
             return {"what": "splats", "path": str(path), "bytes": path.stat().st_size, **splats}
     if suffix in MESHES:
-        from stages.io.meshes.description import describe_mesh
-
         return {"what": "mesh", "path": str(path), "bytes": path.stat().st_size, **describe_mesh(path)}
     if path.name == PosesOutputs.scene:
-        from stages.io import scene
-
         return scene.describe(path.parent)
     if suffix in SUFFIXES or suffix in (".json", ".npy", ".bin", ".txt"):
-        from stages.formats.importers.description import describe_source
-
         return describe_source(path if suffix in SUFFIXES else path.parent)
     known = f"an asset (.nerftree), a mesh ({', '.join(MESHES)}), 3D Gaussians ({', '.join(SPLAT_EXPORTERS)}), a run or the folder of a data set"
     raise BadInput(f"{path}: of no kind that can be described; expected {known}.")
 
 
 def _describe_run(path: Path) -> dict[str, Any]:
-    from pipeline.decide import survey
-    from workflows.report import documents
-    from workflows.report.summary import artifacts
-
     run = open_run(path)
     quality: dict[str, Any] = {}
     damaged = []
@@ -88,8 +80,6 @@ def _describe_run(path: Path) -> dict[str, Any]:
         "damaged": damaged,
     }
     if PosesOutputs.of_run(path).scene.is_file():
-        from stages.io import scene
-
         found["scene"] = scene.describe(PosesOutputs.of_run(path).folder)
     if "asset" in found["artifacts"]:
         found["asset"] = describe_asset(BakeOutputs.of_run(path).asset)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from pipeline.decide import Decision
-    from pipeline.run import Run
+from pipeline import files
+from pipeline.decide import Decision
+from pipeline.run import Run
+from stages.artifacts import EvaluateOutputs, PosesOutputs
 
 
 def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
@@ -21,21 +22,15 @@ def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
 
 def camera_verdict(run: Path) -> dict[str, Any] | None:
     """The grade of the cameras and a sentence; None where there are none yet, or they say nothing that can be read."""
-    from stages.artifacts import PosesOutputs
-
     return _verdict(PosesOutputs.of_run(run).verdict)
 
 
 def result_verdict(run: Path) -> dict[str, Any] | None:
     """The same of what was made."""
-    from stages.artifacts import EvaluateOutputs
-
     return _verdict(EvaluateOutputs.of_run(run).verdict)
 
 
 def _verdict(path: Path) -> dict[str, Any] | None:
-    from pipeline import files
-
     try:
         found = files.read_json(path)
     except (OSError, files.Unreadable):

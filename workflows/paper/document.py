@@ -14,11 +14,18 @@ import json
 import os
 import platform
 from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from workflows.paper import structures, tables
+import torch
+
+from pipeline.errors import BadInput, UsageError
+from pipeline.files import write_atomically
+from stages.figures.plots import curve, with_palette
+from workflows.paper import tables
 from workflows.paper.result import PAPER, Request, Result, Table
+from workflows.paper.table7 import structures
 
 __all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
 
@@ -29,14 +36,12 @@ TABLES: dict[str, Table] = {
     "4": Table("Sizes of the coarse and of the fine network", True, tables.networks),
     "5": Table("The modules, one by one", True, tables.modules),
     "6": Table("Sampling strategies", True, tables.strategies),
-    "7": Table("Structures that cache a scene: dense voxels, sparse tensor, octree, NerfTree", False, structures.structures),
+    "7": Table("Structures that cache a scene: dense voxels, sparse tensor, octree, NerfTree", False, structures),
 }
 
 
 def make(number: str, request: Request, tables: Mapping[str, Table] = TABLES) -> dict[str, Path]:
     """Measure one table and write it; returns the files, by kind."""
-    from pipeline.errors import BadInput, UsageError
-
     if number not in tables:
         raise UsageError(f"paper {number}: no such table. There are: {', '.join(tables)}.")
     table = tables[number]
@@ -60,8 +65,6 @@ def make(number: str, request: Request, tables: Mapping[str, Table] = TABLES) ->
     _write(written["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
     _write(written["markdown"], in_markdown(document))
     if result.curves:
-        from stages.figures.plots import curve, with_palette
-
         written["plot"] = request.out / f"table_{number}.png"
         curve(written["plot"], result.curves, x_label="seconds of training", y_label="PSNR of test views / dB", title=f"Table {number}")
         with_palette(written["plot"])
@@ -106,15 +109,11 @@ def hardware(device: str) -> dict[str, Any]:
     if hasattr(os, "getloadavg"):
         found["load"] = [round(x, 2) for x in os.getloadavg()]
     if device == "cuda":
-        import torch
-
         found["device"] = torch.cuda.get_device_name()
     return found
 
 
 def versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
     found = {}
     for name in ("efficientnerf", "torch", "numba"):
         try:
@@ -125,6 +124,4 @@ def versions() -> dict[str, str]:
 
 
 def _write(path: Path, text: str) -> None:
-    from pipeline.files import write_atomically
-
     write_atomically(path, text.encode("utf-8"))

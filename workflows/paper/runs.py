@@ -7,18 +7,34 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import torch
+
+from efficientnerf.asset import format
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends import dispatch
+from efficientnerf.evaluation.metrics import psnr, ssim
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.rendering.field_renderer import SampleCounts
+from pipeline.errors import BadInput
+from pipeline.run import NAME, Run
+from pipeline.runner import run_stages
 from stages.artifacts import BakeOutputs, TrainOutputs
+from stages.cores import use_all_cores
+from stages.evaluate.views import evaluation_views, evenly_spaced, ground_truth
+from stages.io import scene
+from stages.io.field_file import load_renderer
+from workflows import asset
+from workflows.cli.resolve import Settings, read_preset, table_of
 from workflows.paper.result import Request
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
-    from pipeline.run import Run
 
 PRESET = "paper-n4"
 CONVERGED_PSNR = 22.0  # less is not converged: such a row says nothing about the method
@@ -73,8 +89,6 @@ class Figures:
 
 def scenes(data: Path) -> list[Path]:
     """The data sets of a folder: itself, or those in it."""
-    from pipeline.errors import BadInput
-
     if any((data / name).exists() for name in SCENES_OF):
         return [data]
     found = sorted(folder for folder in data.iterdir() if folder.is_dir() and any((folder / name).exists() for name in SCENES_OF))
@@ -123,9 +137,6 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
 
 def settings_of(row: Row, scale: float) -> dict[str, dict[str, Any]]:
     """Settings of all stages for a row."""
-    from workflows import asset
-    from workflows.cli.resolve import Settings, read_preset, table_of
-
     settings = Settings({stage.name: stage.settings for stage in asset.STAGES})
     settings.put_table(read_preset(PRESET).table, PRESET)
     settings.put_table({"train": row.changes}, row.name)
@@ -135,10 +146,6 @@ def settings_of(row: Row, scale: float) -> dict[str, dict[str, Any]]:
 
 def measured(request: Request, scene: Path, row: Row) -> Figures:
     """Train a row on a scene, or resume its run, and measure it."""
-    from pipeline.run import NAME, Run
-    from pipeline.runner import run_stages
-    from workflows import asset
-
     folder = request.out / "runs" / scene.name / row.name
     settings = settings_of(row, request.scale)
     run = Run.open(folder) if (folder / NAME).exists() else Run.create(folder, scene.resolve(), settings, preset=PRESET, device=request.device)
@@ -158,8 +165,6 @@ def measured(request: Request, scene: Path, row: Row) -> Figures:
 
 def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Seconds, samples and the curve from the log of a training."""
-    import statistics
-
     counts = [after["step"] - before for after, before in zip(lines, [0, *(line["step"] for line in lines)], strict=False)]
     spent = [line["step_seconds"] * count for line, count in zip(lines, counts, strict=True)]
     total = math.fsum(spent)
@@ -182,15 +187,6 @@ def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], device: str) -> dict[str, Any]:
     """PSNR, SSIM and shares of the network on test views; cached beside the run until the field or the views change."""
-    import numpy as np
-
-    from efficientnerf.evaluation.metrics import psnr, ssim
-    from efficientnerf.rendering.field_renderer import SampleCounts
-    from stages.cores import use_all_cores
-    from stages.evaluate.views import evaluation_views, evenly_spaced, ground_truth
-    from stages.io import scene
-    from stages.io.field_file import load_renderer
-
     kept = run.path / "network.json"
     key = {"field": digest, "views": settings["evaluate"]["field_views"]}
     if kept.exists() and (found := json.loads(kept.read_text(encoding="utf-8")))["of"] == key:
@@ -227,19 +223,12 @@ def _count(field_views: int | str) -> int | None:
 
 def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None) -> float:
     """Seconds of a render; on a device its framebuffer stays there."""
-    import time
-
-    from efficientnerf.backends import dispatch
-
     if tree.device == "cpu" or tree.ndc is not None or not dispatch.triton_usable():
-        from efficientnerf.asset.rendering import render
-
         begun = time.perf_counter()
         render(tree, camera, background=background)
         return time.perf_counter() - begun
-    import torch
 
-    from efficientnerf.backends.triton.tree import device_tree_of, render_image
+    from efficientnerf.backends.triton.tree import device_tree_of, render_image  # needs Triton
 
     torch.cuda.synchronize()
     begun = time.perf_counter()
@@ -251,14 +240,6 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
 def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
     """PSNR and SSIM of the baked tree on the test views of the network (`wanted` of them, None: all), and frames a second at
     their size."""
-    import numpy as np
-
-    from efficientnerf.asset import format
-    from efficientnerf.asset.rendering import render
-    from efficientnerf.evaluation.metrics import psnr, ssim
-    from stages.evaluate.views import evaluation_views, evenly_spaced, ground_truth
-    from stages.io import scene
-
     tree = format.load(BakeOutputs.of_run(run.path).asset).to(device)
     s = scene.load(run.folder("poses"))
     views, _ = evaluation_views(s)

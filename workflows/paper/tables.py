@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -197,8 +198,6 @@ def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
 
 
 def _quiet(request: Request) -> Request:
-    import dataclasses
-
     return dataclasses.replace(request, say=lambda text: None, report=None)
 
 

@@ -12,24 +12,23 @@ import stat
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import jinja2
 from markupsafe import Markup
 
+from pipeline.decide import Decision, survey
+from pipeline.run import Run, cannot_write
+from pipeline.stage import Stage
 from pipeline.text import printable
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents
 from workflows.report.documents import CameraVerdict, Damaged, Metrics, PosesReport, Quality, ResultVerdict
+from workflows.report.signature import write_page
 from workflows.report.summary import against_network, quality_in_words, split_of
-
-if TYPE_CHECKING:
-    from pipeline.decide import Decision
-    from pipeline.run import Run
-    from pipeline.stage import Stage
 
 NAME = "report.html"
 RUN = Path()  # names are relative to the page
@@ -65,10 +64,6 @@ def write_report(run: Run, stages: Sequence[Stage]) -> Path:
 
     No lock is taken: where a stage is replaced meanwhile, the page is made again, so that all of it is of the same artifacts.
     """
-    from pipeline.decide import survey
-    from pipeline.run import cannot_write
-    from workflows.report.signature import write_page
-
     path = run.path / NAME
     for _ in range(ATTEMPTS):
         before = _published(run, stages)

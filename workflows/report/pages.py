@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from pipeline.run import Run
-    from pipeline.stage import Stage
+from pipeline.run import Run
+from pipeline.stage import Stage
+from workflows.report.signature import PAGES, is_own, viewer_is_missing
 
 
 def write_pages(run: Run, stages: Sequence[Stage]) -> None:
     """Write them of what the run holds now."""
-    from workflows.report.page import write_report
-    from workflows.report.viewer import write_run_viewer
+    from workflows.report.page import write_report  # torch, for the viewer: a run with nothing to do writes no page
+    from workflows.report.viewer import write_run_viewer  # likewise
 
     write_run_viewer(run)
     write_report(run, stages)
@@ -23,13 +22,10 @@ def write_pages(run: Run, stages: Sequence[Stage]) -> None:
 def has_pages(run: Run, stages: Sequence[Stage]) -> bool:
     """Whether the report is there and no artifact was published after it (that is a rename of its folder, which sets ctime), no page is missing, and none is
     another's."""
-    from workflows.report.signature import PAGES, is_own
-    from workflows.report.viewer import is_missing
-
     try:
         written = os.stat(run.path / "report.html", follow_symlinks=False).st_mtime_ns
     except OSError:
         return False
     folders = (run.folder(stage.name) for stage in stages)
     newest = all(os.stat(folder, follow_symlinks=False).st_ctime_ns <= written for folder in folders if os.path.lexists(folder))
-    return newest and not is_missing(run) and all(is_own(run.path / name) for name in PAGES if os.path.lexists(run.path / name))
+    return newest and not viewer_is_missing(run) and all(is_own(run.path / name) for name in PAGES if os.path.lexists(run.path / name))

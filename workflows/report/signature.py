@@ -12,12 +12,19 @@ import hmac
 import os
 import re
 import secrets
+import stat
+from contextlib import suppress
 from pathlib import Path
 
+from efficientnerf.backends.kernel_cache import cache_folder, first_private
 from pipeline import files
 from pipeline.hashes import CHUNK
+from pipeline.run import Run
+from stages.artifacts import BakeOutputs
+from stages.viewer.html import LARGEST
 
-PAGES = ("report.html", "viewer.html")  # of a run
+VIEWER = "viewer.html"
+PAGES = ("report.html", VIEWER)  # of a run
 KEY = 32  # bytes, as many as a SHA-256 has
 _LINE = re.compile(rb"<!-- enerf ([0-9a-f]{64}) ([0-9a-f]{64}) -->\n")
 _LENGTH = len("<!-- enerf   -->\n") + 2 * 64
@@ -71,8 +78,6 @@ def _signature(digest: str) -> str:
 @functools.cache
 def _key() -> bytes:
     """32 random bytes, the same ones for all that a user does on a machine; where they cannot be kept, for all that this process does."""
-    from efficientnerf.backends.kernel_cache import cache_folder, first_private
-
     try:
         folder = first_private([cache_folder() / "pages"], "key")[0]
         if folder is None:
@@ -83,3 +88,17 @@ def _key() -> bytes:
         return path.read_bytes()
     except (OSError, RuntimeError):  # no home, no room
         return secrets.token_bytes(KEY)
+
+
+def viewer_is_missing(run: Run) -> bool:
+    """Whether the run has no viewer though its asset is one that gets a page: it could not be read, or nobody has written the page yet."""
+    size = size_of(BakeOutputs.of_run(run.path).asset)
+    return size is not None and size <= LARGEST and not os.path.lexists(run.path / VIEWER)
+
+
+def size_of(path: Path) -> int | None:
+    """Bytes of a plain file; None for anything else."""
+    with suppress(OSError):
+        status = os.stat(path, follow_symlinks=False)
+        return status.st_size if stat.S_ISREG(status.st_mode) else None
+    return None

@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from efficientnerf.asset.format import FormatError
 from pipeline.errors import CorruptArtifact
 from pipeline.run import cannot_write
-from stages.viewer.page import NAME
+from stages.viewer.page import NAME, write_viewer
+from workflows.cli.target import is_run
+from workflows.report.signature import is_own
+from workflows.report.viewer import write_viewer_of
 
 
 def present_page(what: Path, asset: Path) -> Path | None:
     """The page that a run has of its present asset, or None: one that another may have written is none."""
-    from workflows.cli.target import is_run
-    from workflows.report.signature import is_own
-
     if not is_run(what):
         return None
     try:
@@ -29,11 +30,6 @@ def make_page(what: Path, asset: Path, target: Path) -> None:
 
     Raises CorruptArtifact for a damaged asset, DiskFull, and BadInput where it cannot be written.
     """
-    from efficientnerf.asset.format import FormatError
-    from stages.viewer.page import write_viewer
-    from workflows.cli.target import is_run
-    from workflows.report.viewer import write_viewer_of
-
     try:
         if is_run(what):
             write_viewer_of(what, asset, target)

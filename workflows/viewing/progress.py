@@ -9,18 +9,21 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import msgspec
 
+from pipeline.artifact import workplace
+from pipeline.decide import Decision, survey
 from pipeline.errors import PipelineError
+from pipeline.hashes import Hashes
+from pipeline.run import Run
+from pipeline.stage import Stage
 from pipeline.text import printable
 from stages.artifacts import BakeOutputs, TrainOutputs
-
-if TYPE_CHECKING:
-    from pipeline.decide import Decision
-    from pipeline.run import Run
-    from pipeline.stage import Stage
+from stages.scratch import opened
+from workflows.cli.target import open_run
+from workflows.inspection.status import run_status
 
 TRAINED = (TrainOutputs, BakeOutputs)  # the stages that have a log and previews
 PREVIEW = re.compile(r"preview_([0-9]{6,12})\.png")
@@ -66,11 +69,6 @@ class Progress:
             return self._state
 
     def _look(self) -> dict[str, Any]:
-        from pipeline.decide import survey
-        from pipeline.hashes import Hashes
-        from workflows.cli.target import open_run
-        from workflows.inspection.status import run_status
-
         run = open_run(self.path)
         if self._hashes is None:
             self._hashes = Hashes(run.cache)
@@ -92,8 +90,6 @@ def asset_identity(run: Path) -> str | None:
 
 def _training(run: Run, decision: Decision, previews: dict[tuple[str, str], str]) -> dict[str, Any]:
     """The curve and the previews of a stage: of what is being made where there is any, else of what it made."""
-    from pipeline.artifact import workplace
-
     folder = run.folder(decision.stage)
     images = folder / TrainOutputs.previews  # the same name in both
     making = None if decision.fresh or decision.request is None else workplace(run.path, decision.stage, decision.request).scratch
@@ -125,8 +121,6 @@ def _preview_names(folder: Path) -> list[str]:
 
 def _lines(path: Path) -> list[_Line]:
     """A log's lines up to one that is none; none where there is no log yet."""
-    from stages.scratch import opened
-
     found: list[_Line] = []
     try:
         with opened(path) as file:

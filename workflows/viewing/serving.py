@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import sys
 import tempfile
 import threading
 import time
+import webbrowser
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.errors import UsageError
 from pipeline.interrupt import stopping
+from pipeline.stage import Stage
 from stages.viewer.page import NAME
+from workflows.cli.target import asset_of, is_run, open_run
 from workflows.viewing.page import make_page, present_page
-
-if TYPE_CHECKING:
-    from pipeline.stage import Stage
+from workflows.viewing.server import LOOPBACK, Server
+from workflows.viewing.sites import AssetSite, RunSite
 
 LOOK = 0.2  # seconds between two looks whether a signal came
 
 
 def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
     """The viewer page of a run or an asset file, and whether it was made now: in a run that can be written, or in a new temporary folder that stays."""
-    from workflows.cli.target import asset_of, is_run
-
     asset = asset_of(what)
     there = None if force else present_page(what, asset)
     if there is not None:
@@ -37,8 +37,6 @@ def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
 
 def check_address(address: str | None, port: int | None) -> bool:
     """Whether what is to be listened on is reached from this machine alone. Raises UsageError for what is no number of an interface."""
-    import ipaddress
-
     if address is None:
         return True
     if port is None:
@@ -51,8 +49,6 @@ def check_address(address: str | None, port: int | None) -> bool:
 
 def open_in_browser(url: str) -> bool:
     """Whether a browser was asked to show a page: not without a screen, where one would take the terminal."""
-    import webbrowser
-
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return False
     try:
@@ -67,10 +63,6 @@ def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, r
     address  None: this machine alone
     ready    is told the URL
     """
-    from workflows.cli.target import asset_of, is_run, open_run
-    from workflows.viewing.server import LOOPBACK, Server
-    from workflows.viewing.sites import AssetSite, RunSite
-
     with tempfile.TemporaryDirectory(prefix="enerf-view-") as name, stopping() as stop:
         folder = Path(name)
         if is_run(what):

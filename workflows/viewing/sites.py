@@ -8,16 +8,15 @@ import re
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
+from pipeline.stage import Stage
 from stages.viewer.page import NAME, policy
+from workflows.cli.output import plain
+from workflows.cli.target import asset_of
 from workflows.viewing.page import make_page
 from workflows.viewing.progress import PREVIEW, Progress, asset_identity
 from workflows.viewing.server import Answer, open_inside
-
-if TYPE_CHECKING:
-    from pipeline.stage import Stage
 
 HTML, JSON, PNG = "text/html; charset=utf-8", "application/json", "image/png"
 LIVE = {"/": ("live.html", HTML), "/live.js": ("live.js", "text/javascript; charset=utf-8"), "/live.css": ("live.css", "text/css; charset=utf-8")}
@@ -63,8 +62,6 @@ class RunSite:
         return None if found is None else self._preview(found[1], found[2])
 
     def status(self) -> bytes:
-        from workflows.cli.output import plain
-
         return json.dumps(plain(self.progress.state()), ensure_ascii=True, allow_nan=False).encode("ascii")
 
     def _preview(self, stage: str, name: str) -> Answer | None:
@@ -74,8 +71,6 @@ class RunSite:
 
     def _viewer(self) -> Answer | None:
         """Of the present asset, made on the first request for it."""
-        from workflows.cli.target import asset_of
-
         with self._making:
             try:
                 asset = asset_of(self.run)

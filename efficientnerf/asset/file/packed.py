@@ -19,6 +19,8 @@ from efficientnerf.asset.file.checks import number
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.streams import Family
 from efficientnerf.asset.file.whole_scene import bits, booleans, grids_of, occupancy_name
+from efficientnerf.backends.numba.entropy import walks
+from efficientnerf.backends.pieces import pieces
 
 MINOR = 5  # the version that brought it
 STREAMS = ("packed.occupancy", "packed.mask", "packed.density", "packed.base", "packed.sh")
@@ -115,8 +117,6 @@ def _walk_all(meta: dict[str, Any], grids: list[np.ndarray], stored: np.ndarray,
     tables  of densities, bases and harmonics
     each    bricks of a slice
     """
-    from efficientnerf.backends.numba.entropy import walks
-
     b, (bricks, cube) = int(meta["brick"]), stored.shape
 
     def occupancy(coder: Any) -> None:
@@ -164,8 +164,6 @@ def _voxels_before(stored: np.ndarray) -> np.ndarray:
 
 
 def _neighbours(before: np.ndarray, stored: np.ndarray, b: int) -> np.ndarray:
-    from efficientnerf.backends.numba.entropy import walks
-
     neighbours = np.full((int(np.count_nonzero(stored)), 3), -1, np.int32)
     index = np.where(stored, np.cumsum(stored, dtype=np.int32).reshape(stored.shape) - 1, -1).astype(np.int32)
     for piece in _pieces(len(stored)):
@@ -178,8 +176,6 @@ def _walk_codes(codes: Tensors, tables: Tensors, neighbours: np.ndarray, first: 
 
     first  (S + 1,) int64: voxels of the slices
     """
-    from efficientnerf.backends.numba.entropy import walks
-
     density, base, sh = codes["voxel.density"], codes["voxel.base"], codes["voxel.sh"]
     _, groups = sh.shape
     near = neighbours.reshape(-1)
@@ -217,8 +213,6 @@ def quarters_of(entries: int) -> np.ndarray:
 
 def code_families(groups: int, *, wide: bool) -> list[Family]:
     """The contexts of `packed.sh`, each group's in a lane; `wide` where codes have two bytes."""
-    from efficientnerf.backends.numba.entropy import walks
-
     kinds = [(walks.REPEAT_CONTEXTS, walks.NEW + 1), (walks.CODE_CONTEXTS, 256), *([(walks.LOW_CONTEXTS, 256)] if wide else [])]
     out = [Family(0)]
     for group in range(groups):
@@ -252,6 +246,4 @@ def _borders(b: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pieces(count: int, first: int = 1024) -> Iterator[slice]:
-    from efficientnerf.backends.pieces import pieces
-
     return pieces(count, first=first)

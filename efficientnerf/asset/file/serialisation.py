@@ -22,6 +22,7 @@ from efficientnerf.asset.cascades import bricks_of, order_of, voxel_sides
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.layouts import LIMIT
 from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.quantisation import compacted, quantised_density
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.harmonics import harmonics_count
 
@@ -105,8 +106,6 @@ def _sparse(tree: NerfTree) -> Written:
 
 def _coded(tree: NerfTree) -> Written:
     """Codes as they are; only densities of more than 256 values are rounded."""
-    from efficientnerf.asset.quantisation import quantised_density
-
     assert isinstance(tree.harmonics, PaletteHarmonics)
     order = order_of(tree)
     codes = tree.harmonics.subset(order)
@@ -124,22 +123,16 @@ def _coded(tree: NerfTree) -> Written:
 
 
 def _compact(tree: NerfTree) -> Written:
-    from efficientnerf.asset.quantisation import compacted
-
     kept = isinstance(tree.harmonics, PaletteHarmonics) and set(tree.harmonics.groups) <= {1} and len(tree.harmonics.palette) <= 256
     return _coded(tree if kept else compacted(_checked(tree)))
 
 
 def _packed(tree: NerfTree) -> Written:
     """Codes as they are, whatever their groups, and else those of `compact`; `format.serialize` codes them. Cheaper ones: `efficientnerf.asset.economy`."""
-    from efficientnerf.asset.quantisation import compacted
-
     return replace(_coded(tree if isinstance(tree.harmonics, PaletteHarmonics) else compacted(_checked(tree))), layout="packed")
 
 
 def _small(tree: NerfTree) -> Written:
-    from efficientnerf.asset.quantisation import compacted
-
     above = tree.harmonics_count - 1
     groups = (above,) if above else ()
     kept = isinstance(tree.harmonics, PaletteHarmonics) and tree.harmonics.groups == groups

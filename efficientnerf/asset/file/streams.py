@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.asset.file.container import FormatError
+from efficientnerf.backends.numba.entropy import rans
 
 MOST_TABLES = 255
 MOST_SLICES = 4096
@@ -53,8 +54,6 @@ def _lanes(families: Sequence[Family]) -> int:
 
 def recorder(most: Sequence[int]) -> Coder:
     """A coder that records at most so many symbols of each slice."""
-    from efficientnerf.backends.numba.entropy import rans
-
     ends = np.cumsum([0, *most], dtype=np.int64)
     blank = np.zeros((0, rans.SLOTS), np.uint8)
     state, failed = np.zeros((len(most), 1), np.int64), np.zeros(len(most), np.int64)
@@ -65,8 +64,6 @@ def recorder(most: Sequence[int]) -> Coder:
 
 def reader(name: str, tensor: str, raw: np.ndarray, families: Sequence[Family], slices: int) -> Coder:
     """A coder that reads the bytes of a tensor; FormatError where its tables break a rule."""
-    from efficientnerf.backends.numba.entropy import rans
-
     contexts, lanes = families[-1].end, _lanes(families)
     try:
         table, frequency, sizes, at = _parsed(raw[:MOST_HEAD].tobytes(), contexts, rans.SLOTS, slices)
@@ -95,8 +92,6 @@ def reader(name: str, tensor: str, raw: np.ndarray, families: Sequence[Family], 
 
 def check(name: str, tensor: str, coder: Coder) -> None:
     """FormatError where what was read is no stream, or does not end with its bytes."""
-    from efficientnerf.backends.numba.entropy import rans
-
     assert isinstance(coder, rans.Coder)
     if not coder.reads:
         return
@@ -158,8 +153,6 @@ def _parsed(data: bytes, contexts: int, slots: int, slices: int) -> tuple[np.nda
 
 def counts(coder: Coder, contexts: int) -> np.ndarray:
     """How often (n, 256) each symbol of each context was recorded."""
-    from efficientnerf.backends.numba.entropy import rans
-
     assert isinstance(coder, rans.Coder)
     out = np.zeros((contexts, 256), np.int64)
     for first, last in zip(coder.end.tolist(), coder.at.tolist(), strict=True):
@@ -171,8 +164,6 @@ def counts(coder: Coder, contexts: int) -> np.ndarray:
 
 def written(coder: Coder, families: Sequence[Family]) -> np.ndarray:
     """The bytes of the tensor that hold what `coder` recorded."""
-    from efficientnerf.backends.numba.entropy import rans
-
     assert isinstance(coder, rans.Coder)
     begin, end, slices, lanes = coder.end, coder.at, len(coder.at), _lanes(families)
     table, frequency = _tables(counts(coder, families[-1].end), families)
@@ -197,8 +188,6 @@ def written(coder: Coder, families: Sequence[Family]) -> np.ndarray:
 
 def _tables(counts: np.ndarray, families: Sequence[Family]) -> tuple[np.ndarray, np.ndarray]:
     """The table of each context (n,) uint8, and the frequencies (T, 256) uint32 of each."""
-    from efficientnerf.backends.numba.entropy import rans
-
     table = np.zeros(len(counts), np.uint8)
     rows: list[np.ndarray] = []
     most = max(1, MOST_TABLES // len(families))

@@ -13,7 +13,7 @@ import numpy as np
 from efficientnerf.asset.cascades import MAX_CASCADES, check_nesting
 from efficientnerf.asset.file.checks import FARTHEST, coarse_shape, number, numbers
 from efficientnerf.asset.file.container import FormatError
-from efficientnerf.asset.region import Region
+from efficientnerf.asset.tree import Region
 
 NEAREST_PREFIX = "nearest-"  # of layouts whose voxels are not interpolated; before the other prefix where both hold
 NESTED_PREFIX = "nested-"  # of layouts with several grids, or with an environment map

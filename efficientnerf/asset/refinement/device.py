@@ -1,6 +1,6 @@
 """Steps of refinement on CUDA: pixels, rays, values and steps stay on the device, and the host waits only when the state is fetched.
 
-Kernels: `efficientnerf.backends.triton.tree_gradients`, `tree_packets` and `tree_steps`. N voxels, K harmonics, R rays.
+Kernels: `efficientnerf.backends.triton.tree_gradients` and `tree_steps`. N voxels, K harmonics, R rays.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset.refinement.error_map import INTERVAL, Drawn, ErrorMap
-from efficientnerf.asset.refinement.host import MAX_PACKET_ANGLE
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
@@ -24,7 +23,7 @@ from efficientnerf.backends.layout import Hyperparameters, Moments
 from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
 from efficientnerf.backends.transfer import constant, to_host_async
-from efficientnerf.backends.triton import tree_gradients, tree_packets
+from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
 from efficientnerf.backends.triton.tree_steps import Neighbours, step
 from efficientnerf.training.device_pixels import DevicePixels
@@ -66,19 +65,13 @@ class DeviceArrays:
                 arrived.synchronize()
             self.error = self.error_map.record(drawn, loss.numpy()) / 3
 
-    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters, min_weight: float = 0.0, first: Tensor | None = None) -> Tensor:
-        """Losses (R,) of the rays before the step.
-
-        first  (P + 1,) int64 first ray of each packet, and the end; None: rays that share nothing
-        """
+    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters, min_weight: float = 0.0) -> Tensor:
+        """Losses (R,) of the rays before the step."""
         values, sums = (self.values["density"], self.values["sh"]), (self.by_thickness, self.by_sh)
-        given: dict[str, Any] = {"min_weight": min_weight, "terms": hyperparameters.terms}
-        if first is None:
-            outputs = tree_gradients.forward(self.grid, rays, *values, min_weight=min_weight)
-            loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
-            tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number, **given)
-        else:
-            loss = tree_packets.loss_and_gradients(self.grid, first, rays, *values, wanted, sums, self.stamp, number, **given)
+        outputs = tree_gradients.forward(self.grid, rays, *values, min_weight=min_weight)
+        loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
+        terms = hyperparameters.terms
+        tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number, min_weight=min_weight, terms=terms)
         step(self.grid, values, sums, self.moments, self.stamp, hyperparameters, self.neighbours, number=number, rays=len(loss))
         return loss
 
@@ -95,14 +88,6 @@ def voxels_beside(tree: NerfTree) -> np.ndarray:
         beyond = np.take(joined, np.arange(b) + (1 if upper else b - 1), axis=axis)
         found[index[index >= 0], face] = beyond[index >= 0]
     return found
-
-
-def packets_within(first: np.ndarray, most: int) -> np.ndarray:
-    """`first` (P + 1,) of packets that are cut into those of at most so many rays."""
-    sizes = np.diff(first)
-    parts = -(-sizes // most)
-    number = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
-    return np.append(np.repeat(first[:-1], parts) + most * number, first[-1])
 
 
 def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
@@ -131,11 +116,10 @@ def optimise(
             error_map.set_chances()
         drawn = error_map.draw(rays, step_rng(seed, number))
         origins, directions, wanted = targets.of(drawn.patches.pixels)
-        first = targets.pixels.to_device(packets_within(drawn.patches.first, tree_packets.RAYS)) if patches.angle <= MAX_PACKET_ANGLE else None
         factor = fall(number)
         rates = {"density_lr": density_lr * factor, "sh_lr": sh_lr * factor, "view_share": view_dependent_lr_ratio}
         hyperparameters = rule.hyperparameters(number, state.tree.harmonics_count, **rates)
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters, rule.min_weight, first)
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters, rule.min_weight)
         arrays.pending.append((drawn, *to_host_async(loss)))
         state.step = number
         arrays.record(0 if number == begin + 1 else LAG)

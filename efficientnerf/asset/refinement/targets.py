@@ -6,16 +6,16 @@ R rays, H rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import torch
 
+from efficientnerf.backends import dispatch
 from efficientnerf.backends.layout import RayTargets
 from efficientnerf.rendering import environment
+from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.pixels import Pixels
-
-if TYPE_CHECKING:
-    from efficientnerf.training.device_pixels import DevicePixels
 
 MEAN, VARIANCE = 0.5, 0.25  # of a random background: mean of a channel, and the three channels' variances summed; see `Targets`
 
@@ -61,18 +61,12 @@ class Targets:
 
     def to(self, device: str) -> Targets:
         """These targets on "cpu" or "cuda", the latter where its kernels can be built."""
-        from efficientnerf.backends import dispatch
-
         if device == "cpu" or not dispatch.triton_usable():
             return self
         return self.sent(device)
 
     def sent(self, device: Any) -> Targets:
         """These targets on a torch device."""
-        import torch
-
-        from efficientnerf.training.device_pixels import DevicePixels
-
         assert isinstance(self.pixels, Pixels)
         sent = None if self.environment is None else torch.from_numpy(np.ascontiguousarray(self.environment)).to(device)
         return replace(self, pixels=DevicePixels(self.pixels, device), environment=sent)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from efficientnerf.asset.tree import NerfTree, leaps
-
-if TYPE_CHECKING:
-    from efficientnerf.training.patches import PatchGrid
+from efficientnerf.backends.numba.tree_training.hits import come_near
+from efficientnerf.backends.pieces import pieces
+from efficientnerf.training.patches import PatchGrid
 
 MOST_MET = 0.9  # share of the tiles above which all are drawn
 
@@ -30,8 +29,6 @@ def tiles_met(tree: NerfTree, patches: PatchGrid) -> np.ndarray | None:
     if reach > 255:
         return None
     leap = leaps(leaps(tree.brick_index >= 0) <= reach)
-    from efficientnerf.backends.numba.tree_training.hits import come_near
-    from efficientnerf.backends.pieces import pieces
 
     met = np.empty(len(patches), bool)
     for part in pieces(len(patches), first=2**12):

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import RayBundle, SampleColumns
+from efficientnerf.backends.numba import adam as kernel
+from efficientnerf.backends.numba import compositing, hash_grid, mlp, occupancy, rays, sampling
+from efficientnerf.backends.numba.sampling import Box
+from efficientnerf.backends.numba.tree import nearest
+from efficientnerf.backends.numba.tree.rendering import render_rays
+from efficientnerf.backends.torch.hash_grid import HashLevels
+from efficientnerf.fields.gradient_buffer import GradientBuffer
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.rendering.compositing import Composite
 from efficientnerf.sampling.samples import Samples
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.backends.numba.sampling import Box
-    from efficientnerf.backends.torch.hash_grid import HashLevels
-    from efficientnerf.fields.gradient_buffer import GradientBuffer
-    from efficientnerf.geometry.spaces import Space
 
 
 def _array(t: Tensor) -> np.ndarray:
@@ -26,8 +28,6 @@ def _array(t: Tensor) -> np.ndarray:
 
 
 def _box(space: Space) -> Box:
-    from efficientnerf.backends.numba.sampling import Box
-
     return Box(space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted)
 
 
@@ -35,32 +35,24 @@ def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, max_intervals: int,
     voxels: Tensor, threshold: float, *, unpruned: int = 0,
 ) -> Samples:  # fmt: skip
-    from efficientnerf.backends.numba import sampling
-
     bundle = RayBundle(*(_array(t) for t in (origins, directions, near, far, offset)))
     *packed, tried = sampling.valid_samples(bundle, _box(space), step, max_intervals, _array(voxels), threshold, unpruned)
     return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
 
 
 def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: int) -> Tensor:
-    from efficientnerf.backends.numba import sampling
-
     out = torch.empty(len(weight), dtype=torch.bool)
     sampling.select_pivots(_array(weight), _array(first), np.float32(threshold), max_pivots, out.numpy())
     return out
 
 
 def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
-    from efficientnerf.backends.numba import sampling
-
     bundle, columns = RayBundle(*map(_array, (origins, directions, offset, offset, offset))), SampleColumns(*map(_array, coarse[1:5]))
     fine = sampling.pivotal_samples(bundle, _box(space), _array(coarse.first), columns, _array(pivotal), per_pivot)
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 
 def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str) -> None:
-    from efficientnerf.backends.numba import occupancy
-
     occupancy.update_occupancy(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
 
 
@@ -72,8 +64,6 @@ def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, bac
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, exponential: bool) -> tuple[Tensor, ...]:
-        from efficientnerf.backends.numba import compositing
-
         rays = len(first) - 1
         colour, opacity, distortion = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays)
         weight, rgb = torch.empty(len(raw)), torch.empty(len(raw), 3)
@@ -86,8 +76,6 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        from efficientnerf.backends.numba import compositing
-
         *given, weight, rgb = ctx.saved_tensors
         grad_raw, grad_background = torch.empty(given[0].shape), torch.empty(given[4].shape)
         arrays = [_array(t) for t in (weight, rgb, *grads[:4])]
@@ -102,8 +90,6 @@ def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: Gradient
 
 def _encoded(points: Tensor, table: Tensor, levels: HashLevels) -> tuple[Tensor, Tensor]:
     """Points (3, N) and features (F L, N): the order that the kernels want."""
-    from efficientnerf.backends.numba import hash_grid
-
     transposed, out = torch.empty(3, len(points)), torch.empty(table.shape[1] * len(levels.sides), len(points))
     hash_grid.transpose_points(_array(points), transposed.numpy())
     hash_grid.encode(transposed.numpy(), table.detach().numpy(), *levels, out.numpy())
@@ -112,8 +98,6 @@ def _encoded(points: Tensor, table: Tensor, levels: HashLevels) -> tuple[Tensor,
 
 def _add_table_gradient(points: Tensor, grad: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> None:
     """Add to the buffer for gradients (F L, N) of the features at points (3, N)."""
-    from efficientnerf.backends.numba import hash_grid
-
     hash_grid.encode_backward(points.numpy(), grad.numpy(), *levels, gradient.accumulator(table).numpy())
 
 
@@ -143,8 +127,6 @@ class _HashNetwork(torch.autograd.Function):
     def forward(
         ctx: Any, points: Tensor, table: Tensor, levels: HashLevels, offset: float, precision: torch.dtype, gradient: GradientBuffer, *weights: Tensor
     ) -> Tensor:
-        from efficientnerf.backends.numba import mlp
-
         at, features = _encoded(points, table, levels)
         prepared = mlp.pack_weights([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
         out = torch.empty(len(points), len(weights[-1]))
@@ -157,8 +139,6 @@ class _HashNetwork(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        from efficientnerf.backends.numba import mlp
-
         of_features, of_weights = mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
         ctx.kept = None
         _add_table_gradient(ctx.at, torch.from_numpy(of_features), ctx.table, ctx.levels, ctx.gradient)
@@ -170,15 +150,11 @@ def adam(
     epsilon: float, *, skip_zeros: bool,
 ) -> None:  # fmt: skip
     """Also clears the gradient, where it is contiguous."""
-    from efficientnerf.backends.numba import adam as kernel
-
     flat = [t.detach().view(-1).numpy() for t in (value, grad.contiguous(), first, second)]
     kernel.adam(*flat, *(np.float32(x) for x in (rate, beta1, beta2, correction1, correction2, epsilon)), skip_zeros)
 
 
 def ray_directions(lookup: Tensor, begin: Tensor, knots: Tensor, stride: int, pixel: Tensor, width: Tensor, rotation: Tensor, view: Tensor) -> Tensor:
-    from efficientnerf.backends.numba import rays
-
     out = torch.empty(len(view), 3)
     rays.ray_directions(*(_array(t) for t in (lookup, begin, knots)), stride, *(_array(t) for t in (pixel, width, rotation, view)), out.numpy())
     return out
@@ -188,9 +164,6 @@ def tree_rays(
     tree: NerfTree, origins: np.ndarray, directions: np.ndarray, views: np.ndarray | None, eye: np.ndarray | None, columns: int | None
 ) -> tuple[np.ndarray, ...]:
     if tree.lookup == "nearest":
-        from efficientnerf.backends.numba.tree import nearest
-
         return nearest.render_rays(tree, origins, directions, views)
-    from efficientnerf.backends.numba.tree.rendering import render_rays
 
     return render_rays(tree, origins, directions, views, eye, columns)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from efficientnerf.fields.gradient_buffer import GradientBuffer
+from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 PRIME_Y, PRIME_Z = 2654435761, 805459861  # section 3
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,9 +19,7 @@ from torch import Tensor
 from efficientnerf.backends.torch.hash_grid import HashLevels, relu_network
 from efficientnerf.backends.triton.launch import LANES, blocks
 from efficientnerf.backends.triton.vectors import Vec3
-
-if TYPE_CHECKING:
-    from efficientnerf.fields.gradient_buffer import GradientBuffer
+from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 FEATURES = 2
 

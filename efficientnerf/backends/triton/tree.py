@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ import triton
 from torch import Tensor
 
 from efficientnerf.asset.cascades import brick_ranges, cascades_of
-from efficientnerf.asset.tree import leaps
+from efficientnerf.asset.tree import NerfTree, leaps
 from efficientnerf.backends.transfer import constant, to_device
 from efficientnerf.backends.triton.launch import INTERPRETED
 from efficientnerf.backends.triton.tree_march import Cascades, Rays
@@ -28,15 +28,12 @@ from efficientnerf.backends.triton.vectors import Vec3
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
 
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
-
 TILE = (32, 16) if INTERPRETED else (8, 4)  # pixels of a program
 BRICKS_PER_BLOCK = 2**14
 # A program's warps by the length of a voxel's row of coefficients: as few as keep the row and the basis in registers; twice as many for nested trees.
 WARPS = {4: 1, 16: 1, 32: 1, 64: 4, 128: 4}
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
-NO_CAMERA = DeviceCamera(*[Vec3(0.0, 0.0, 0.0)] * 4, 0.0, 0.0, 0.0, 0.0)
+NO_CAMERA = DeviceCamera(*[Vec3(0.0, 0.0, 0.0)] * 4, *[0.0] * 4)
 
 
 def device_cascades(tree: NerfTree, owner: Tensor) -> Cascades:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,15 +22,13 @@ import triton.language as tl
 from torch import Tensor
 
 from efficientnerf.asset.cascades import voxel_cascades
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import RayTargets
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import brick_arrays, device_cascades
 from efficientnerf.backends.triton.tree_march import Cascades, Rays, colour_of, corner_place, corner_weight, interpolate_harmonics, march_cascades
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, store_vec3, zeros_vec3
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 # Rays and warps of a program by the length of a row of coefficients: so few that what a sample needs stays in registers. Rays of a bundle come from
 # anywhere, and a program lasts as long as its longest.

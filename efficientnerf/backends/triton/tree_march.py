@@ -80,7 +80,6 @@ class Sample(NamedTuple):
     step         to the next sample, voxels
     inside       whether it lies in a brick
     corner       place of its lowest corner in the arrays of bricks with border
-    parity       whether that corner's coordinates in the grid are odd: 4 for x, 2 for y, 1 for z
     fraction     Vec3 from there to the next corner, 0 to 1
     """
 
@@ -89,7 +88,6 @@ class Sample(NamedTuple):
     step: Any
     inside: Any
     corner: Any
-    parity: Any
     fraction: Any
 
 
@@ -153,14 +151,12 @@ def _first_corner(u, cell, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type:
 
 @triton.jit
 def _place_in_brick(point, cell, brick, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
-    """`corner`, `parity` and `fraction` of a Sample."""
+    """`corner` and `fraction` of a Sample."""
     EDGE: tl.constexpr = BRICK + 2
     i, fx = _first_corner(point.x, cell.x, BRICK, NEAREST)
     j, fy = _first_corner(point.y, cell.y, BRICK, NEAREST)
     k, fz = _first_corner(point.z, cell.z, BRICK, NEAREST)
-    x, y, z = cell.x * BRICK + i - 1, cell.y * BRICK + j - 1, cell.z * BRICK + k - 1
-    parity = ((x & 1) * 2 + (y & 1)) * 2 + (z & 1)
-    return brick.to(tl.int64) * (EDGE * EDGE * EDGE) + (i * EDGE + j) * EDGE + k, parity, Vec3(fx, fy, fz)
+    return brick.to(tl.int64) * (EDGE * EDGE * EDGE) + (i * EDGE + j) * EDGE + k, Vec3(fx, fy, fz)
 
 
 @triton.jit
@@ -175,8 +171,8 @@ def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  #
     exit_y, exit_z = _cube_exit(o.y, d.y, inverse.y, cell.y, radius, BRICK), _cube_exit(o.z, d.z, inverse.z, cell.z, radius, BRICK)
     exit = tl.minimum(_cube_exit(o.x, d.x, inverse.x, cell.x, radius, BRICK), tl.minimum(exit_y, exit_z))
     after = tl.minimum(tl.maximum(tl.ceil((tl.minimum(exit, ray.leave) - ray.enter) / ray.step - 0.5), 0.0), 1e9).to(tl.int32)
-    corner, parity, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
-    return Sample(t, ray.unit, ray.step, alive & (owner >= 0), corner, parity, fraction), tl.where(owner < 0, tl.maximum(k + 1, after), k + 1)
+    corner, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
+    return Sample(t, ray.unit, ray.step, alive & (owner >= 0), corner, fraction), tl.where(owner < 0, tl.maximum(k + 1, after), k + 1)
 
 
 @triton.jit

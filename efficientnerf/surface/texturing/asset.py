@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.colours import CHUNK, surface_colours
 from efficientnerf.surface.mesh import Mesh, Texture, vertex_normals
 from efficientnerf.surface.texturing.atlas import Atlas, atlas_of
 from efficientnerf.surface.texturing.filling import texture_from
 from efficientnerf.surface.volume import NdcVolume, volume_of
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 TEXELS_PER_VOXEL = 1.5
 

@@ -7,11 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
+from efficientnerf.backends.numba.mesh.charts import lay_faces, pack, profiles
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.surface.mesh import face_areas
 from efficientnerf.surface.texturing.charts import Charts, charts_of
 
-SMALLEST, LARGEST = 16, 8192  # texels along a side
+SMALLEST = 16  # texels along a side
 FILLED = 0.7  # share of a square that packed charts fill, about
 STEP = 0.97  # of the scale, until charts fit
 ENOUGH = 0.8  # of the scale that is wanted, or that the charts' area alone allows
@@ -99,8 +100,6 @@ def gap_of(size: int) -> int:
 
 def _packed(charts: Charts, scale: float, size: int) -> np.ndarray | None:
     """Corners (F, 3, 2) in texels of charts packed at a scale; None where they do not fit."""
-    from efficientnerf.backends.numba.mesh.charts import pack, profiles
-
     gap = gap_of(size) // 2
     corners = charts.corners * scale
     far = np.zeros((charts.count, 2))
@@ -126,8 +125,6 @@ def _packed(charts: Charts, scale: float, size: int) -> np.ndarray | None:
 
 
 def _texels(atlas: Atlas) -> Texels:
-    from efficientnerf.backends.numba.mesh.charts import lay_faces
-
     owner = np.full((atlas.size, atlas.size), -1, np.int32)
     corners = np.ascontiguousarray(atlas.corners)
     for part in pieces(len(corners), first=4096):

@@ -9,7 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
+from efficientnerf.backends.numba.mesh.charts import best_turns, grow, overlapping
 from efficientnerf.surface.mesh import face_neighbours, face_vectors
 
 SMOOTHING = 4  # rounds over neighbouring faces, of the normals that charts are grown by
@@ -41,8 +44,6 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
 
     texel  side of a texel, about, in the mesh's units: faces of a chart nowhere lie over each other, as far as half of that resolves
     """
-    from efficientnerf.backends.numba.mesh.charts import grow
-
     beside, vectors = face_neighbours(faces, len(vertices)), face_vectors(vertices, faces)
     areas = np.linalg.norm(vectors, axis=1)
     normals = np.divide(vectors, areas[:, None], out=np.zeros_like(vectors), where=areas[:, None] > 0)
@@ -83,8 +84,6 @@ def _smoothed(normals: np.ndarray, areas: np.ndarray, beside: np.ndarray) -> tup
 
 def flattened(vertices: np.ndarray, faces: np.ndarray, chart: np.ndarray) -> Charts:
     """The charts in their planes; numbers without faces are closed up."""
-    from efficientnerf.backends.numba.mesh.charts import best_turns
-
     used, chart = np.unique(chart, return_inverse=True)
     chart, count = chart.reshape(-1).astype(np.int64), len(used)
     vectors = face_vectors(vertices, faces)
@@ -114,8 +113,6 @@ def plane(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _misplaced(charts: Charts, normals: np.ndarray, vectors: np.ndarray, grid: float) -> np.ndarray:
     """(F,) bool: faces that are folded over in their chart, or lie over another one."""
-    from efficientnerf.backends.numba.mesh.charts import overlapping
-
     order = np.argsort(charts.chart, kind="stable")
     begin = np.searchsorted(charts.chart[order], np.arange(charts.count + 1))
     edge = np.diff(charts.corners, axis=1)
@@ -171,9 +168,6 @@ def _joined(chart: np.ndarray, beside: np.ndarray, normals: np.ndarray, areas: n
 
 def _connected(chart: np.ndarray, beside: np.ndarray) -> np.ndarray:
     """Charts that fell apart as several."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
     face, side = np.nonzero(beside >= 0)
     other = beside[face, side]
     same = chart[face] == chart[other]

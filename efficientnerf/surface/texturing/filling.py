@@ -4,15 +4,15 @@ of the texture have no seams."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
 
+from efficientnerf.backends.numba.mesh.charts import spread
 from efficientnerf.backends.pieces import pieces
+from efficientnerf.surface.mesh import Mesh
 from efficientnerf.surface.texturing.atlas import Atlas
-
-if TYPE_CHECKING:
-    from efficientnerf.surface.mesh import Mesh
 
 RINGS = 6  # of vertices, over which the colours that photographs show are carried on to where none shows anything. docs/experiments/textures.md
 NEAREST = 8  # vertices, of which what is further away has the mean, by the square of the distance
@@ -22,8 +22,6 @@ EMPTY = 128  # what a texture holds that has no texel at all
 
 def texture_from(atlas: Atlas, colours: np.ndarray) -> np.ndarray:
     """(S, S, 3) uint8 from the colours (T, 3) uint8 of an atlas's texels."""
-    from efficientnerf.backends.numba.mesh.charts import spread
-
     place, shape = atlas.texels.place, (atlas.size, atlas.size)
     if not len(place):
         return np.full((*shape, 3), EMPTY, np.uint8)
@@ -47,9 +45,6 @@ def carried_on(
     known    (T,) share of each that is from photographs; the rest is from
     expected (T, 3) uint8
     """
-    from scipy.sparse import csr_matrix
-    from scipy.spatial import cKDTree
-
     faces, count, texels = mesh.faces, len(mesh.vertices), atlas.texels
     sums, total = np.zeros((count, 3)), np.zeros(count)
     for corner in range(3):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from efficientnerf.backends.numba.mesh.normals import count_in_cells, normals_met, put_in_cells
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.surface.mesh import Mesh, Texture
 from efficientnerf.surface.smoothing import smoothed_face_normals
@@ -49,8 +50,6 @@ def with_normal_map(mesh: Mesh, dense: Dense, tick: Callable[[], None] = lambda:
 
 def normals_in_tangent_space(mesh: Mesh, texels: Texels, dense: Dense, tick: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
     """(T, 3) uint8 of the texels, and whether each has met the dense mesh (T,) bool; those that have not are flat."""
-    from efficientnerf.backends.numba.mesh.normals import normals_met
-
     split, frame = corner_frames(mesh)
     grid = _Grid.of(dense, tick)
     normals = dense_normals(dense, tick)
@@ -110,8 +109,6 @@ class _Grid:
 
     @classmethod
     def of(cls, dense: Dense, tick: Callable[[], None]) -> _Grid:
-        from efficientnerf.backends.numba.mesh.normals import count_in_cells, put_in_cells
-
         vertices, faces = dense.vertices, dense.faces
         edge = float(np.linalg.norm(vertices[faces[:, 1]] - vertices[faces[:, 0]], axis=1).mean())
         low, extent = vertices.min(0), np.ptp(vertices, 0)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from efficientnerf.backends.numba.mesh.photographs import blend, mark_edges, observe, sweep_down, sweep_up
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project, resized
 from efficientnerf.surface.mesh import Mesh, face_areas
@@ -184,8 +185,6 @@ def _seen(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: P
 
 def edge_distance(usable: np.ndarray, near: np.ndarray, tick: Callable[[], None] = _untold) -> np.ndarray:
     """(H, W) float32 pixels from what may not be used (H, W) bool, and from jumps in the inverse depth (H, W) float32; 4 REACH at most."""
-    from efficientnerf.backends.numba.mesh.photographs import mark_edges, sweep_down, sweep_up
-
     clear = np.where(usable, np.float32(4 * REACH), np.float32(0))
     rows = len(clear)
     for part in pieces(rows, first=64):
@@ -246,8 +245,6 @@ class PhotographTexture:
 
     def look(self, photo: Photograph, found: Survey, tick: Callable[[], None] = _untold) -> None:
         """Let all texels see a photograph."""
-        from efficientnerf.backends.numba.mesh.photographs import observe
-
         done = 0
         while done < self.halvings and min(photo.usable.shape) >= 2 * SMALLEST_PHOTOGRAPH:
             photo, done = halved(photo), done + 1
@@ -273,8 +270,6 @@ class PhotographTexture:
         self, expected: np.ndarray, views: int = KEPT, power: float = POWER, scale: float = SCALE, tick: Callable[[], None] = _untold
     ) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the texels (T, 3) uint8, and what share of each is from photographs (T,); `expected` (T, 3) uint8 where they show nothing."""
-        from efficientnerf.backends.numba.mesh.photographs import blend
-
         out, known = np.empty((len(self.seen), 3), np.uint8), np.empty(len(self.seen), np.float32)
         for part in pieces(len(self.seen), first=4096):
             tick()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 ROUNDS = 10  # of reweighting
 LEAST_SCALE = 0.05  # logarithm: residuals below it are all alike, colours have 8 bits
@@ -36,8 +37,6 @@ def fit_exposure(light: np.ndarray, point: np.ndarray, view: np.ndarray, radius:
     point      (O,) int64 of each observation, view (O,) int64 its photograph, radius (O,) r^2 in it
     camera_of  (C,) camera of each photograph
     """
-    from scipy import sparse
-
     count, cameras = len(camera_of), int(camera_of.max()) + 1
     point = np.unique(point, return_inverse=True)[1]
     rows, of = np.arange(len(point)), camera_of[view]

@@ -1,7 +1,6 @@
 """The checkpoint of a refinement in the bake's scratch folder: the state, how far it is, and where its voxels lie.
 
-What was baked gives the grids. A state's voxels are some of those that were baked: all of them before voxels are dropped for the first time. After voxels were
-split they are descendants of these, on grids of twice the resolution, or four times.
+What was baked gives the grids. A state's voxels are all of those that were baked in the first phase, and some of them in the second.
 
 N voxels, n voxels of the state.
 """
@@ -12,21 +11,22 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
-from efficientnerf.asset.refinement.schedule import RefinementSchedule, count_splits, recorded_schedule
+from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.refinement.schedule import RefinementSchedule, recorded_schedule
+from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
+from efficientnerf.asset.tree import NerfTree
 from pipeline.files import atomic, exists, remove
 from pipeline.stage import Job
 from stages.bake.pruning import Pruned
 from stages.scratch import opened, unusable
 from stages.train.budget import schedule_state
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.refinement.state import RefinementState
-    from efficientnerf.asset.tree import NerfTree
 
 CHECKPOINT = "refinement.safetensors"
 
@@ -38,7 +38,7 @@ class _About(msgspec.Struct, forbid_unknown_fields=True):
     """What a checkpoint says of itself: `Point` without the state."""
 
     step: Annotated[int, msgspec.Meta(ge=0, le=2**40)]
-    phase: Annotated[int, msgspec.Meta(ge=0, le=2**10)]
+    phase: Annotated[int, msgspec.Meta(ge=0, le=1)]
     pruned: Pruned | None
     schedule: list[dict[str, Any]]
     seconds: _Seconds
@@ -51,8 +51,8 @@ class Point:
     """How far a refinement is.
 
     schedule  of the steps
-    phase     number of the one whose steps are taken; those before it are done, and what is done after each of them
-    pruned    what the last pruning dropped; None before the first
+    phase     number of the one whose steps are taken
+    pruned    what was dropped after the first; None in it
     seconds   of the stage up to here
     began     seconds at which the phase began
     allotted  seconds that it may take, where there is a budget
@@ -69,12 +69,6 @@ class Point:
 
 def save(job: Job, point: Point) -> None:
     """Replace the checkpoint."""
-    from safetensors.numpy import save_file
-
-    from efficientnerf.asset.cascades import voxel_cascades
-    from efficientnerf.asset.refinement.state import STATE
-    from efficientnerf.asset.tree import voxel_coordinates
-
     state = point.state
     state.fetch()
     tensors = {name: np.ascontiguousarray(getattr(state, name)) for name in STATE}
@@ -105,15 +99,13 @@ def digest_of(tensors: Mapping[str, np.ndarray]) -> str:
 
 
 def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | None = None, *, cells: int) -> Point | None:
-    """The last checkpoint of a refinement of this tree with these phases; None where there is none that fits, and one that does not is removed.
+    """The last checkpoint of a refinement of this tree; None where there is none that fits, and one that does not is removed.
 
     tree    as it was baked
     stated  the schedule
     hold    of a phase whose number of steps follows from the time that they take; None: all of them are stated
     cells   of the error map
     """
-    from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
-
     path = job.work / CHECKPOINT
     if not exists(path):
         return None
@@ -121,9 +113,7 @@ def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | N
         found = _read(path)
         about, schedule, kept = check(found, tree, stated, hold)
         errors = _errors(found, about.step, cells)
-        splits = count_splits(stated.phases[: about.phase])
-        values = np.array(found["density"]), np.array(found["sh"])
-        fitted = _split_tree(tree, splits, found, *values) if splits else _with_values(tree, kept, *values)
+        fitted = _with_values(tree, kept, np.array(found["density"]), np.array(found["sh"]))
         density, sh, visits = (np.array(found[name]) for name in MOMENTS)
         state = RefinementState(fitted, density, sh, visits, about.step, errors)
     except (OSError, ValueError, RecursionError) as error:
@@ -136,8 +126,6 @@ def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | N
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """The tensors of a checkpoint; ValueError or OSError where it is not as it was written."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with opened(path), safe_open(str(path), framework="np") as file:
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
@@ -161,32 +149,10 @@ def _errors(found: Mapping[str, np.ndarray], step: int, cells: int) -> np.ndarra
 
 def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.ndarray) -> NerfTree:
     """The tree with the voxels `kept`, places of its own, alone, and their values."""
-    from efficientnerf.asset.cascades import subset
-
     keep = np.zeros(len(tree.density_values), bool)
     keep[kept] = True
     structure = subset(replace(tree, harmonics=tree.sh[:, :0]), keep)  # harmonics are most of the memory: none are copied
     return replace(structure, density_values=density, harmonics=sh.reshape(len(sh), -1, 3))
-
-
-def _split_tree(tree: NerfTree, splits: int, found: Mapping[str, np.ndarray], density: np.ndarray, sh: np.ndarray) -> NerfTree:
-    """A tree with the checkpoint's voxels on the grids of `tree`, which were split so often. ValueError where they are not in the order of a tree."""
-    from efficientnerf.asset.cascades import cascades_of, nested
-    from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
-
-    at, of, finer = found["coordinates"], _cascades(found), 2**splits
-    trees = []
-    for n, cascade in enumerate(cascades_of(tree)):
-        x, y, z = cascade.shape
-        here = of == n if tree.outer else slice(None)
-        trees.append(tree_from_voxels(
-            (x * finer, y * finer, z * finer), cascade.voxel / finer, cascade.bounds_min, at[here], density[here], sh[here].reshape(-1, sh.shape[1] // 3, 3),
-            brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup, step_size=tree.step_size,
-        ))  # fmt: skip
-    made = replace(nested(trees, tree.environment), region=tree.region) if tree.outer else replace(trees[0], region=tree.region)
-    if (np.diff(of.astype(np.int16)) < 0).any() or not np.array_equal(voxel_coordinates(made), at):
-        raise ValueError("its voxels are not in their order")
-    return made
 
 
 def _cascades(found: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -197,7 +163,7 @@ def _cascades(found: Mapping[str, np.ndarray]) -> np.ndarray:
 def check(
     found: Mapping[str, np.ndarray], tree: NerfTree, stated: RefinementSchedule, hold: int | None = None
 ) -> tuple[_About, RefinementSchedule, np.ndarray]:
-    """What the checkpoint says of itself; the schedule; and the places in the tree of the state's voxels, or of their ancestors. ValueError where the tensors
+    """What the checkpoint says of itself; the schedule; and the places in the tree of the state's voxels. ValueError where the tensors
     are no state of a refinement of this tree, or a step in it is out of range."""
     kinds = {"density": "float32", "sh": "float32", "square_density": "float32", "square_sh": "float32", "visits": "int32"}
     count = len(found["density"]) if "density" in found and found["density"].ndim else 0
@@ -210,30 +176,24 @@ def check(
         raise ValueError("'about' is missing, or no text")
     about = msgspec.json.decode(found["about"].tobytes(), type=_About)
     schedule = _schedule_of(about, stated, hold)
-    before = stated.phases[: about.phase]
-    splits = count_splits(before)
-    place = places(tree, found["coordinates"] >> splits, _cascades(found))
-    whole = splits == 0 and all(phase.after == "none" for phase in before)
-    if not count or (splits == 0 and (np.diff(place) <= 0).any()) or (count < len(tree.density_values) and whole):
+    place = places(tree, found["coordinates"], _cascades(found))
+    if not count or (np.diff(place) <= 0).any() or (count < len(tree.density_values) and about.phase == 0):
         raise ValueError("its voxels are not those that were baked, in their order")
     return about, schedule, place
 
 
 def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) -> RefinementSchedule:
     """The schedule that the checkpoint was written with; ValueError where it is none of this refinement, or the step is not one of the phase."""
-    phases = stated.phases
-    if about.phase > len(phases):
-        raise ValueError(f"step {about.step} of phase {about.phase}, of {len(phases)} phases")
-    if (about.pruned is None) == any(phase.after != "none" for phase in phases[: about.phase]):
+    if (about.pruned is None) == (about.phase == 1):
         raise ValueError(f"what was dropped up to phase {about.phase} is not what is dropped there")
     if hold is None:
         schedule = stated
         if about.schedule != stated.state():
             raise ValueError(f"step {about.step} is of another number of steps")
     else:
-        if len(about.schedule) != min(about.phase + 1, len(phases)):
+        if len(about.schedule) != about.phase + 1:
             raise ValueError(f"step {about.step} is not of the last phase that has begun")
-        schedule = recorded_schedule(phases, [schedule_state(one, hold) for one in about.schedule])
+        schedule = recorded_schedule([schedule_state(one, hold) for one in about.schedule])
     low, high = schedule.begin(about.phase), schedule.begin(about.phase + 1)
     if not low <= about.step <= high:
         raise ValueError(f"step {about.step} is not from {low} to {high}")
@@ -242,9 +202,6 @@ def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) ->
 
 def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.ndarray:
     """Which voxels of the tree lie at coordinates (n, 3) of their cascades (n,); ValueError where one of them is not stored."""
-    from efficientnerf.asset.cascades import cascades_of, voxel_cascades
-    from efficientnerf.asset.tree import voxel_coordinates
-
     sizes = np.asarray([cascade.shape for cascade in cascades_of(tree)], np.int64) * tree.brick
     if (cascades >= len(sizes)).any() or (coordinates < 0).any() or (coordinates >= sizes[cascades]).any():
         raise ValueError("voxels outside of the grid")
@@ -262,11 +219,3 @@ def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.
     if not np.array_equal(ours[place], theirs):
         raise ValueError("its voxels are not those that were baked, in their order")
     return place
-
-
-def ancestors(baked: NerfTree, tree: NerfTree, splits: int) -> np.ndarray:
-    """(n,) the voxel of a baked tree that each voxel of `tree`, which was split so often, was or lies in."""
-    from efficientnerf.asset.cascades import voxel_cascades
-    from efficientnerf.asset.tree import voxel_coordinates
-
-    return places(baked, voxel_coordinates(tree) >> splits, voxel_cascades(tree))

@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from efficientnerf.asset.refinement.state import RefinementState
+from stages.bake.refine.timing import Stopwatch
 from stages.train.log import continue_log, psnr_of
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.refinement.state import RefinementState
-    from stages.bake.refine.timing import Stopwatch
-    from stages.train.previews import Previews
+from stages.train.previews import Previews
 
 EVERY = 10  # steps
 SMOOTHING = 0.9  # of the running mean of the error

@@ -1,7 +1,7 @@
-"""Refinement in the bake stage: the baked values are fitted to the training images, in phases (`efficientnerf.asset.refinement.schedule`).
+"""Refinement in the bake stage: the baked values are fitted to the training images, in two phases (`efficientnerf.asset.refinement.schedule`).
 
-After a phase the tree is rendered along many training rays, and voxels that do not show are dropped (`stages.bake.pruning`): floaters have faded by then.
-Those that are left may be split into voxels of half the side. The steps after that correct for what is missing. An interrupted refinement goes on from its
+After the first the tree is rendered along many training rays, and voxels that do not show are dropped (`stages.bake.pruning`): floaters have faded by then.
+The steps after that correct for what is missing. An interrupted refinement goes on from its
 checkpoint (`stages.bake.refine.checkpoint`).
 
 With bake.time_budget the number of steps of a phase follows from the time that its first ones take, as in training (`stages.train.budget`).
@@ -10,121 +10,112 @@ With bake.time_budget the number of steps of a phase follows from the time that 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import shutil
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.refinement.schedule import Phase, RefinementSchedule, count_splits, stated_schedule
+from efficientnerf.asset.cascades import cascades_of
+from efficientnerf.asset.field_samples import FieldSamples
+from efficientnerf.asset.refinement import fit
+from efficientnerf.asset.refinement.error_map import count_cells
+from efficientnerf.asset.refinement.rule import Rule
+from efficientnerf.asset.refinement.schedule import PHASES, RefinementSchedule, stated_schedule
+from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
+from efficientnerf.asset.refinement.targets import Targets
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import given
+from efficientnerf.training.patches import PatchGrid
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs
 from stages.bake import pruning
 from stages.bake.holes import find_holes
-from stages.bake.pruning import Pruned, most_children
+from stages.bake.memory import free_on_device, needed_on_device
+from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint
 from stages.bake.refine.checkpoint import Point
 from stages.bake.refine.log import RefinementLog
 from stages.bake.refine.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, packing_seconds, timed_schedule
+from stages.bake.settings import BakeSettings
 from stages.cores import count_cores
+from stages.io.scene import Scene
 from stages.train.budget import Budget
 from stages.train.log import draw_curve, psnr_of
 from stages.train.previews import Previews
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.field_samples import FieldSamples
-    from efficientnerf.asset.refinement.targets import Targets
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.cameras import Camera
-    from stages.bake.run import BakeSettings
-    from stages.io.scene import Scene
 
 CHECKPOINT_SECONDS = 30.0
 ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
-MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, 6  # see `refinement_steps`
+MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, (6, 15)  # see `usual_steps`
 UNREFINED = 0.1  # of the steps that are usual: with fewer the asset is hardly refined
 ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
-
-Room = Callable[[int], int]  # voxels that the asset holds on its grids, which were split so often
 
 
 @dataclass(eq=False)
 class Refinement:
     """A refinement that is going on.
 
-    budget   seconds of the stage up to the end of the last step, or None
-    per_ray  seconds that measuring the error of a ray took
-    samples  of the field, for whole scenes: what was dropped wrongly is restored by them
-    baked    of whole scenes the voxels as they were baked, without harmonics
+    capacity  voxels that the asset holds
+    budget    seconds of the stage up to the end of the last step, or None
+    per_ray   seconds that measuring the error of a ray took
+    samples   of the field, for whole scenes: what was dropped wrongly is restored by them
+    baked     (N,) of whole scenes the densities before the first step
     """
 
     job: Job
     scene: Scene
     targets: Targets
-    room: Room
+    capacity: int
     stopwatch: Stopwatch
     point: Point
     log: RefinementLog
     budget: float | None
     per_ray: float = 0.0
     samples: FieldSamples | None = None
-    baked: NerfTree | None = None
+    baked: np.ndarray | None = None
     written: float = field(default_factory=clock)
 
     def run(self) -> NerfTree:
         """Take all steps that are left; the tree after the last of them."""
         point = self.point
-        phases = point.schedule.phases
         if not point.schedule.each:
             self._begin_phase()
-        while point.phase < len(phases):
+        if point.phase == 0:
             self._take_steps()
-            after = phases[point.phase].after
-            if after != "none":
-                self._prune(split=after == "split")
-            point.phase += 1
+            self._prune()
+            point.phase = 1
             self._begin_phase()
-            if after != "none":
-                self._save()
+            self._save()
+        self._take_steps()
         point.state.to_host()
         return replace(point.state.tree)  # what a renderer made of earlier values is left behind
 
     def _begin_phase(self) -> None:
         """Allot time to the phase, if there is a budget."""
         point = self.point
-        phases = point.schedule.phases
-        if self.budget is None or point.phase == len(phases):
+        if self.budget is None:
             return
         point.began = point.seconds = self.stopwatch.seconds
-        point.allotted = allotted(phases, point.phase, self.budget - point.began - self._operations_left())
+        point.allotted = allotted(point.phase, self.budget - point.began - (0.0 if point.phase else self._pruning_seconds()))
         point.schedule = point.schedule.with_phase(point.phase, timed_schedule())
 
-    def _operations_left(self) -> float:
+    def _pruning_seconds(self) -> float:
         """About how many seconds will go into which voxels show."""
-        state, phases = self.point.state, self.point.schedule.phases
-        voxels, rays = len(state.density), 0
-        for number, phase in enumerate(phases[self.point.phase :], self.point.phase):
-            if phase.after == "none":
-                continue
-            rays += pruning.count_rays(self.job, state.tree.ndc is not None, voxels, self.targets)
-            room = self.room(count_splits(phases[: number + 1]))
-            voxels = min(8 * voxels, most_children(room)) if phase.after == "split" else min(voxels, room)
-        return rays * self.per_ray * WEIGHT_SECONDS
+        state = self.point.state
+        return pruning.count_rays(self.job, state.tree.ndc is not None, len(state.density), self.targets) * self.per_ray * WEIGHT_SECONDS
 
     def _take_steps(self) -> None:
         """Take the steps that are left of the phase, with checkpoints on the way and where it is stopped."""
-        from efficientnerf.asset.refinement import fit
-        from efficientnerf.asset.refinement.rule import Rule
-
         settings, point, state, job = self.job.settings, self.point, self.point.state, self.job
         begin, number = point.schedule.begin(point.phase), point.phase
         spent = point.seconds - point.began
         budget = None if self.budget is None else Budget(point.allotted, point.schedule.each[number], WARMUP, spent, clock)
-        phase, end = point.schedule.phases[number].name, point.schedule.begin(number + 1)
+        phase, end = PHASES[number].name, point.schedule.begin(number + 1)
         if state.step >= end:
             return
         ratio, share = given(settings.view_dependent_lr_ratio), given(settings.error_map)
@@ -146,7 +137,7 @@ class Refinement:
                 job.say(f"{budget.schedule.iterations} steps with {phase} fit into the budget")
             fraction = point.schedule.fraction(state.step)
             shown = self.log.record(state, phase, fraction, settings.refine_rays_per_batch, error, took, last=state.step == end)
-            self._report(fraction, phase, shown)
+            self._report(phase, shown)
             if clock() - self.written > CHECKPOINT_SECONDS:
                 self._save()
             try:
@@ -158,7 +149,7 @@ class Refinement:
                 break
             step_began = clock()
 
-    def _report(self, fraction: float, phase: str, shown: dict[str, Any]) -> None:
+    def _report(self, phase: str, shown: dict[str, Any]) -> None:
         """Progress: in steps, or in seconds where there is a budget."""
         schedule, step = self.point.schedule, self.point.state.step
         done, total = (step, schedule.begin(len(schedule.each))) if self.budget is None else (self.stopwatch.seconds, self.budget)
@@ -170,37 +161,25 @@ class Refinement:
         checkpoint.save(self.job, self.point)
         self.written = clock()
 
-    def _prune(self, *, split: bool) -> None:
-        """Drop voxels that do not show, and split the others."""
-        from efficientnerf.asset.refinement import splitting
-
-        point, splits = self.point, count_splits(self.point.schedule.phases[: self.point.phase])
-        baked = None if self.baked is None else self.baked.density_values[checkpoint.ancestors(self.baked, point.state.tree, splits)]
-        most = most_children(self.room(splits + 1)) // 8 if split else self.room(splits)
-        point.state, point.pruned = pruning.prune(self.job, self.scene, point.state, self.targets, most, self.samples, baked)
-        if split:
-            point.state = splitting.split(point.state, np.ones(len(point.state.density), bool))
-            self.job.say(f"voxels are split: {len(point.state.density):,} with {max(point.state.tree.resolution)} along the longest side")
+    def _prune(self) -> None:
+        """Drop voxels that do not show."""
+        point = self.point
+        point.state, point.pruned = pruning.prune(self.job, self.scene, point.state, self.targets, self.capacity, self.samples, self.baked)
 
 
 def refined(
-    job: Job, s: Scene, tree: NerfTree, targets: Targets, phases: tuple[Phase, ...], room: Room, stopwatch: Stopwatch, samples: FieldSamples | None = None
+    job: Job, s: Scene, tree: NerfTree, targets: Targets, capacity: int, stopwatch: Stopwatch, samples: FieldSamples | None = None
 ) -> tuple[NerfTree, dict[str, Any]]:
-    """The refined tree with at most as many voxels as there is room for, and the entries of the report; the log, the curve and the previews are written.
+    """The refined tree of at most `capacity` voxels, and the entries of the report; the log, the curve and the previews are written.
 
     samples  of the field, for whole scenes: what was dropped wrongly is restored by them
     """
-    from efficientnerf.asset.refinement import fit
-    from efficientnerf.asset.refinement.error_map import count_cells
-    from efficientnerf.training.patches import PatchGrid
-
     settings = job.settings
-    splits = count_splits(phases)
-    most = min(len(tree.density_values) * 4**splits, room(splits))
-    steps, seconds = refinement_steps(settings, most, whole=_is_whole(tree)), given(settings.time_budget)
+    most = min(len(tree.density_values), capacity)
+    steps, seconds = refinement_steps(settings, most, len(targets.pixels) if _is_whole(tree) else None), given(settings.time_budget)
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
-    targets = targets_on_device(job, tree, targets, splits, room)
+    targets = targets_on_device(job, tree, targets)
     began = clock()
     before = fit.error(tree, targets, sample, settings.seed)
     measuring = clock() - began
@@ -212,17 +191,17 @@ def refined(
     if settings.layout == "packed":
         weighed = min(max(settings.visibility_rays, most), 4 * len(targets.pixels))
         finish += packing_seconds(most, count_cores(), per_ray, settings.refine_rays_per_batch, weighed, sample)
-    schedule = stated_schedule(phases, steps) if seconds is None else RefinementSchedule(phases)
-    baked = None if samples is None else _without_harmonics(tree, capped=bool(steps))
+    schedule = stated_schedule(steps) if seconds is None else RefinementSchedule()
+    baked = None if samples is None else _initial_density(tree, capped=bool(steps))
     cells = count_cells(PatchGrid(targets.host_pixels, fit.PATCH_SIDE))
     point = _first_point(job, tree, schedule, stopwatch, cells, timed=seconds is not None, capped=bool(steps))
     log = RefinementLog(
         job.work / BakeOutputs.log, point.state.step, point.schedule.fraction(point.state.step), stopwatch, _previews(job, s, point, targets), clock
     )  # fmt: skip
     if point.state.step == 0:
-        log.begin(point.state, phases[0].name, before)
+        log.begin(point.state, PHASES[0].name, before)
     del tree  # the state has values of its own
-    made = Refinement(job, s, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, per_ray, samples, baked)
+    made = Refinement(job, s, targets, capacity, stopwatch, point, log, None if seconds is None else seconds - finish, per_ray, samples, baked)
     tree = made.run()
     if point.state.step < UNREFINED * steps:
         job.warn(_unrefined(point.state.step, steps))
@@ -243,8 +222,6 @@ def _unrefined(taken: int, usual: int) -> str:
 
 def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, *, timed: bool, capped: bool) -> Point:
     """Where an earlier attempt stopped, or else the beginning."""
-    from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
-
     found = checkpoint.restored(job, tree, schedule, HOLD if timed else None, cells=cells)
     if found is None:
         return Point(initial_state(tree, MAX_INITIAL_THICKNESS if capped else math.inf), schedule)
@@ -252,18 +229,14 @@ def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwat
     return found
 
 
-def _without_harmonics(tree: NerfTree, *, capped: bool) -> NerfTree:
-    """The tree with the densities that its refinement begins with, and without colours."""
-    from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
-
+def _initial_density(tree: NerfTree, *, capped: bool) -> np.ndarray:
+    """(N,) the densities that the refinement of a tree begins with."""
     bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
-    return initial_state(bare, MAX_INITIAL_THICKNESS if capped else math.inf).tree
+    return initial_state(bare, MAX_INITIAL_THICKNESS if capped else math.inf).density
 
 
 def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
     """Renders of the tree as it is at the time."""
-    from efficientnerf.asset.rendering import render
-
     def seen(camera: Camera) -> np.ndarray:
         tree = replace(point.state.tree)  # what a renderer makes of values is kept with a tree, and these change
         return render(tree, camera, background=targets.background, normals=False).colour
@@ -273,8 +246,6 @@ def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
 
 def _publish(job: Job, log: RefinementLog) -> None:
     """The log, its curve and the previews."""
-    import shutil
-
     outputs = BakeOutputs(job.out)
     log.flush()
     shutil.copyfile(log.path, outputs.log)
@@ -290,20 +261,11 @@ def _holes(job: Job, tree: NerfTree, samples: FieldSamples, pruned: Pruned) -> d
     return holes
 
 
-def targets_on_device(job: Job, tree: NerfTree, targets: Targets, splits: int = 0, room: Room | None = None) -> Targets:
-    """The targets on the run's device, where the tree is then fitted; on the host where the device's memory is too small.
-
-    splits, room  how often its voxels will be split, and how many there is room for then
-    """
-    from efficientnerf.asset.cascades import cascades_of
-    from stages.bake.memory import free_on_device, needed_on_device
-
-    cells = sum(cascade.brick_index.size for cascade in cascades_of(tree)) * 8**splits
+def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
+    """The targets on the run's device, where the tree is then fitted; on the host where the device's memory is too small."""
+    cells = sum(cascade.brick_index.size for cascade in cascades_of(tree))
     voxels = len(tree.density_values)
-    if splits and room is not None:
-        voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
-    bricks = -(-len(tree.voxel_index) * voxels // max(len(tree.density_values), 1))
-    needed = needed_on_device(voxels, tree.harmonics_count, bricks, cells, tree.brick, smooth=job.settings.total_variation > 0)
+    needed = needed_on_device(voxels, tree.harmonics_count, len(tree.voxel_index), cells, tree.brick, smooth=job.settings.total_variation > 0)
     needed += voxels * bool(tree.outer)  # the cascade of each voxel
     if targets.pixels.images is not None:
         needed += targets.pixels.images.nbytes
@@ -321,13 +283,19 @@ def _is_whole(tree: NerfTree) -> bool:
     return tree.background is None and tree.ndc is None
 
 
-def refinement_steps(settings: BakeSettings, voxels: int, *, whole: bool) -> int:
-    """Steps of the refinement of so many voxels, of a whole scene or of another; the usual ones where bake.time_budget stands in place of a number of them."""
+def refinement_steps(settings: BakeSettings, voxels: int, pixels: int | None) -> int:
+    """Steps of the refinement; the usual ones where bake.time_budget stands in place of a number of them. Arguments as of `usual_steps`."""
     if settings.time_budget == "off" and (stated := given(settings.refine_steps)) is not None:
         return stated
-    return usual_steps(voxels, settings.refine_rays_per_batch, whole=whole)
+    return usual_steps(voxels, settings.refine_rays_per_batch, pixels)
 
 
-def usual_steps(voxels: int, rays: int, *, whole: bool) -> int:
-    """Steps of so many rays where nothing is stated."""
-    return max(MIN_STEPS, math.ceil((SCENE_STEP_RAYS_PER_VOXEL if whole else STEP_RAYS_PER_VOXEL) * voxels / rays))
+def usual_steps(voxels: int, rays: int, pixels: int | None) -> int:
+    """Steps of so many rays where nothing is stated.
+
+    pixels  of all training images of a whole scene, whose few photographs are soon overfitted: a ray for each, between 6 and 15 for each voxel; None: another
+            scene, 15 for each voxel
+    """
+    least, most = SCENE_STEP_RAYS_PER_VOXEL
+    wanted = STEP_RAYS_PER_VOXEL * voxels if pixels is None else min(max(pixels, least * voxels), most * voxels)
+    return max(MIN_STEPS, math.ceil(wanted / rays))

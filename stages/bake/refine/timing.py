@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from efficientnerf.asset.refinement.schedule import Phase
+from efficientnerf.asset.refinement.schedule import PHASES
 from efficientnerf.training.schedule import Schedule
 from stages.compiling import clock
 from stages.train.budget import UNKNOWN
@@ -35,9 +33,9 @@ class Stopwatch:
         self._began = clock() - seconds
 
 
-def allotted(phases: Sequence[Phase], phase: int, left: float) -> float:
+def allotted(phase: int, left: float) -> float:
     """Seconds of those left that a phase may take: its share among those to come."""
-    return max(0.0, left) * phases[phase].share / sum(one.share for one in phases[phase:])
+    return max(0.0, left) * PHASES[phase].share / sum(one.share for one in PHASES[phase:])
 
 
 def packing_seconds(voxels: int, cores: int, per_ray: float, rays: int, weight_rays: int, error_rays: int) -> float:

@@ -13,8 +13,10 @@ import os
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
+from efficientnerf.rendering.colour import linear_premultiplied
 from pipeline.files import atomic
 
 PIXELS_AT_ONCE = 2**20  # whose rays are made
@@ -35,10 +37,6 @@ def write_exr(
 
     The file appears whole or not at all.
     """
-    import OpenEXR
-
-    from efficientnerf.rendering.colour import linear_premultiplied
-
     similarity = Similarity.identity() if world_from_capture is None else world_from_capture
     scale, rotation = similarity.scale, similarity.rotation
     rgba = np.concatenate([linear_premultiplied(colour, opacity), opacity[..., None]], axis=-1)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from efficientnerf.rendering.colour import straight_from_premultiplied
 from pipeline.errors import UsageError
+from stages.figures.plots import to_uint8
 
 NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -34,9 +36,6 @@ def frame_from_rendering(colour: np.ndarray, opacity: np.ndarray, background: tu
     background  sRGB colour below it; None keeps the alpha
     returns     (H, W, 3) or, without a background, (H, W, 4) uint8
     """
-    from efficientnerf.rendering.colour import straight_from_premultiplied
-    from stages.figures.plots import to_uint8
-
     if background is not None:
         return to_uint8(colour + (1.0 - opacity[..., None]) * np.asarray(background, np.float32))
     straight = straight_from_premultiplied(colour, opacity)
@@ -47,7 +46,6 @@ def over_background(frame: np.ndarray, background: tuple[float, float, float]) -
     """(H, W, 4) uint8 over a colour -> (H, W, 3) uint8; RGB passes through."""
     if frame.shape[2] == 3:
         return frame
-    from stages.figures.plots import to_uint8
 
     values = frame.astype(np.float32) / 255.0
     alpha = values[..., 3:]

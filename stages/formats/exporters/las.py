@@ -33,7 +33,7 @@ def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS
     """Write a point cloud in the capture's frame; compressed where the file's name ends in .laz. Raises BadInput and UsageError."""
     check_points(points, path)
     refuse_without_package(path)
-    import laspy
+    import laspy  # an extra
 
     low, high = points.positions.min(axis=0), points.positions.max(axis=0)
     header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")

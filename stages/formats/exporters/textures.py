@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from PIL import Image
 
 Picture = Literal["png", "jpeg"]  # how textures are stored
 EXTENSIONS: dict[Picture, str] = {"png": ".png", "jpeg": ".jpg"}
@@ -18,8 +19,6 @@ JPEG_QUALITY = 92
 
 def encoded(pixels: np.ndarray, picture: Picture) -> bytes:
     """(H, W, 3) uint8 as a file: the same pixels are the same bytes."""
-    from PIL import Image
-
     file = io.BytesIO()
     image = Image.fromarray(np.ascontiguousarray(pixels))
     if picture == "jpeg":

@@ -89,7 +89,7 @@ def _pictures(mesh: Mesh, picture: Picture) -> list[bytes]:
 
 def _layer(mesh: Mesh, frame: SourceFrame, pictures: list[str]) -> bytes:
     """The layer as a binary file; `pictures` are the files that it refers to, beside it."""
-    from pxr import Tf, Usd, UsdGeom, Vt
+    from pxr import Tf, Usd, UsdGeom, Vt  # an extra
 
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -119,7 +119,7 @@ def _layer(mesh: Mesh, frame: SourceFrame, pictures: list[str]) -> bytes:
 
 def _put_geometry(shape: Any, mesh: Mesh, rotation: np.ndarray) -> None:
     """Vertices, faces, normals, and texture coordinates or colours."""
-    from pxr import Sdf, UsdGeom, Vt
+    from pxr import Sdf, UsdGeom, Vt  # an extra
 
     vertices = np.ascontiguousarray(mesh.vertices @ rotation.T, np.float32)
     normals = mesh.normals @ rotation.T
@@ -145,7 +145,7 @@ def _put_geometry(shape: Any, mesh: Mesh, rotation: np.ndarray) -> None:
 
 def _put_material(stage: Any, shape: Any, pictures: list[str], normal_map: bool) -> None:
     """UsdPreviewSurface, bound to the mesh."""
-    from pxr import Gf, Sdf, UsdShade
+    from pxr import Gf, Sdf, UsdShade  # an extra
 
     kinds = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, "/surface/material")

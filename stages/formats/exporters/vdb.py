@@ -18,15 +18,19 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, voxel_coordinates
+from efficientnerf.asset.queries import normal_at
+from efficientnerf.asset.region import voxel_centres
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.colour import linear_from_srgb
+from efficientnerf.rendering.harmonics import basis_numpy
+from efficientnerf.surface.colours import outside_directions
 from pipeline.errors import BadInput, UsageError
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, write_parts
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from stages.framing.captured import captured_of
 
 MAGIC, VERSION, LIBRARY = 0x56444220, 224, (12, 0)
 ACTIVE_VALUES = 2  # compression: of nodes the values of their active voxels alone
@@ -59,9 +63,6 @@ def write_volume(tree: NerfTree, path: Path, frame: SourceFrame = CAPTURE_IS_Z_U
 
 def grids_of(tree: NerfTree, frame: SourceFrame, path: Path) -> list[Grid]:
     """Density and colour of each cascade that holds something."""
-    from efficientnerf.asset.cascades import cascade_tree, cascades_of
-    from efficientnerf.asset.tree import voxel_coordinates
-
     if tree.ndc is not None:
         raise UsageError(f"{path}: the asset's grid is of normalised device coordinates, which no volume has. Export its points or a mesh instead.")
     back, inner, found = frame.world_from_capture.inverse().matrix(), None, []
@@ -92,12 +93,6 @@ def _colours(tree: NerfTree, kept: np.ndarray) -> np.ndarray:
     """(n, 3) float16, linear: of an asset that keeps its captured cameras the mean over some of these, by how squarely each looks at the surface; else
     the median over views from outside, as `surface_colours` has it. The harmonic of degree 0 is no such mean: what nobody photographed, a surface from
     within, looks like whatever fitted the rest. docs/experiments/volume-colours.md"""
-    from efficientnerf.asset.queries import normal_at
-    from efficientnerf.asset.region import voxel_centres
-    from efficientnerf.rendering.colour import linear_from_srgb
-    from efficientnerf.rendering.harmonics import basis_numpy
-    from efficientnerf.surface.colours import outside_directions
-
     voxels, centres, eyes = np.flatnonzero(kept), voxel_centres(tree), _eyes(tree)
     out = np.empty((len(voxels), 3), np.float16)
     for start in range(0, len(voxels), AT_ONCE):
@@ -118,8 +113,6 @@ def _colours(tree: NerfTree, kept: np.ndarray) -> np.ndarray:
 
 def _eyes(tree: NerfTree) -> np.ndarray | None:
     """(C, 3) where some of the captured cameras stood, spread over their path; None where the asset keeps none."""
-    from stages.framing.captured import captured_of
-
     found = captured_of(tree.metadata)
     if found is None:
         return None

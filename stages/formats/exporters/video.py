@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
+from av.video.reformatter import ColorRange, Colorspace, Interpolation
 
 from pipeline.files import atomic
 
@@ -21,8 +23,6 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
 
     The file appears whole or not at all. Raises ValueError where there is no frame or their sizes differ.
     """
-    import av
-
     count, size = 0, None
     # bitexact: no names or versions of libraries, no dates. One thread: x264's decisions depend on their number. cpu-independent: x264's kernels for
     # AVX-512 lookahead kernels vary from run to run; without them every processor writes the same bytes.
@@ -54,11 +54,8 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
     return count
 
 
-def _yuv(frame: np.ndarray) -> av.VideoFrame:  # type: ignore[name-defined]  # noqa: F821
+def _yuv(frame: np.ndarray) -> av.VideoFrame:
     """The frame in Rec. 709 YCbCr 4:2:0, studio range, padded to even sides."""
-    import av
-    from av.video.reformatter import ColorRange, Colorspace, Interpolation
-
     height, width = frame.shape[:2]
     even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     return av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24").reformat(

@@ -1,4 +1,4 @@
-"""Formats that a capture can come in: one file each, by family (apps, photogrammetry, datasets), a plain dict as the table.
+"""Formats that a capture can come in: one file each, or an entry in `datasets.published`; a plain dict as the table.
 
 Nothing heavy is imported until something is read.
 """
@@ -14,10 +14,11 @@ from typing import Any
 
 from pipeline.errors import BadInput
 from pipeline.text import printable
+from stages.formats.importers.photographs import photographs
 from stages.formats.importers.source import ImportSettings, Source
 from stages.io.capture import Capture
 from stages.io.pictures import NOT_THE_FILES_FAULT
-from stages.video.reading import KNOWN, SUFFIXES
+from stages.video import KNOWN, SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,14 @@ class Importer:
     posed    whether the format states cameras; else they are found from the photographs
     renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
     dialect  passed on to `recognises` and `read` where one module reads several formats
+    entry    the `ListFormat` of the module, where it has one in place of these functions
     """
 
     module: str
     posed: bool = True
     renders: bool = False
     dialect: str | None = None
+    entry: str | None = None
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         """Whether a folder holds files of this format; BadInput where they cannot be read."""
@@ -58,7 +61,8 @@ class Importer:
         return paths
 
     def _function(self, name: str) -> Callable[..., Any]:
-        return getattr(import_module(f"{__name__}.{self.module}"), name)
+        module = import_module(f"{__name__}.{self.module}")
+        return getattr(module if self.entry is None else getattr(module, self.entry), name)
 
     @property
     def _dialect(self) -> tuple[str, ...]:
@@ -85,20 +89,20 @@ IMPORTERS: dict[str, Importer] = {
     "blender": Importer("transforms", renders=True, dialect="blender"),
     "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
     "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
-    "scannetpp": Importer("datasets.scannetpp"),
-    "polycam": Importer("apps.polycam"),
-    "record3d": Importer("apps.record3d"),
-    "3d-scanner-app": Importer("apps.scanner_app"),
-    "metashape": Importer("photogrammetry.metashape"),
-    "realitycapture": Importer("photogrammetry.realitycapture"),
-    "opensfm": Importer("photogrammetry.opensfm"),
-    "kapture": Importer("photogrammetry.kapture"),
+    "scannetpp": Importer("datasets.published", entry="SCANNETPP"),
+    "polycam": Importer("apps.polycam", entry="FORMAT"),
+    "record3d": Importer("apps.record3d", entry="FORMAT"),
+    "3d-scanner-app": Importer("apps.scanner_app", entry="FORMAT"),
+    "metashape": Importer("photogrammetry.metashape", entry="FORMAT"),
+    "realitycapture": Importer("photogrammetry.realitycapture", entry="FORMAT"),
+    "opensfm": Importer("photogrammetry.opensfm", entry="FORMAT"),
+    "kapture": Importer("datasets.published", entry="KAPTURE"),
     "llff": Importer("llff"),
     "colmap": Importer("colmap"),
-    "mvsnet": Importer("datasets.mvsnet"),
-    "idr": Importer("datasets.idr"),
-    "nsvf": Importer("datasets.nsvf", renders=True),
-    "tanks-and-temples": Importer("datasets.tanks"),
+    "mvsnet": Importer("datasets.published", entry="MVSNET"),
+    "idr": Importer("datasets.published", entry="IDR"),
+    "nsvf": Importer("datasets.published", renders=True, entry="NSVF"),
+    "tanks-and-temples": Importer("datasets.published", entry="TANKS"),
     "photographs": Importer("photographs", posed=False),
 }
 FORMATS = ("auto", *IMPORTERS)
@@ -122,8 +126,6 @@ def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str
         raise BadInput(f"{folder}: a file; expected a folder of photographs or of a posed data set, or a video ({KNOWN}). Name the folder that holds it.")
     found = [name for name, importer in IMPORTERS.items() if importer.recognises(folder, allow_outside)]
     if not found:
-        from stages.formats.importers.photographs import photographs
-
         with one_line_errors(folder):
             photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
         found.append("photographs")

@@ -115,7 +115,7 @@ def read_depth(found: DepthFile, photo: Photo) -> np.ndarray:
 
 def _exr(path: Path) -> np.ndarray:
     """(H, W) float32, the one channel of an OpenEXR file, or its R, Y or Z. Raises UnreadableImage."""
-    import OpenEXR
+    import OpenEXR  # only where depth is read: folders are recognised without it
 
     data, said = read_bytes(path, LARGEST_EXR), io.StringIO()
     try:

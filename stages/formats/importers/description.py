@@ -16,6 +16,7 @@ from stages.formats.importers.photographs import is_video, photographs
 from stages.formats.importers.source import Source
 from stages.io.capture import Capture
 from stages.io.pictures import UnreadableImage, read_header
+from stages.video.reading import UnreadableVideo, opened
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,6 @@ def _posed(capture: Capture) -> dict[str, Any]:
 
 
 def _videos(source: Source, videos: list[Path]) -> dict[str, Any]:
-    from stages.video.reading import UnreadableVideo, opened
-
     described: list[dict[str, Any]] = []
     rejected: list[dict[str, str]] = []
     for path in videos:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -67,8 +67,11 @@ def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
     return lambda name, size: replace(camera, name=name)
 
 
+F = TypeVar("F", bound=Frame)
+
+
 @dataclass
-class Listing:
+class Listing(Generic[F]):
     """Frames with the images that they led to.
 
     found       (frame, its image)
@@ -78,7 +81,7 @@ class Listing:
     extensions  (listed, found) of those with another extension
     """
 
-    found: list[tuple[Frame, Path]] = field(default_factory=list)
+    found: list[tuple[F, Path]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     repeated: list[tuple[str, str]] = field(default_factory=list)
     places: list[tuple[str, str]] = field(default_factory=list)
@@ -150,9 +153,9 @@ def _best_folder(source: Source, names: Sequence[str], parts: tuple[str, ...], t
     return {name: source.check_inside(path) for name, path in by_folder[ranked[0]].items()}
 
 
-def located(source: Source, frames: Sequence[Frame]) -> Listing:
+def located(source: Source, frames: Sequence[F]) -> Listing[F]:
     """The frames with their images, in the order of the frames. Raises BadInput for an image outside of the source."""
-    listing = Listing()
+    listing: Listing[F] = Listing()
     results = [source.find(frame.name, frame.beside) for frame in frames]
     taken = {result.path for result in results if result.path is not None}
     present = [frame.name for frame, result in zip(frames, results, strict=True) if result.path is not None]
@@ -236,7 +239,7 @@ def capture_of(
     )
 
 
-def _photos(source: Source, listing: Listing) -> tuple[list[Photo], list[str], list[tuple[str, str, Path]], dict[str, list[str]]]:
+def _photos(source: Source, listing: Listing[Frame]) -> tuple[list[Photo], list[str], list[tuple[str, str, Path]], dict[str, list[str]]]:
     """Photos, their listed names, the unreadable as (name, reason, file), and what `lenses.fit_to_images` remarks."""
     photos: list[Photo] = []
     names: list[str] = []

@@ -12,10 +12,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from efficientnerf.capture.forward_facing import MAX_AXIS_ANGLE
 from efficientnerf.geometry.cameras import Camera, pose_from_llff
 from pipeline.errors import BadInput
 from pipeline.text import printable
-from stages.formats.importers import lenses
+from stages.formats.importers import colmap, lenses
 from stages.formats.importers.masks import masks_of
 from stages.formats.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, name_key
 from stages.io.capture import Capture, Photo
@@ -35,9 +36,6 @@ def holds_less_than_colmap(folder: Path, allow_outside: bool = False) -> bool:
     The file was made from the model, and has one focal length for its lens and none of its points. Of forward-facing captures its depths give the space that
     they are trained in.
     """
-    from efficientnerf.capture.forward_facing import MAX_AXIS_ANGLE
-    from stages.formats.importers import colmap
-
     source = Source(folder, allow_outside)
     try:
         rows, named = _rows(source), colmap.image_names(source)

@@ -20,8 +20,9 @@ import numpy as np
 from pipeline.errors import BadInput
 from stages.formats.importers.masks import FOLDERS, masks_of
 from stages.formats.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, abbreviated, images_in, name_key, one_of_each
+from stages.io.photo import read_photo
 from stages.io.pictures import RAW_SUFFIXES, UnreadableImage, exif_of, opened, read_header
-from stages.video.reading import KNOWN, SUFFIXES
+from stages.video import KNOWN, SUFFIXES
 
 # What conversions leave beside the photographs, in any case: reductions, depth maps, masks.
 NOT_PHOTOGRAPHS = {*FOLDERS, "depth", "depths", "sparse", "dense", "stereo", "thumbnails", "thumbs", "@eadir"}
@@ -159,8 +160,6 @@ def _is_same_picture(path: Path, other: Path) -> bool:
 @lru_cache(maxsize=MAX_FRAMES)
 def _are_alike(path: Path, changed: int, other: Path, other_changed: int) -> bool:
     """Whether two files are one picture; asked again where one has changed."""
-    from stages.io.photo import read_photo
-
     try:
         headers, times = [read_header(each) for each in (path, other)], [_taken(each) for each in (path, other)]
         if headers[0].size != headers[1].size or headers[0].alpha != headers[1].alpha:

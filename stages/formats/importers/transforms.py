@@ -13,8 +13,8 @@ becomes sparse points where images agree on it. The capture's frame is that of t
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,9 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import lenses
 from stages.formats.importers.depth import DepthFile, depth_file, with_depth
-from stages.formats.importers.frames import relocated
+from stages.formats.importers.frames import SPLIT_ORDER, Frame, Listing, located
 from stages.formats.importers.masks import masks_of
-from stages.formats.importers.source import MAX_FRAMES, MIN_IMAGES, Found, ImportSettings, Source, missing_images_warning, moved_images_warnings
+from stages.formats.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, missing_images_warning, moved_images_warnings
 from stages.formats.importers.transforms_camera import lens_of, pose_of
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
@@ -46,31 +46,13 @@ _MILLIMETRE = 0.001  # metres
 _NGP_SCALE = 0.33  # of instant-ngp, where the file states none
 
 
-@dataclass
-class _Frame:
-    """A frame of a file and the image that it led to."""
+@dataclass(frozen=True, kw_only=True)
+class _Frame(Frame):
+    """A frame of a file, which holds `document`, of which `entry` is the frame's part."""
 
-    document: dict[str, Any]
     file: Path
-    index: int
+    document: dict[str, Any]
     entry: dict[str, Any]
-    split: str | None
-    listed: str
-    image: Path
-
-    @property
-    def where(self) -> str:
-        return f"{self.file.name}: frame {self.index} ({printable(self.listed, MAX_NAME)})"
-
-
-@dataclass
-class _Listing:
-    frames: list[_Frame] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    repeated: list[tuple[str, str]] = field(default_factory=list)
-    places: list[tuple[str, str]] = field(default_factory=list)
-    extensions: list[tuple[str, str]] = field(default_factory=list)
-    total: int = 0
 
 
 def json_files(folder: Path) -> list[Path]:
@@ -109,11 +91,11 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
         ply = _ply(source, document)
         if ply is not None:
             paths[ply] = None
-    listing = _list_frames(source)
-    paths |= dict.fromkeys(mask for mask, _ in _masks(source, listing).values())
-    for frame in listing.frames:
-        paths[frame.image] = None
-        depth = _depth(source, frame)
+    found = located(source, _frames(source)).found
+    paths |= dict.fromkeys(mask for mask, _ in _masks(source, found).values())
+    for frame, image in found:
+        paths[image] = None
+        depth = _depth(source, frame, image)
         if depth is not None:
             paths[depth.file] = None
     return list(paths)
@@ -126,12 +108,13 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     source = Source(folder, settings.allow_outside)
     kind = kind or dialect(source)
     where = ", ".join(file.name for file in json_files(folder))
-    listing = _list_frames(source)
-    photos, unreadable, remarks, lens_warnings = _photos(source, listing, kind)
+    frames = _frames(source)
+    listing = located(source, frames)
+    photos, unreadable, remarks, lens_warnings = _photos(source, listing)
     rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *((name, why) for name, why, _ in unreadable)]
-    warnings = missing_images_warning(where, listing.total, len(photos), listing.missing, settings.strict, _REMEDY)
+    warnings = missing_images_warning(where, len(frames), len(photos), listing.missing, settings.strict, _REMEDY)
     if len(photos) < MIN_IMAGES:
-        raise BadInput(f"{folder / where}: {len(photos)} usable images of {listing.total} frames; at least {MIN_IMAGES} are needed.")
+        raise BadInput(f"{folder / where}: {len(photos)} usable images of {len(frames)} frames; at least {MIN_IMAGES} are needed.")
     warnings += moved_images_warnings(where, listing.places, listing.extensions) + lenses.fit_warnings(where, remarks) + lens_warnings
     if listing.repeated:
         warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
@@ -139,21 +122,20 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     if len({file.name for file in json_files(folder)} & set(SPLIT_FILES)) and (folder / "transforms.json").is_file():
         warnings.append(f"transforms.json is not read: {where} state the same with their splits.")
     points, point_warnings = _points(source, document)
-    order = {"train": 0, "val": 1, "test": 2, None: 3}
     capture = Capture(
         kind=kind,
-        photos=tuple(sorted(photos, key=lambda photo: (order[photo.split], photo.camera.name))),
+        photos=tuple(sorted(photos, key=lambda photo: (SPLIT_ORDER[photo.split], photo.camera.name))),
         background=None,
         up=np.array([0.0, 0.0, 1.0]) if kind == "blender" else None,
         points=points,
         bounds=_bounds(document, json_files(folder)[0]) if kind == "instant-ngp" else None,
         rejected=tuple(rejected),
         warnings=tuple(warnings + point_warnings),
-        metric=any("depth_file_path" in frame.entry for frame in listing.frames) and "applied_scale" not in document,
+        metric=any("depth_file_path" in frame.entry for frame, _ in listing.found) and "applied_scale" not in document,
         facts={key: _fact(document[key]) for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
         rejected_files={name: file for name, _, file in unreadable},
     )
-    maps = {source.real(frame.image): _depth(source, frame) for frame in listing.frames}
+    maps = {source.real(image): _depth(source, frame, image) for frame, image in listing.found}
     return with_depth(capture, lambda photo: maps.get(photo.image))
 
 
@@ -178,10 +160,9 @@ def read_document(file: Path, max_frames: int = MAX_FRAMES) -> dict[str, Any]:
     return document
 
 
-def _list_frames(source: Source) -> _Listing:
-    listing = _Listing()
+def _frames(source: Source) -> list[_Frame]:
     documents = _documents(source)
-    entries: list[tuple[_Frame, Found]] = []
+    listed = []
     for file, document in documents:
         split_of_file = SPLIT_FILES.get(file.name) if len(documents) > 1 else None
         split_of_name = dict(_listed_splits(document, file))
@@ -189,29 +170,13 @@ def _list_frames(source: Source) -> _Listing:
             if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
                 raise BadInput(f"{file}: frame {index} has no `file_path`. Write the data set again, or take it out.")
             name = entry["file_path"]
-            found = source.find(name, file.parent)
-            split = split_of_file or split_of_name.get(_plain(name))
-            entries.append((_Frame(document, file, index, entry, split, name, found.path or file), found))
-    listing.total = len(entries)
-    missing = [frame.listed for frame, found in entries if found.path is None]
-    present = [frame.listed for frame, found in entries if found.path is not None]
-    taken = {found.path for _, found in entries if found.path is not None}
-    elsewhere = relocated(source, missing, present, taken) if missing else {}
-    seen: set[Path] = set()
-    for frame, found in entries:
-        path, name = found.path or elsewhere.get(frame.listed), printable(frame.listed, MAX_NAME)
-        if path is None:
-            listing.missing.append(name)
-        elif path in seen:
-            listing.repeated.append((name, f"the same image as an earlier frame ({source.name_of(path)})"))
-        else:
-            seen.add(path)
-            how = found.how if found.path is not None else "elsewhere"
-            place = {"elsewhere": listing.places, "extension": listing.extensions}.get(how)
-            if place is not None:
-                place.append((name, source.name_of(path)))
-            listing.frames.append(replace(frame, image=path))
-    return listing
+            where, split = f"{file.name}: frame {index} ({printable(name, MAX_NAME)})", split_of_file or split_of_name.get(_plain(name))
+            listed.append(_Frame(name, file.parent, where, _camera(document, entry, where), split=split, file=file, document=document, entry=entry))
+    return listed
+
+
+def _camera(document: dict[str, Any], entry: dict[str, Any], where: str) -> Callable[[str, tuple[int, int]], Camera]:
+    return lambda name, size: lens_of(document | entry, name, size, pose_of(entry, where), where)
 
 
 def _listed_splits(document: dict[str, Any], file: Path) -> Iterator[tuple[str, str]]:
@@ -226,34 +191,33 @@ def _plain(name: str) -> str:
     return name.removeprefix("./").replace("\\", "/")
 
 
-def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str, Path]], dict[str, list[str]], list[str]]:
+def _photos(source: Source, listing: Listing[_Frame]) -> tuple[list[Photo], list[tuple[str, str, Path]], dict[str, list[str]], list[str]]:
     """Photos, the unreadable as (name, reason, file), what `lenses.fit_to_images` remarks, and warnings."""
     photos: list[Photo] = []
     rejected: list[tuple[str, str, Path]] = []
     remarks: dict[str, list[str]] = {}
     warnings: list[str] = []
     rolling = lost_masks = 0
-    readable: list[_Frame] = []
+    readable: list[tuple[_Frame, Path]] = []
     stated: list[tuple[Camera, Header, str]] = []
-    for frame in listing.frames:
-        name = source.name_of(frame.image)
+    for frame, image in listing.found:
+        name = source.name_of(image)
         try:
-            header = read_header(source.real(frame.image))
+            header = read_header(source.real(image))
         except UnreadableImage as error:
-            rejected.append((name, str(error), source.real(frame.image)))
+            rejected.append((name, str(error), source.real(image)))
             warnings.append(f"{name}: {error}; left out.")
             continue
-        pose = pose_of(frame.entry, frame.where)
         rolling += "transform_matrix" not in frame.entry
-        stated.append((lens_of(frame.document | frame.entry, name, header.size, pose, frame.where), header, frame.where))
-        readable.append(frame)
-    masks = _masks(source, listing)
-    for frame, (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
+        stated.append((frame.camera(name, header.size), header, frame.where))
+        readable.append((frame, image))
+    masks = _masks(source, listing.found)
+    for (frame, image), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
         if remark is not None:
             remarks.setdefault(remark, []).append(camera.name)
-        mask, ignore = masks.get(frame.image, (None, "black"))
+        mask, ignore = masks.get(image, (None, "black"))
         lost_masks += mask is None and "mask_path" in frame.entry
-        photos.append(Photo(camera, source.real(frame.image), None if mask is None else source.real(mask), ignore, frame.split))
+        photos.append(Photo(camera, source.real(image), None if mask is None else source.real(mask), ignore, frame.split))
     if rolling:
         warnings.append(f"{rolling} frames state a rolling shutter (transform_matrix_start, _end); the pose in the middle is used.")
     if lost_masks:
@@ -264,27 +228,27 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
     return photos, rejected, remarks, warnings
 
 
-def _masks(source: Source, listing: _Listing) -> dict[Path, tuple[Path, str]]:
+def _masks(source: Source, found: Sequence[tuple[_Frame, Path]]) -> dict[Path, tuple[Path, str]]:
     """Image -> its mask and which of the mask's pixels are left out: the mask that its frame names; of frames that name none, that beside the image."""
-    found: dict[Path, tuple[Path, str]] = {}
+    masks: dict[Path, tuple[Path, str]] = {}
     unnamed = []
-    for frame in listing.frames:
+    for frame, image in found:
         listed = frame.entry.get("mask_path")
         mask: Path | None
         if isinstance(listed, str) and listed:
             mask, ignore = source.find(listed, frame.file.parent).path, "black"
         else:
-            names = (f"dynamic_mask_{frame.image.stem}.png", f"dynamic_mask_{frame.image.name}.png")
-            beside = (frame.image.with_name(name) for name in names)
+            names = (f"dynamic_mask_{image.stem}.png", f"dynamic_mask_{image.name}.png")
+            beside = (image.with_name(name) for name in names)
             mask, ignore = next((source.check_inside(path) for path in beside if os.path.isfile(path)), None), "white"
             if mask is None:
-                unnamed.append(frame.image)
+                unnamed.append(image)
         if mask is not None:
-            found[frame.image] = mask, ignore
-    return found | {image: (mask, "black") for image, mask in masks_of(source, unnamed).items()}
+            masks[image] = mask, ignore
+    return masks | {image: (mask, "black") for image, mask in masks_of(source, unnamed).items()}
 
 
-def _depth(source: Source, frame: _Frame) -> DepthFile | None:
+def _depth(source: Source, frame: _Frame, image: Path) -> DepthFile | None:
     """The depth of a frame: nerfstudio's in millimetres, instant-ngp's in units that the file states. Of poses that were scaled afterwards it is not used."""
     if isinstance(frame.entry.get("depth_file_path"), str) and "applied_scale" not in frame.document:
         listed, unit = frame.entry["depth_file_path"], _MILLIMETRE
@@ -293,7 +257,7 @@ def _depth(source: Source, frame: _Frame) -> DepthFile | None:
     else:
         return None
     path = source.find(listed, frame.file.parent, (".png",)).path if unit > 0 else None
-    return None if path is None or path == frame.image or path.suffix.lower() != ".png" else depth_file(source, path, unit)
+    return None if path is None or path == image or path.suffix.lower() != ".png" else depth_file(source, path, unit)
 
 
 def _bounds(document: dict[str, Any], file: Path) -> np.ndarray | None:

@@ -17,6 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageCms
 
 MAX_PROFILE = 8 << 20  # bytes; those of printers have up to three million
 TOLERANCE = 2  # levels of 255 that sRGB's profiles differ by among each other
@@ -66,8 +67,6 @@ def conversion_of(profile: bytes | None, mode: str) -> Conversion:
 
 @lru_cache(maxsize=8)
 def _conversion(profile: bytes, mode: str) -> Conversion:
-    from PIL import ImageCms
-
     space = _KINDS.get(profile[16:20])
     if len(profile) < 128 or profile[36:40] != b"acsp" or profile[12:16] not in _CLASSES:
         return Conversion(fault="damaged, or none of a picture")
@@ -108,8 +107,6 @@ def _tags(profile: bytes) -> list[bytes]:
 
 def _probe(conversion: Conversion) -> tuple[np.ndarray, np.ndarray]:
     """Colours all over the space, black first and white last: as sRGB would read them, (N, 3), and as the profile does."""
-    from PIL import Image
-
     levels = np.linspace(0, 255, 16).round().astype(np.uint8)
     if conversion.mode == "L":
         expected = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)

@@ -31,7 +31,7 @@ class RawFile(ImageFile.ImageFile):
 
     def _open(self) -> None:
         try:
-            import rawpy
+            import rawpy  # an extra
         except ImportError as error:
             raise NoLibRaw("a camera's raw picture, which needs: pip install 'efficientnerf[raw]'") from error
         assert self.fp is not None
@@ -49,7 +49,7 @@ class RawFile(ImageFile.ImageFile):
 
     def load(self) -> Any:
         if self.tile:
-            import rawpy
+            import rawpy  # an extra
 
             options = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 8, "user_flip": 0, "adjust_maximum_thr": 0.0, "gamma": (2.4, 12.92)}
             try:

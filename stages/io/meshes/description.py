@@ -18,7 +18,6 @@ from stages.io.meshes.ply import read_ply
 from stages.io.meshes.text import read_obj, read_stl, read_xyz
 
 READERS = {".ply": read_ply, ".obj": read_obj, ".stl": read_stl, ".xyz": read_xyz}
-SUFFIXES = (*READERS, ".glb")
 
 
 def describe_mesh(path: Path) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.files import SafePoint
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.images import SafePoint
 from stages.sfm.mapping import bundle_adjust
 
 OBSERVATIONS = 30, 400  # of a photograph: fewer say nothing of its lens, of more some are taken

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.files import SafePoint
 from stages.cores import in_order
 from stages.io.png import read_png
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, forget, pair_id_of
-from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
+from stages.sfm.images import Progress, WorkImage, images_of
 from stages.sfm.learned.networks import FEWEST, Detector, Features, Matcher
 from stages.sfm.pairs import Pair, ordered
 

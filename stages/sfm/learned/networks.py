@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from pipeline.errors import BadInput, UsageError
@@ -62,8 +63,6 @@ class Detector:
 
     def features(self, rgb: np.ndarray, mask: np.ndarray | None, most: int) -> Features:
         """The strongest features, at most so many, of an sRGB picture (H, W, 3) uint8, where the mask (H, W) uint8 is not black."""
-        import cv2
-
         height, width = rgb.shape[:2]
         limits = [side or LONGEST for side in self._fixed]
         scale = min(1.0 if None in self._fixed else np.inf, limits[0] / height, limits[1] / width)

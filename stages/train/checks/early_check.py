@@ -14,13 +14,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from stages.io.scene import Scene, View
+from efficientnerf.geometry.cameras import Camera
+from stages.evaluate.trivial import blurred
+from stages.evaluate.views import evenly_spaced, ground_truth, subsample_camera
+from stages.io.scene import Scene, View, views_of
 
 FRACTION = 0.1  # of the steps
 MIN_STEP = 256  # before the warm-up of the density voxels ends nothing is expected
@@ -80,18 +81,11 @@ def check_step(iterations: int) -> int | None:
 
 def held_out_views(folder: Path, s: Scene) -> list[HeldOutView]:
     """Small views of the scene in `folder`: validation views, else test views, else training views, evenly spaced in their order."""
-    from stages.evaluate.views import evenly_spaced
-    from stages.io.scene import views_of
-
     views = views_of(s, "val") or views_of(s, "test") or views_of(s, "train")
     return [_small(folder, s, views[index]) for index in evenly_spaced(len(views), VIEWS)]
 
 
 def _small(folder: Path, s: Scene, view: View) -> HeldOutView:
-    import cv2
-
-    from stages.evaluate.views import ground_truth, subsample_camera
-
     stride = max(1, math.ceil(max(view.camera.width, view.camera.height) / SIDE))
     truth = ground_truth(folder, view, s.background, stride)
     subject = np.ones(truth.colour.shape[:2], bool) if truth.inside is None else truth.inside
@@ -120,8 +114,6 @@ def _decibels(error: np.ndarray) -> float:
 
 def _errors(view: HeldOutView, render: np.ndarray) -> tuple[float, float, float]:
     """Mean squared errors of the render, the mean colour and the blurred photograph."""
-    from stages.evaluate.trivial import blurred
-
     truth, at = view.colour, view.counted
     gain = (render[at] * truth[at]).sum(axis=0) / np.maximum((render[at] ** 2).sum(axis=0), 1e-9)
     render = np.clip(render * np.clip(gain, 1 / MAX_GAIN, MAX_GAIN), 0, 1)

@@ -10,21 +10,26 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.model import model
+from efficientnerf.rendering.field_renderer import FieldRenderer
+from efficientnerf.training import loop
+from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
+from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
+from stages.framing.view_coverage import kept_pixels
+from stages.io.field_file import space_of
+from stages.io.scene import Scene, View, views_of
 from stages.scratch import note, noted
 from stages.train.checks.early_check import EarlyResult, HeldOutView, judge
 from stages.train.choices import TrainingChoices
-
-if TYPE_CHECKING:
-    from efficientnerf.training.pixels import Pixels
-    from efficientnerf.training.sparse_depth import SparseDepthRays
-    from stages.io.scene import Scene, View
+from stages.train.data import depth_range, sparse_depth_of
+from stages.train.exposure import begin_exposure
+from stages.train.priors import filled_points, mask_cells_by
 
 # docs/experiments/early-check.md
 SMALL = TrainSettings(
@@ -75,8 +80,6 @@ def _lowers(choices: TrainingChoices, s: Scene) -> bool:
 
 def try_all(job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView]) -> list[Trial]:
     """A trial of each candidate, in their order."""
-    from stages.train.data import sparse_depth_of
-
     trials, depth = [], sparse_depth_of(job.inputs[PosesOutputs.stage], s, settings.seed)
     for number, (name, choices) in enumerate(candidates(s, settings).items()):
         path = job.work / f"trial_{number}.json"
@@ -111,16 +114,6 @@ def _train(
     job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView], depth: SparseDepthRays | None, name: str
 ) -> EarlyResult | None:
     """A short training on a scene, and what it comes to; None where no pixel can be compared, or masks leave none to train on."""
-    from efficientnerf.model import model
-    from efficientnerf.rendering.field_renderer import FieldRenderer
-    from efficientnerf.training import loop
-    from stages.framing.view_coverage import kept_pixels
-    from stages.io.field_file import space_of
-    from stages.io.scene import views_of
-    from stages.train.data import depth_range
-    from stages.train.exposure import begin_exposure
-    from stages.train.priors import filled_points, mask_cells_by
-
     views, small = views_of(s, "train"), _small(settings)
     own = _with_views(pixels, views)
     near, far = depth_range(s, own, small)

@@ -9,23 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.training.pixels import Pixels
 from pipeline.errors import StageFailed
 from pipeline.files import remove
 from pipeline.stage import Job
+from stages.io.scene import Scene
 from stages.scratch import note, noted
 from stages.train import budget
 from stages.train.checks.early_check import EarlyResult, check_step, held_out_views, judge
 from stages.train.checks.second_chances import best_of, finished, try_all
 from stages.train.choices import TrainingChoices, write
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.training.pixels import Pixels
-    from stages.io.scene import Scene
 
 DECIDED = "second_chances.json"
 REMEDY = "Look at the cameras and the photographs in the report, and try poses.masks=ignore where there are masks."

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.rendering.field_renderer import FieldRenderer
+from efficientnerf.training.loop import Progress, Trainer, train
+from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.sparse_depth import SparseDepthRays
+from efficientnerf.training.view_checks.checks import Observations, ViewChecks, check, is_due
+from pipeline.stage import Job
 from pipeline.text import printable
-
-if TYPE_CHECKING:
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.rendering.field_renderer import FieldRenderer
-    from efficientnerf.training.loop import Progress, Trainer
-    from efficientnerf.training.pixels import Pixels
-    from efficientnerf.training.sparse_depth import SparseDepthRays
-    from efficientnerf.training.view_checks.checks import Observations, ViewChecks
-    from pipeline.stage import Job
-    from stages.io.scene import Scene, View
+from stages.evaluate.views import ground_truth, subsample_camera
+from stages.figures.plots import to_uint8
+from stages.io.png import write_png
+from stages.io.refined_cameras import as_trained
+from stages.io.scene import Scene, View, read_points, views_of
 
 SIDE = 300  # of a photograph in the picture, pixels
 ROWS = 12  # of it: more views than that are in the report alone
@@ -31,10 +34,6 @@ def train_and_check(job: Job, t: Trainer, pixels: Pixels, s: Scene, sparse_depth
 
     sparse_depth  rays to the sparse points of a scene, made again where its training views change
     """
-    from efficientnerf.training.loop import train
-    from efficientnerf.training.view_checks.checks import check, is_due
-    from stages.io.scene import views_of
-
     views = views_of(s, "train")
     known = observations(job.inputs["poses"], s) if t.checks is not None else None
     while t.step < t.schedule.iterations:
@@ -58,8 +57,6 @@ def _say(job: Job, c: ViewChecks, before: np.ndarray, views: tuple[View, ...]) -
 
 def scene_of(c: ViewChecks | None, s: Scene, views: tuple[View, ...]) -> Scene:
     """The scene as it is trained on: without the views that are left out, with the cameras that were replaced."""
-    from stages.io.refined_cameras import as_trained
-
     if c is None or not c.changed:
         return s
     return as_trained(s, *_replaced_and_left_out(c, views))
@@ -72,9 +69,6 @@ def _replaced_and_left_out(c: ViewChecks, views: tuple[View, ...]) -> tuple[dict
 
 def observations(folder: Path, s: Scene) -> Observations | None:
     """The sparse points as the training views observe them; None where it is not known which views do."""
-    from efficientnerf.training.view_checks.checks import Observations
-    from stages.io.scene import read_points
-
     if not s.points:
         return None
     points = read_points(folder)
@@ -117,12 +111,6 @@ def findings_of(t: Trainer, views: tuple[View, ...]) -> list[dict[str, Any]]:
 
 def draw_wrong_views(path: Path, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
     """Rows of photograph and render by the camera as it was given, and by the pose that was found where there is one; no file where no view is concerned."""
-    from dataclasses import replace
-
-    from stages.evaluate.views import ground_truth, subsample_camera
-    from stages.figures.plots import to_uint8
-    from stages.io.png import write_png
-
     c = t.checks
     if c is None or not (c.left_out | c.replaced).any():
         return

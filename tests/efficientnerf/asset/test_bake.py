@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset import bake
-from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_values
-from efficientnerf.asset.queries import density_at, density_block
-from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_of, visible_voxels, voxel_values
+from efficientnerf.asset.queries import density_at
+from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
@@ -57,7 +57,7 @@ def sparse(weight: np.ndarray, brick: int) -> Visibility:
     return Visibility(cells, rows[cells])
 
 
-@pytest.mark.parametrize(("extent", "resolution", "brick"), [((2, 2, 2), 64, 4), ((2, 1, 0.3), 100, 4), ((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])
+@pytest.mark.parametrize(("extent", "resolution", "brick"), [((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])
 def test_cells_cover_the_box_and_no_more(extent: tuple[float, float, float], resolution: int, brick: int) -> None:
     bounds = np.array([[1.0, 2.0, 3.0], np.add(extent, (1, 2, 3))])
     shape, voxel = grid_of(bounds, resolution, brick)
@@ -78,14 +78,7 @@ def test_visible_voxels_are_the_balls_skin() -> None:
     assert weight[away < 0.2].max() < 1e-3  # nobody sees the inside
 
 
-def test_more_pixels_never_make_a_voxel_less_visible() -> None:
-    few, many = greatest(500), greatest()
-    assert few.any()
-    assert (few <= many + 1e-6).all()
-    assert (few > 0).sum() < (many > 0).sum()
-
-
-@pytest.mark.parametrize("resolution", [16, 15, 9, 4])
+@pytest.mark.parametrize("resolution", [15, 4])
 def test_of_a_coarser_grid_what_was_seen_of_a_finer_one(resolution: int) -> None:
     """Each coarse voxel has the greatest of the fine ones whose centres it holds, and about what it would have shown itself."""
     bounds = np.array([[0.0, 0.0, 0.0], [2.0, 1.5, 1.0]])
@@ -109,14 +102,6 @@ def test_masked_pixels_are_not_looked_at_and_progress_ends_at_its_total() -> Non
     assert calls[-1] == (7, 7)
 
 
-def test_looked_at_pixels_are_spread_over_columns_and_rows() -> None:
-    index = spread_pixels(pixels(10, 25), 10 * 25 * 25 // 5)
-    assert 1000 <= len(index) <= 1500
-    assert len(np.unique(index)) == len(index)
-    assert len(np.unique(index % 25)) == 25
-    assert len(np.unique(index // 25)) > 240
-
-
 def test_chosen_voxels_are_those_above_the_threshold_and_their_neighbours() -> None:
     weight = np.zeros((8, 4, 4), np.float32)
     weight[5, 1, 2], weight[0, 0, 0], weight[3, 3, 3] = 0.5, 1e-3, 2e-3
@@ -130,7 +115,7 @@ def test_chosen_voxels_are_those_above_the_threshold_and_their_neighbours() -> N
     assert not len(chosen_voxels(sparse(np.zeros((8, 4, 4), np.float32), 4), (2, 1, 1), 4, 1e-3, 2))
 
 
-@pytest.mark.parametrize("dilate", [0, 1, 2, 5])
+@pytest.mark.parametrize("dilate", [0, 2])
 def test_growing_is_that_of_a_plain_grid(dilate: int) -> None:
     from scipy.ndimage import binary_dilation
 
@@ -138,16 +123,6 @@ def test_growing_is_that_of_a_plain_grid(dilate: int) -> None:
     kept = weight > 0.97
     wanted = np.argwhere(binary_dilation(kept, np.ones((3, 3, 3), bool), iterations=dilate) if dilate else kept)
     np.testing.assert_array_equal(chosen_voxels(sparse(weight, 3), (4, 3, 2), 3, 0.97, dilate), wanted)
-
-
-def test_coordinates_of_a_tree_are_those_it_was_built_from() -> None:
-    from tests.efficientnerf.trees import random_tree
-
-    tree = random_tree(3, brick=3)
-    at = voxel_coordinates(tree)
-    for n in range(0, len(at), 17):
-        low = tuple(int(x) for x in at[n])
-        assert density_block(tree, low, tuple(x + 1 for x in low)).item() == tree.density_values[n]
 
 
 def test_values_are_means_over_the_voxel() -> None:
@@ -167,7 +142,7 @@ def test_values_are_means_over_the_voxel() -> None:
     assert sh[2, 0, 0] < BOUNDS[0][0] + 11.5 / 8 + 0.01
 
 
-@pytest.mark.parametrize("first", [0, 1, 2])
+@pytest.mark.parametrize("first", [0, 2])
 def test_blocks_do_not_depend_on_where_one_begins(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
     monkeypatch.setattr(bake, "POINTS_PER_BLOCK", 40)
     m = model_of_a_ball()

@@ -17,12 +17,11 @@ from efficientnerf.asset.cascades import (
     nested,
     subset,
     voxel_cascades,
+    voxel_coordinates,
     voxel_sides,
 )
 from efficientnerf.asset.rendering import render_reference
-from efficientnerf.asset.tree import voxel_coordinates
-from efficientnerf.rendering import environment
-from tests.efficientnerf.trees import LOW, random_cascades, rays_at, uniform_tree
+from tests.efficientnerf.trees import random_cascades, rays_at, uniform_tree
 
 
 def rendered(tree, origins, directions):  # type: ignore[no-untyped-def]
@@ -67,32 +66,6 @@ def test_a_subset_renders_as_the_tree_with_the_others_emptied() -> None:
     emptied = rendered(replace(tree, density_values=np.where(keep, tree.density_values, 0).astype(np.float32)), origins, directions)[1]
     np.testing.assert_allclose(some, emptied, atol=1e-6)
     assert some.max() > 0.05
-
-
-def test_a_uniform_medium_absorbs_by_the_length_of_the_path() -> None:
-    """Whatever the cascades: opacity = 1 - exp(-density length)."""
-    sigma, grids = 0.8, cascade_grids(np.stack([LOW, LOW + 1.6]), 0.1, 4, 3)
-    tree = nested([replace(uniform_tree(shape, brick=4, sigma=sigma), voxel=voxel, bounds_min=low) for shape, voxel, low in grids])
-    _, _, low = grids[-1]
-    start = low + np.array([0.02, 3.1, 3.2])
-    origins, directions = start[None], np.array([[1.0, 0.0, 0.0]])
-    opacity = rendered(tree, origins, directions)[1][0]
-    assert abs(opacity - (1 - np.exp(-sigma * (6.4 - 0.02)))) < 0.02
-
-
-def test_rays_that_meet_nothing_show_the_environment() -> None:
-    tree = random_cascades(5)
-    empty = replace(tree, density_values=np.zeros_like(tree.density_values))
-    origins, directions = rays_at(tree, 20)
-    colour, opacity = rendered(empty, origins, directions)
-    assert tree.environment is not None
-    np.testing.assert_allclose(colour, environment.lookup(tree.environment, directions), atol=1e-6)
-    assert (opacity == 0).all()
-
-
-def test_directions_of_texels_look_up_their_texels() -> None:
-    image = np.random.default_rng(1).random((6, 12, 3)).astype(np.float32)
-    np.testing.assert_allclose(environment.lookup(image, environment.directions_of(6, 12).reshape(-1, 3)), image.reshape(-1, 3), atol=1e-6)
 
 
 @pytest.mark.parametrize("wrong", ["voxel", "shifted", "smaller"])

@@ -6,23 +6,13 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.refinement import error_map
-from efficientnerf.asset.refinement.error_map import MOST, Drawn, ErrorMap, count_cells
+from efficientnerf.asset.refinement.error_map import MOST, ErrorMap, count_cells
 from efficientnerf.training.patches import PatchGrid
 from tests.efficientnerf.small_views import SIZES, views
 
 
 def chances(drawn_by: ErrorMap) -> np.ndarray:
     return np.diff(drawn_by.cumulative, prepend=0)
-
-
-def test_before_any_error_tiles_are_alike() -> None:
-    grid = PatchGrid(views(), 2)
-    met = np.arange(len(grid)) % 3 == 0
-    made = ErrorMap(grid, met)
-    np.testing.assert_allclose(chances(made), met / met.sum(), atol=1e-12)
-    drawn = made.draw(400, np.random.default_rng(0))
-    assert met[drawn.patches.tile].all()
-    np.testing.assert_allclose(drawn.factor, 1, rtol=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.9])
@@ -96,30 +86,7 @@ def test_a_map_goes_on_where_another_one_stopped() -> None:
     assert not np.array_equal(whole.errors[0], whole.errors[1])
 
 
-def test_large_grids_have_cells_of_several_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    grid = PatchGrid(views(), 1)
-    assert count_cells(grid) == len(grid)
-    monkeypatch.setattr(error_map, "MAX_CELLS", 20)
-    assert count_cells(grid) <= 20
-    made = ErrorMap(grid)
-    assert made.tiles > 1
-    drawn = made.draw(40_000, np.random.default_rng(4))
-    found = np.bincount(drawn.patches.tile, minlength=len(grid))
-    assert found.max() < 2 * found[found > 0].mean()  # all tiles are about as probable
-    assert len(np.flatnonzero(found)) == len(set(drawn.patches.tile)) > 0.95 * (grid.pixels.width * grid.pixels.height).sum()
-    with pytest.raises(ValueError, match="expected"):
-        ErrorMap(grid, None, np.zeros((2, len(grid)), np.float32))
-
-
-def test_what_no_pixel_shows_is_never_drawn() -> None:
-    grid = PatchGrid(views([None, np.zeros((9, 4), bool), None]), 2)
-    made = ErrorMap(grid)
-    drawn = made.draw(500, np.random.default_rng(5))
-    assert isinstance(drawn, Drawn)
-    assert set(grid.pixels.view_of(drawn.patches.pixels)) == {0, 2}
-
-
-def test_of_masks_that_keep_little_no_more_patches_are_drawn_than_are_asked_for() -> None:
+def test_no_more_patches_are_drawn_than_are_asked_for() -> None:
     masks = [np.zeros((h, w), bool) for w, h in SIZES]
     masks[1][5, 3] = True
     grid = PatchGrid(views(masks), 2)

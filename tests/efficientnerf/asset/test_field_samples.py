@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.bake import chosen_voxels, spread_pixels, voxel_values
-from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, point_cascades, voxel_cascades, voxels_around
+from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, point_cascades, voxel_cascades, voxel_coordinates, voxels_around
 from efficientnerf.asset.components import unsupported_components
 from efficientnerf.asset.field_samples import (
     FieldSamples,
@@ -18,10 +18,9 @@ from efficientnerf.asset.field_samples import (
     field_samples,
     seen_weights,
     surface_points,
-    weight_by_box,
 )
 from efficientnerf.asset.rendering import render_rays
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.model import Model
 from efficientnerf.rendering import environment
 from efficientnerf.training.pixels import Pixels
@@ -61,16 +60,6 @@ def test_the_samples_are_those_of_the_pixels(made: Made) -> None:
     assert on_something.mean() > 0.97
     assert (away < 0.05).any()
     assert (plan > WALL - 0.5).any()
-
-
-def test_weights_are_of_the_innermost_box(made: Made) -> None:
-    _, _, samples = made
-    found = weight_by_box(samples, boxes(4))
-    assert found.sum() == pytest.approx(samples.weight.sum(dtype=np.float64))
-    points = samples.points(np.arange(len(samples.start)), samples.ray())
-    inside = ((points >= boxes(4)[0][0]) & (points < boxes(4)[0][1])).all(axis=1)
-    assert found[0] == pytest.approx(samples.weight[inside].sum(dtype=np.float64))
-    assert (found[:4] > 0).all()
 
 
 def test_voxels_weigh_what_passes_through_them(made: Made) -> None:
@@ -166,10 +155,6 @@ def test_what_lies_beyond_is_the_sky(made: Made) -> None:
     assert np.abs(near[7] - sky).max() > 0.2
 
 
-def test_without_any_light_beyond_the_map_is_the_mean() -> None:
-    np.testing.assert_array_equal(environment.filled(np.zeros((4, 8, 3)), np.zeros((4, 8)), np.full(3, 0.25)), np.full((4, 8, 3), 0.25, np.float32))
-
-
 def test_a_map_keeps_what_is_known_and_spreads_it() -> None:
     weight = np.zeros((8, 16))
     weight[3, 0] = weight[5, 8] = 1e4
@@ -180,11 +165,6 @@ def test_a_map_keeps_what_is_known_and_spreads_it() -> None:
     assert ((found >= 0.2 - 1e-6) & (found <= 1)).all()
     assert found[3, 15, 0] > 0.8  # columns wrap
     assert found[3, 1, 0] == pytest.approx(found[3, 15, 0], abs=1e-5)
-
-
-def test_directions_fall_into_the_texels_that_they_look_up() -> None:
-    at = environment.texels_of(environment.directions_of(6, 12).reshape(-1, 3), 6)
-    np.testing.assert_array_equal(at, np.arange(72))
 
 
 def test_voxels_around_points_are_those_that_they_are_interpolated_from() -> None:

@@ -49,12 +49,3 @@ def test_a_tree_of_codes_is_asked_like_one_of_floats() -> None:
         np.testing.assert_allclose(getattr(render_rays(coded, origins, directions), name), getattr(render_rays(twin, origins, directions), name), atol=1e-5)
     assert np.allclose(colour_at(coded, origins + directions), colour_at(twin, origins + directions), atol=1e-5)
     assert coded.with_metadata(a=1).harmonics is coded.harmonics
-
-
-def test_values_of_another_number_are_refused() -> None:
-    tree = random_tree(1)
-    with pytest.raises(ValueError, match=r"values of shapes \(3,\) and"):
-        tree.with_values(np.ones(3), tree.sh)
-    with pytest.raises(ValueError, match="expected 0 to 4"):
-        tree.with_values(tree.density_values, np.zeros((len(tree.density_values), 49, 3)))
-    assert tree.with_values(tree.density_values, tree.sh[:, :1]).degree == 0

@@ -11,7 +11,7 @@ import pytest
 from efficientnerf.asset import format
 from efficientnerf.asset.format import WRITERS, describe, load, save, serialize
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.quantisation import ENTRIES, clustered, compacted, quantised_density, quantised_harmonics
+from efficientnerf.asset.quantisation import compacted, quantised_density
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -59,36 +59,6 @@ def test_the_nearest_is_the_nearest(count: int, size: int, entries: int) -> None
     np.testing.assert_allclose(approached, np.minimum(squared[:, 0], 1), rtol=1e-5, atol=1e-6)
 
 
-def test_clusters_are_found_and_equals_are_the_first() -> None:
-    rng = np.random.default_rng(0)
-    centres = rng.normal(size=(8, 3)).astype(np.float16).astype(np.float32) * 10
-    owner = rng.integers(0, 8, 3000)
-    centroids, code = clustered(centres[owner] + rng.normal(0, 0.01, (3000, 3)).astype(np.float32), np.ones(3000), 8, 0)
-    assert len(centroids) == 8
-    np.testing.assert_allclose(centroids[code], centres[owner], atol=0.06)
-
-
-def test_fewer_different_vectors_than_entries_are_kept() -> None:
-    rng = np.random.default_rng(0)
-    values = rng.normal(size=(100, 6)).astype(np.float16).astype(np.float32)
-    vectors = values[rng.integers(0, 100, 5000)]
-    centroids, code = clustered(vectors, np.ones(5000), ENTRIES, 0)
-    assert len(centroids) <= 100
-    assert np.array_equal(centroids[code], vectors)
-    assert clustered(vectors[:0], np.ones(0), ENTRIES, 0)[0].shape == (0, 6)
-
-
-def test_what_shows_more_is_served_better() -> None:
-    """Two heaps of vectors: the one with a thousand times the share gets most entries, the other some."""
-    rng = np.random.default_rng(0)
-    vectors = rng.normal(size=(200_000, 2)).astype(np.float32) + np.repeat([[0.0], [50.0]], 100_000, axis=0).astype(np.float32)
-    share = np.repeat([1.0, 1e-3], 100_000)
-    centroids, code = clustered(vectors, share, 64, 0)
-    off = ((centroids[code] - vectors) ** 2).sum(1)
-    assert off[:100_000].mean() < 0.5 * off[100_000:].mean()
-    assert off[100_000:].mean() < 2.5
-
-
 def test_codes_repeat_whatever_the_threads() -> None:
     import numba
 
@@ -117,21 +87,6 @@ def test_densities_are_rounded_by_a_few_percent() -> None:
     assert np.allclose(rounded[depth > 50] * voxel, 50)
     assert np.array_equal(quantised_density(rounded, voxel), rounded)
     assert not quantised_density(np.linspace(0, 1e-5, 1000, dtype=np.float32), voxel).any()
-
-
-def test_the_base_colour_keeps_eight_bits() -> None:
-    """Within one of 256 steps of the colour that it makes, for ordinary and for saturated bases alike, and in the middle range better."""
-    rng = np.random.default_rng(0)
-    sh = np.clip(rng.normal(0, 8, size=(5000, 1, 3)), -25, 25).astype(np.float32)
-    codes = quantised_harmonics(sh, np.ones(5000), ENTRIES, ())
-    colour = 1 / (1 + np.exp(-0.28209479 * np.stack([sh, codes.decoded()])))
-    assert np.abs(colour[0] - colour[1]).max() < 1 / 256
-    assert np.abs(codes.decoded() - sh).max() < 1.0
-
-
-def test_groups_must_hold_all_harmonics() -> None:
-    with pytest.raises(ValueError, match=r"groups \(1, 1\) hold 2 harmonics; expected 3"):
-        quantised_harmonics(np.zeros((5, 4, 3), np.float32), np.ones(5), 16, (1, 1))
 
 
 # Layouts
@@ -206,8 +161,3 @@ def test_trees_of_nothing_have_every_layout(tmp_path: Path, layout: str) -> None
         assert (again.degree, again.shape) == (tree.degree, tree.shape)
         assert again.density_values.sum() == tree.density_values.sum()
         describe(tmp_path / "a.nerftree")
-
-
-def test_an_unknown_layout_is_refused() -> None:
-    with pytest.raises(ValueError, match="layout 'zip'; expected one of compact, packed, small, sparse, full, full32"):
-        serialize(random_tree(0), "zip")

@@ -69,11 +69,6 @@ def test_a_worse_tree_is_never_made(monkeypatch: pytest.MonkeyPatch) -> None:
     assert refit(tree, targets(), 4) is tree
 
 
-def test_a_tree_without_codes_is_refused() -> None:
-    with pytest.raises(ValueError, match="without codes"):
-        refit(ball_tree(), targets(), 1)
-
-
 def test_densities_that_would_meet_or_pass_each_other_keep_their_order() -> None:
     from efficientnerf.asset.refinement.quantised import _rising
 

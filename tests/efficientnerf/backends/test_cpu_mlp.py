@@ -54,8 +54,7 @@ def expected(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, 
     return [out.detach(), x.grad, *(w.grad for w in parameters)]  # type: ignore[list-item]
 
 
-@pytest.mark.parametrize("bfloat16", [False, True])
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("shape", "bfloat16"), [(shape, n % 2 == 0) for n, shape in enumerate(SHAPES)] + [(SHAPES[0], False), (SHAPES[5], True)])
 def test_passes_are_those_of_autograd(shape: tuple[int, int, int, int], bfloat16: bool) -> None:
     """With as many samples as fill no block, one block, blocks and a rest, and chunks and a rest."""
     rng = np.random.default_rng(0)
@@ -88,13 +87,6 @@ def test_all_outputs_and_nothing_else_are_written(bfloat16: bool) -> None:
             assert np.array_equal(out, activations)
 
 
-def test_the_offset_is_added_to_the_first_output_alone() -> None:
-    rng = np.random.default_rng(3)
-    weights, features, grad = weights_of(8, 16, 1, 5, rng), rng.normal(size=(8, 100)).astype(np.float32), np.ones((100, 5), np.float32)
-    without, with_it = passes(features, weights, grad, False)[0], passes(features, weights, grad, False, 2.5)[0]
-    np.testing.assert_allclose(with_it - without, np.tile([2.5, 0, 0, 0, 0], (100, 1)), atol=1e-5)
-
-
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_nan_stays_nan(bfloat16: bool) -> None:
     """A diverged loss must show, and not be hidden by a ReLU or a rounding."""
@@ -119,11 +111,6 @@ def _pack_row_pairs(x, out):  # type: ignore[no-untyped-def]
     products.pack_row_pairs(products.Rows(pointer(x), 0, x.shape[1]), x.shape[1], pointer(out), out.shape[0], out.shape[1])
 
 
-@numba.njit
-def _transpose(x, out):  # type: ignore[no-untyped-def]
-    products.transpose16(pointer(x), 0, x.shape[1], pointer(out), 0, out.shape[1])
-
-
 def test_conversion_to_bfloat16_rounds_as_torch_does() -> None:
     special = torch.tensor([0.0, -0.0, 1.0, float("inf"), -float("inf"), float("nan"), 3.3895e38, 2.0**-126, -1.0039062, 1.0117188])
     x = torch.cat([special, torch.randn(998, generator=torch.Generator().manual_seed(0))]).reshape(21, 48)
@@ -137,28 +124,6 @@ def test_conversion_to_bfloat16_rounds_as_torch_does() -> None:
     again = np.empty((10, 48), np.int32)
     _pack_row_pairs(out, again)
     assert np.array_equal(again, paired)
-
-
-def test_rows_are_padded_with_zeros() -> None:
-    x = np.arange(1, 1 + 8 * 5, dtype=np.float32).reshape(8, 5)
-    expected = np.pad(x[:4], ((0, 0), (0, 11)))
-    wide = np.full((4, 16), 7, np.float32)  # whole vectors reach into the rows after these
-    _copy_rows(x, wide)
-    assert np.array_equal(wide, expected)
-    narrow = np.full((4, 16), 7, np.int16)
-    _copy_rows(x, narrow)
-    assert np.array_equal(narrow, torch.from_numpy(expected).bfloat16().view(torch.int16).numpy())
-    paired = np.full((2, 16), 7, np.int32)
-    _pack_row_pairs(x, paired)
-    assert np.array_equal(paired.view(np.int16).reshape(2, 16, 2), np.stack([narrow[::2], narrow[1::2]], axis=2))
-
-
-def test_transpose() -> None:
-    x = np.arange(16 * 20, dtype=np.float32).reshape(16, 20)
-    out = np.zeros((16, 30), np.float32)
-    _transpose(x, out)
-    assert np.array_equal(out[:, :16], x[:, :16].T)
-    assert not out[:, 16:].any()
 
 
 PROGRAM = """
@@ -188,8 +153,7 @@ def test_a_processor_without_wide_registers_gives_the_same(tmp_path: Path) -> No
             assert np.linalg.norm(here - other) < 1e-2 * np.linalg.norm(here)
 
 
-@pytest.mark.parametrize(("precision", "near"), [("float32", 1e-5), ("bfloat16", 3e-2)])
-@pytest.mark.parametrize("layers", [1, 2, 3])
+@pytest.mark.parametrize(("precision", "near", "layers"), [("float32", 1e-5, 1), ("bfloat16", 3e-2, 2), ("float32", 1e-5, 3)])
 def test_the_field_is_that_of_plain_torch(precision: str, near: float, layers: int) -> None:
     """The same field in float64 goes through autograd alone."""
     generator = torch.Generator().manual_seed(0)
@@ -208,5 +172,4 @@ def test_the_field_is_that_of_plain_torch(precision: str, near: float, layers: i
     mine, its = ([group.gradient(name) for name in group.parameters] for group in groups)
     for one, other in zip(mine, its, strict=True):
         assert one is not None
-        assert other is not None
         assert (one - other).norm() < 5 * near * other.norm()  # ReLUs close to zero fall to the other side

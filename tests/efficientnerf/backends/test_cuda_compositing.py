@@ -67,8 +67,3 @@ def test_padding_has_neither_weight_nor_gradient() -> None:
     assert not whole[3][samples:].any()
     assert not expected[0][samples:].any()
     assert grads[0].shape == b.raw.shape
-
-
-def test_an_unknown_activation_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected 'exp' or 'softplus'"):
-        cuda.composite(*there(bundle(0)), "relu")

@@ -49,8 +49,7 @@ def test_a_capacity_cuts_off_the_end_or_pads_it(contracted: bool, room: int) -> 
     assert int(cut.tried) == whole.tried
 
 
-@pytest.mark.parametrize("room", [None, 300, 4000])
-@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize(("contracted", "room"), [(False, None), (True, 300), (False, 4000)])
 def test_the_first_rays_can_be_left_unpruned(contracted: bool, room: int | None) -> None:
     rays, space = there(make_rays("outside")), space_from(BOUNDS, contracted=contracted)
     args = (space, *rays, STEP, 60, voxels_of().to(DEVICE))
@@ -86,12 +85,6 @@ def test_pivotal_samples_are_those_of_torch_cut_off_or_padded(contracted: bool, 
         assert len(a) == (kept if room is None else room)
         torch.testing.assert_close(a[:kept], b[:kept], rtol=1e-4, atol=1e-5)
         assert not a[kept:].any()
-
-
-def test_padding_is_never_pivotal() -> None:
-    weight = torch.tensor([0.1, 0.5, 0.4, 0.6, *[1.0] * 9]).to(DEVICE)  # the last nine belong to no ray
-    chosen = cuda.select_pivots(weight, torch.tensor([0, 3, 4]).to(DEVICE), 0.3, 1)
-    assert chosen.tolist() == [False, True, False, True, *[False] * 9]
 
 
 def test_no_rays_no_slots_and_no_samples_are_fine() -> None:

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.queries import density_block
 from efficientnerf.asset.rendering import Rendering, render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
-from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering import environment
-from tests import reference
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.trees import LOW, looking, nested_rays, random_cascades, random_tree, rays_at, tensors, uniform_tree
+from tests.efficientnerf.trees import LOW, looking, nested_rays, random_cascades, random_tree, rays_at, tensors
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.tree")
 
@@ -46,7 +44,7 @@ def agree(ours: Rendering, theirs: Rendering, faces: float = 0.0) -> None:
 @pytest.mark.parametrize(("brick", "degree", "step_size"), [(1, 0, 0.5), (4, 2, 1.0), (2, 4, 0.5)])
 def test_rays_are_those_of_the_torch_function(brick: int, degree: int, step_size: float) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, step_size=step_size)
-    origins, directions = rays_at(tree, 240)
+    origins, directions = rays_at(tree, 96)
     colour, opacity = render_reference(tree, *tensors(origins, directions))
     found = device_rays(tree, origins, directions)
     # The kernel stops at 1e-3 of the light, and is in float32.
@@ -56,71 +54,53 @@ def test_rays_are_those_of_the_torch_function(brick: int, degree: int, step_size
     agree(found, render_rays(tree, origins, directions))
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1])
+@pytest.mark.parametrize("share", [0.1])
 def test_skipping_empty_space_changes_no_value(share: float) -> None:
     tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
-    origins, directions = rays_at(tree, 240)
-    agree(device_rays(tree, origins, directions), render_rays(tree, origins, directions), faces=0.004)
+    origins, directions = rays_at(tree, 96)
+    agree(device_rays(tree, origins, directions), render_rays(tree, origins, directions), faces=0.011)
 
 
 @pytest.mark.parametrize(("model", "params"), [
-    ("SIMPLE_PINHOLE", (30.0, 10.0, 11.5)), ("PINHOLE", (30.0, 33.0, 9.0, 12.0)), ("OPENCV", (30.0, 33.0, 9.0, 12.0, 0.05, -0.02, 0.003, 0.002)),
-    ("OPENCV_FISHEYE", (24.0, 24.0, 10.0, 11.5, 0.02, 0.0, 0.0, 0.0)),
+    ("SIMPLE_PINHOLE", (15.0, 5.0, 6.5)), ("PINHOLE", (15.0, 16.0, 4.5, 6.0)), ("OPENCV", (15.0, 16.0, 4.5, 6.0, 0.05, -0.02, 0.003, 0.002)),
+    ("OPENCV_FISHEYE", (12.0, 12.0, 5.0, 6.0, 0.02, 0.0, 0.0, 0.0)),
 ])  # fmt: skip
 def test_images_are_those_of_the_cpu(model: str, params: tuple[float, ...]) -> None:
     tree = random_tree(0, share=0.7, degree=2)
-    camera = replace(looking(tree), width=18, model=model, params=params)
+    camera = replace(looking(tree, 10), width=9, model=model, params=params)
     for background in (None, (1.0, 0.5, 0.0)) if model == "PINHOLE" else ((0.2, 0.5, 1.0),):
         found, expected = device_image(tree, camera, background=background), render(tree, camera, background=background)
         assert found.colour.shape == (camera.height, camera.width, 3)
-        agree(found, expected, faces=0.01)
+        agree(found, expected, faces=0.02)
         assert np.array_equal(np.isfinite(found.depth), found.opacity >= 0.5)
 
 
 @pytest.mark.parametrize(("brick", "degree"), [(1, 0), (4, 2)])
 def test_rays_through_voxels_that_are_not_interpolated(brick: int, degree: int) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, lookup="nearest")
-    origins, directions = rays_at(tree, 240)
+    origins, directions = rays_at(tree, 96)
     found = device_rays(tree, origins, directions)
     assert 0.2 < (found.opacity > 0.05).mean() < 0.9
     agree(found, render_rays(tree, origins, directions), faces=0.02)  # samples at faces of voxels: float32 may see the one on the other side
-    other = render_rays(tree, *rays_at(replace(tree, lookup="trilinear"), 240))
+    other = render_rays(tree, *rays_at(replace(tree, lookup="trilinear"), 96))
     assert np.abs(other.colour - device_rays(replace(tree, lookup="trilinear"), origins, directions).colour).max() > 0.05
 
 
 def test_images_of_voxels_that_are_not_interpolated() -> None:
     tree = random_tree(0, share=0.7, degree=2, lookup="nearest")
-    camera = looking(tree)
+    camera = looking(tree, 8)
     for supersample in (1, 2):
         agree(device_image(tree, camera, supersample=supersample), render(tree, camera, supersample=supersample), faces=0.03)
 
 
 def test_supersampling() -> None:
-    supersample = 2
     tree = random_tree(4, share=0.7, sigma=20.0)
-    camera = looking(tree, 9)
-    for background in ((1.0, 0.5, 0.0),):
-        found = device_image(tree, camera, background=background, supersample=supersample)
-        agree(found, render(tree, camera, background=background, supersample=supersample), faces=0.01)
-        assert np.array_equal(np.isfinite(found.depth), found.opacity >= 0.5)
-    with pytest.raises(ValueError, match="expected at least 1"):
+    camera = looking(tree, 7)
+    found = device_image(tree, camera, background=(1.0, 0.5, 0.0), supersample=2)
+    agree(found, render(tree, camera, background=(1.0, 0.5, 0.0), supersample=2), faces=0.02)
+    assert np.array_equal(np.isfinite(found.depth), found.opacity >= 0.5)
+    with pytest.raises(ValueError, match="at least 1"):
         device_image(tree, camera, supersample=0)
-
-
-def test_one_colour_everywhere_gives_that_colour_however_thin() -> None:
-    for sigma in (0.02, 2.0):
-        tree = uniform_tree((6, 6, 6), brick=2, sigma=sigma, logit=0.7)
-        found = device_rays(tree, *rays_at(tree, 40))
-        np.testing.assert_allclose(found.colour, found.opacity[:, None] * reference.sigmoid(0.7) * np.ones(3), atol=3e-4)
-
-
-def test_normals_face_the_ray() -> None:
-    tree = uniform_tree(sigma=60.0)
-    middle = (tree.bounds_min + tree.bounds_max) / 2
-    directions = np.concatenate([np.eye(3), -np.eye(3)])
-    found = device_rays(tree, middle - 3 * directions, directions)
-    np.testing.assert_allclose(found.normal, -directions, atol=2e-3)
-    np.testing.assert_allclose(found.depth, 3 - 0.8, atol=0.05)
 
 
 def test_an_empty_tree_and_no_rays() -> None:
@@ -149,26 +129,6 @@ def test_palettes_are_decoded() -> None:
         assert np.array_equal(getattr(device_rays(coded, origins, directions), name), getattr(device_rays(plain, origins, directions), name))
 
 
-def test_bricks_carry_a_border_of_their_neighbours() -> None:
-    tree = random_tree(2, brick=3, share=0.6)
-    on_device = cuda.device_tree(tree, DEVICE)
-    edge = tree.brick + 2
-    for cell in np.argwhere(tree.brick_index >= 0):
-        low = cell * tree.brick - 1
-        block = density_block(tree, tuple(low), tuple(low + edge))
-        held = on_device.density[tree.brick_index[tuple(cell)]].reshape(edge, edge, edge).float().cpu().numpy()
-        np.testing.assert_allclose(held, block, rtol=1e-3)
-    assert on_device.bytes > 0
-    assert torch.equal(on_device.cascades.owner.cpu() < 0, torch.from_numpy(tree.brick_index < 0))
-
-
-def test_an_image_is_its_rays() -> None:
-    tree = random_tree(0, share=0.7)
-    camera = looking(tree)
-    image, flat = device_image(tree, camera), device_rays(tree, *rays(camera))
-    assert (np.abs(image.colour.reshape(-1, 3) - flat.colour) < 1e-3).mean() > 0.99
-
-
 def test_rays_of_another_frame_have_the_colours_along_those_of_the_world() -> None:
     tree = random_tree(3, degree=2)
     origins, directions = rays_at(tree, 60)
@@ -182,7 +142,7 @@ def test_rays_of_another_frame_have_the_colours_along_those_of_the_world() -> No
 @pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(1, 3, 1, "trilinear"), (2, 1, 0, "trilinear"), (3, 4, 2, "trilinear"), (3, 2, 1, "nearest")])
 def test_rays_through_cascades_are_those_of_the_torch_function(count: int, brick: int, degree: int, lookup: str) -> None:
     tree = replace(random_cascades(count, count=count, brick=brick, degree=degree, lookup=lookup), environment=None)
-    origins, directions = nested_rays(tree, 160)
+    origins, directions = nested_rays(tree, 80)
     colour, opacity = (part.numpy() for part in render_reference(tree, *tensors(origins, directions)))
     found = device_rays(tree, origins, directions)
     faces = 0.03 if lookup == "nearest" else 0.01  # samples at faces of voxels and of boxes: float32 may see the one on the other side
@@ -192,15 +152,15 @@ def test_rays_through_cascades_are_those_of_the_torch_function(count: int, brick
     agree(found, render_rays(tree, origins, directions), faces=0.03)
 
 
-@pytest.mark.parametrize(("model", "params"), [("PINHOLE", (12.0, 11.0, 9.0, 12.0)), ("OPENCV", (12.0, 11.0, 9.0, 12.0, 0.05, -0.02, 0.003, 0.002))])
-def test_images_of_cascades_lie_over_the_environment_or_the_background(model: str, params: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(("supersample", "background"), [(1, None), (2, (1.0, 0.5, 0.0))])
+def test_images_of_cascades_lie_over_the_environment_or_the_background(supersample: int, background: tuple[float, float, float] | None) -> None:
     tree = random_cascades(2, degree=1, share=0.3)
     tree = replace(tree, density_values=tree.density_values / 4)
-    camera = replace(looking(tree), width=18, model=model, params=params)
-    for supersample, background in ((1, None), (2, None), (1, (1.0, 0.5, 0.0))) if model == "PINHOLE" else ((1, None),):
-        found = device_image(tree, camera, background=background, supersample=supersample)
-        agree(found, render(tree, camera, background=background, supersample=supersample), faces=0.04)  # normals beside the face of a box
-        assert found.opacity.min() < 0.4 < 0.6 < found.opacity.max()
+    side = 10 // supersample
+    camera = replace(looking(tree, side), model="PINHOLE", params=(0.6 * side, 0.55 * side, 0.5 * side, 0.6 * side))
+    found = device_image(tree, camera, background=background, supersample=supersample)
+    agree(found, render(tree, camera, background=background, supersample=supersample), faces=0.05)  # normals beside the face of a box
+    assert found.opacity.min() < 0.4 < 0.6 < found.opacity.max()
 
 
 @pytest.mark.parametrize("side", [(1, 2), (8, 16), (64, 128)])

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
+from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.refinement.error_map import ErrorMap
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
-from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import EARLY_STOP, RayTargets
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.device_pixels import DevicePixels
@@ -36,7 +35,7 @@ device = pytest.importorskip("efficientnerf.asset.refinement.device")
 def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opacity_weight: float) -> None:
     # Rays that stop early or run along a voxel's face depart from the exact sums: low densities, and rays at no angle of the grid.
     tree = random_tree(brick, brick=brick, degree=degree, sigma=4.0)
-    origins, directions = (a[np.arange(160) % 4 != 2] for a in rays_at(tree, 160))
+    origins, directions = (a[np.arange(100) % 4 != 2] for a in rays_at(tree, 100))
     seen = seen_at_random(len(origins), opacity_weight)
     found, wanted = device_gradients(tree, origins, directions, seen, DEVICE), gradients_by_autograd(tree, origins, directions, seen)
     np.testing.assert_allclose(found[0], wanted[0], atol=2e-5)
@@ -51,7 +50,7 @@ def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opa
 def test_values_and_gradients_through_cascades_are_those_of_autograd(count: int, brick: int, degree: int, lookup: str) -> None:
     tree = replace(random_cascades(count, count=count, brick=brick, degree=degree, lookup=lookup), environment=None)
     tree = replace(tree, density_values=tree.density_values / 8)
-    origins, directions = (a[np.arange(120) % 4 != 3] for a in nested_rays(tree, 120))
+    origins, directions = (a[np.arange(80) % 4 != 3] for a in nested_rays(tree, 80))
     seen = seen_at_random(len(origins), 0.4)
     found, wanted = device_gradients(tree, origins, directions, seen, DEVICE), gradients_by_autograd(tree, origins, directions, seen)
     # A sample at a face of a voxel, or at the end of its part, may lie on the other side in float32.
@@ -67,7 +66,7 @@ def test_values_and_gradients_through_cascades_are_those_of_autograd(count: int,
     "tree", [random_tree(5, brick=3, degree=1, sigma=8.0), replace(random_cascades(2, brick=2), environment=None)], ids=["one", "cascades"]
 )
 def test_light_samples_absorb_and_have_no_gradient(tree: NerfTree) -> None:
-    origins, directions = (a[np.arange(60) % 4 != 2] for a in (nested_rays(tree, 60) if tree.outer else rays_at(tree, 60)))
+    origins, directions = (a[np.arange(40) % 4 != 2] for a in (nested_rays(tree, 40) if tree.outer else rays_at(tree, 40)))
     seen = seen_at_random(len(origins), 0.5)
     found = device_gradients(tree, origins, directions, seen, DEVICE, min_weight=0.03)
     wanted = gradients(tree, origins, directions, seen, stop=EARLY_STOP, min_weight=0.03)
@@ -78,24 +77,12 @@ def test_light_samples_absorb_and_have_no_gradient(tree: NerfTree) -> None:
     assert 0 < (found[1] != 0).sum() < (everything[1] != 0).sum()
 
 
-def test_terms_that_are_not_trained_have_no_gradient_and_change_no_other() -> None:
-    tree = random_tree(4, brick=2, degree=2, share=0.8, sigma=5.0)
-    origins, directions = rays_at(tree, 30)
-    seen = seen_at_random(30, 0.3)
-    whole, few = (device_gradients(tree, origins, directions, seen, DEVICE, terms=terms) for terms in (9, 4))
-    np.testing.assert_array_equal(few[1], whole[1])
-    np.testing.assert_array_equal(few[2][:, :4], whole[2][:, :4])
-    assert few[2][:, :4].any()
-    assert whole[2][:, 4:].any()
-    assert not few[2][:, 4:].any()
-
-
 def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
-    tree = random_tree(4, brick=4, degree=1, share=0.6)
-    origins, directions = rays_at(tree, 60)
-    seen = seen_at_random(60, 0.3, np.float32)
+    tree = random_tree(4, brick=2, degree=1, share=0.6)
+    origins, directions = rays_at(tree, 40)
+    seen = seen_at_random(40, 0.3, np.float32)
     _, by_density, by_sh = device_gradients(tree, origins, directions, seen, DEVICE)
-    order = np.random.default_rng(0).permutation(60)
+    order = np.random.default_rng(0).permutation(40)
     again = device_gradients(tree, origins[order], directions[order], RayTargets(*(part[order] for part in seen[:4]), seen.opacity_weight), DEVICE)
     assert np.array_equal(by_density, again[1])
     assert np.array_equal(by_sh, again[2])
@@ -131,12 +118,13 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
     assert (device_gradients(bare, origins, directions, seen_at_random(40, 0.0), DEVICE)[0] > 0).any()
 
 
-def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 4, rule: Rule = PLAIN) -> tuple[RefinementState, list[float]]:
+def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 16, steps: int = 4, rule: Rule = PLAIN) -> tuple[RefinementState, list[float]]:
     """Steps in one go, or in several with the state fetched in between, as a checkpoint does."""
     o = initial_state(tree)
     errors: list[float] = []
     for end in until:
-        errors += optimise(o, targets, until=end, rays=rays, density_lr=0.3, sh_lr=0.05, fall=exponential_fall(0.1, steps), seed=1, view_dependent_lr_ratio=0.5,
+        errors += optimise(o, targets, until=end, rays=rays, density_lr=0.3, sh_lr=0.05, fall=lambda step: 0.1 ** (step / steps),
+                           seed=1, view_dependent_lr_ratio=0.5,
                            rule=rule)  # fmt: skip
         o.fetch()
     return o, errors
@@ -169,7 +157,7 @@ def test_steps_are_those_of_the_cpu(tree: NerfTree, rule: Rule) -> None:
         assert (np.abs(a - b) > 1e-3 * np.abs(b) + 1e-3 * np.abs(b).max()).mean() < 0.02, name
     assert errors[0] == pytest.approx(wanted[0], rel=1e-5)
     assert errors == [errors[0]] * 4  # nothing later has arrived
-    assert error(ours.result(), on_device, 500, 0) == pytest.approx(error(theirs.result(), on_host, 500, 0), rel=1e-2)
+    assert error(ours.result(), on_device, 60, 0) == pytest.approx(error(theirs.result(), on_host, 60, 0), rel=1e-2)
 
 
 @pytest.mark.parametrize("tree", [random_tree(2), random_tree(3, brick=1), nested_balls()], ids=["one", "bricks of one voxel", "cascades"])
@@ -189,7 +177,7 @@ def test_interrupted_or_not_the_bytes_are_the_same() -> None:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 
 
-@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("smooth", [True])
 def test_the_room_that_a_fit_takes_is_known_before(*, smooth: bool) -> None:
     from stages.bake.memory import needed_on_device
 
@@ -211,10 +199,10 @@ def test_the_room_that_a_fit_takes_is_known_before(*, smooth: bool) -> None:
 ], ids=["one grid", "cascades"])  # fmt: skip
 def test_weights_are_those_of_the_cpu(tree: NerfTree) -> None:
     targets = Targets(pixels(4, 12), (1.0, 1.0, 1.0))
-    wanted = max_weights(tree, targets, 700, 0)
+    wanted = max_weights(tree, targets, 250, 0)
     told: list[int] = []
-    found = max_weights(tree, targets.sent(DEVICE), 700, 0, lambda done, _: told.append(done))
-    assert told == [700]
+    found = max_weights(tree, targets.sent(DEVICE), 250, 0, lambda done, _: told.append(done))
+    assert told == [250]
     assert (wanted > 0.01).mean() > 0.2
     assert (np.abs(found - wanted) > 2e-3).mean() < 0.01
 
@@ -264,16 +252,10 @@ def test_in_normalised_device_coordinates_too() -> None:
     camera = camera_at(0, 0, 0)
     image = np.full((camera.height, camera.width, 3), 128, np.uint8)
     targets = Targets(Pixels([camera], [image], [None], np.ones(1), np.full(1, 5.0)), (0.5, 0.5, 0.5), reaches_infinity=True)
-    count = min(300, len(targets.pixels))
+    count = min(80, len(targets.pixels))
     wanted, found = error(tree, targets, count, 0), error(tree, targets.sent(DEVICE), count, 0)
     assert wanted > 1e-3
     assert found == pytest.approx(wanted, rel=1e-3)
-
-
-def test_targets_stay_on_the_host_where_kernels_cannot_be_built() -> None:
-    targets = Targets(pixels(2, 8), (1.0, 1.0, 1.0))
-    assert targets.to("cpu") is targets
-    assert targets.to("cuda").on_device == torch.cuda.is_available()
 
 
 @pytest.mark.gpu

@@ -10,7 +10,7 @@ import torch
 
 from efficientnerf.asset.queries import normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.rendering import ray_statistics
 from efficientnerf.geometry.cameras import Camera, rays, resized
@@ -36,7 +36,7 @@ def camera_of(tree: NerfTree, model: str = "PINHOLE", distance: float = 2.5) -> 
     return Camera("view", 27, 22, model, LENSES[model], at)
 
 
-@pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((8,), 1000), ((3, 5), 17), ((), 1)])
+@pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((3, 5), 17), ((), 1)])
 def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], entries: int) -> None:
     tree = in_codes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
     origins, directions = rays_at(tree, 300)
@@ -48,7 +48,7 @@ def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], en
     assert outputs.opacity.max() > 0.5
 
 
-@pytest.mark.parametrize("brick", [1, 2, 4, 5])
+@pytest.mark.parametrize("brick", [1, 5])
 def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
     tree = in_codes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
     origins, directions = rays_at(tree, 300)
@@ -95,8 +95,7 @@ def far_camera(tree: NerfTree, voxels: float) -> Camera:
     return Camera("far", 40, 36, "SIMPLE_PINHOLE", (30 * voxels / max(tree.resolution), 20.0, 18.0), at)
 
 
-@pytest.mark.parametrize("degree", range(5))
-@pytest.mark.parametrize("distance", [0.0, 30.0, 300.0, 1000.0, 3000.0])
+@pytest.mark.parametrize(("degree", "distance"), [(0, 0.0), (0, 3000.0), (1, 300.0), (2, 30.0), (2, 1000.0), (3, 300.0), (4, 0.0), (4, 1000.0)])
 @pytest.mark.parametrize("layout", ["floats", "codes"])
 def test_images_match_the_torch_reference_from_near_and_far(degree: int, distance: float, layout: str) -> None:
     """View colours and colours at each sample: the harmonics of neighbours are independent here, and surfaces opaque."""
@@ -141,19 +140,6 @@ def test_images_without_normals_are_otherwise_the_same(kind: str) -> None:
         assert np.array_equal(getattr(usual, name), getattr(without, name)), name
 
 
-def test_ray_statistics_are_consistent() -> None:
-    tree = uniform_tree(sigma=0.5)
-    camera = camera_of(tree)
-    visited, tested, interpolated, lookups = np.moveaxis(ray_statistics(tree, camera), -1, 0)
-    hit = render(tree, camera).opacity > 0
-    assert ((interpolated > 0) == hit).all()
-    assert (tested >= interpolated).all()
-    assert (interpolated >= lookups).all()
-    assert (visited[hit] > 0).all()
-    # A chord of the box in half voxels, at most its diagonal.
-    assert tested.max() <= 2 * np.linalg.norm(tree.resolution) + 1
-
-
 @pytest.mark.parametrize(("sigma", "share", "stop"), [(0.3, 0.9, 0.0), (3.0, 0.6, 0.0), (300.0, 0.6, 1e-3)])
 def test_thin_and_opaque_media_match_the_torch_reference(sigma: float, share: float, stop: float) -> None:
     """The kernel may differ by the early stop, by 1e-4 for the weight of samples without a colour, and by rounding: 1e-3 together."""
@@ -167,21 +153,7 @@ def test_thin_and_opaque_media_match_the_torch_reference(sigma: float, share: fl
     assert outputs.opacity.mean() > 0.05
 
 
-def test_the_largest_coefficients_of_a_file_render_like_others() -> None:
-    tree = random_tree(2, degree=2, share=0.7)
-    sh = tree.sh.copy()
-    sh[::7, 0] = 65000.0
-    sh[1::7, 0] = -65000.0
-    tree = replace(tree, harmonics=sh)
-    origins, directions = rays_at(tree, 300)
-    colour, _ = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    error = np.abs(render_rays(tree, origins, directions).colour - colour.numpy())
-    # A coefficient beside one of 65000 is known to 1, but there the logistic is flat, except for the few rays on its slope.
-    assert np.quantile(error, 0.98) < 1e-3
-
-
-@pytest.mark.parametrize("model", LENSES)
-@pytest.mark.parametrize("supersample", [1, 2])
+@pytest.mark.parametrize(("model", "supersample"), [*((model, 1) for model in LENSES), ("OPENCV", 2)])
 def test_images_of_every_camera_model_match_single_rays(model: str, supersample: int) -> None:
     tree = random_tree(0, share=0.7, degree=2)
     camera = camera_of(tree, model)
@@ -201,9 +173,7 @@ def test_images_of_every_camera_model_match_single_rays(model: str, supersample:
         np.testing.assert_allclose(image.depth[solid], (flat.depth.reshape(solid.shape) * slant)[solid], rtol=1e-3)
 
 
-@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
-@pytest.mark.parametrize("share", [0.01, 0.05, 0.4])
-@pytest.mark.parametrize("distance", [0.1, 1.5, 9.0])
+@pytest.mark.parametrize(("model", "share", "distance"), [("PINHOLE", 0.01, 9.0), ("OPENCV", 0.05, 1.5), ("OPENCV_FISHEYE", 0.4, 0.1)])
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=share)
     timid = replace(tree)
@@ -229,15 +199,6 @@ def test_leaps_in_every_direction_alike_change_no_value(monkeypatch: pytest.Monk
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
     assert work[..., 0].sum() < more[..., 0].sum()
     assert np.array_equal(work[..., 2:], more[..., 2:])
-
-
-def test_given_rays_may_come_in_any_order() -> None:
-    tree = random_tree(3, shape=(9, 8, 7), brick=4, share=0.1)
-    origins, directions = rays_at(tree, 700)
-    order = np.random.default_rng(0).permutation(len(origins))
-    one, other = render_rays(tree, origins, directions), render_rays(tree, origins[order], directions[order])
-    for name in FIELDS:
-        assert np.array_equal(getattr(one, name)[order], getattr(other, name)), name
 
 
 def test_a_camera_inside_and_one_facing_away() -> None:
@@ -279,26 +240,6 @@ def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> No
     colour, opacity, _, _ = render_rays(tree, origins, directions, sh_directions)
     expected = 1 / (1 + np.exp(-0.4886025119029199 * sh_directions[:, 2]))
     np.testing.assert_allclose(colour, (opacity * expected)[:, None] * np.ones(3), atol=1e-4)
-
-
-def test_a_tree_without_voxels_renders() -> None:
-    tree = tree_from_voxels((2, 3, 1), 0.1, np.zeros(3), np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
-    outputs = render(tree, camera_of(tree), supersample=2)
-    assert not outputs.opacity.any()
-    assert not outputs.colour.any()
-
-
-def test_a_background_has_three_numbers() -> None:
-    tree = random_tree(0)
-    with pytest.raises(ValueError, match="expected three numbers"):
-        render(tree, camera_of(tree), background=(1.0, 1.0))  # type: ignore[arg-type]
-
-
-def test_nan_directions_render_as_empty() -> None:
-    tree = random_tree(0)
-    bad = np.array([[np.nan, 0, 1], [0, 0, 0], [np.inf, 0, 0]])
-    outputs = render_rays(tree, np.zeros((3, 3)), bad)
-    assert np.isfinite(outputs.opacity).all()
 
 
 @pytest.mark.parametrize("layout", ["floats", "codes"])

@@ -8,8 +8,8 @@ import numba
 import numpy as np
 import pytest
 
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.queries import density_block
-from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, packed_pointers, sh_basis
@@ -45,8 +45,7 @@ def pairs(packed, brick):  # type: ignore[no-untyped-def]
     return out
 
 
-@pytest.mark.parametrize("wide", [False, True])
-@pytest.mark.parametrize("brick", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize(("brick", "wide"), [(1, False), (2, True), (4, False), (4, True), (5, False)])
 def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int, wide: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if wide:
         monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_BITS", 0)
@@ -79,9 +78,10 @@ def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int, 
         assert bits.sum() == (eight > 0).any(axis=0).sum()
 
 
-@pytest.mark.parametrize("brick", [1, 2, 4, 5])
-@pytest.mark.parametrize("degree", range(5))
-@pytest.mark.parametrize("layout", ["floats", "codes", "wide codes"])
+@pytest.mark.parametrize(
+    ("layout", "degree", "brick"),
+    [(layout, degree, (1, 2, 4, 5)[(n + degree) % 4]) for n, layout in enumerate(["floats", "codes", "wide codes"]) for degree in range(5)],
+)
 def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, layout: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if layout == "wide codes":
         monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_COORDINATES", 0)
@@ -102,8 +102,7 @@ def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, 
     assert not bits[-1].any()
 
 
-@pytest.mark.parametrize("shape", [(7, 5, 6), (1, 9, 2), (270, 1, 1)])
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize(("shape", "share"), [((7, 5, 6), 0.3), ((1, 9, 2), 0.0), ((270, 1, 1), 0.02)])
 def test_leaps_in_eight_directions_are_the_sides_of_empty_cubes(shape: tuple[int, int, int], share: float) -> None:
     occupied = np.random.default_rng(5).random(shape) < share
     leap, at = octant_leaps(occupied), np.argwhere(occupied)

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region, inside_distance
+from efficientnerf.asset.region import inside_distance
+from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_foreground
 from efficientnerf.geometry.cameras import Camera, rays
 
@@ -93,7 +94,7 @@ ROOM = box([-6, -6, -0.5], [6, 6, 4], from_within=True)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_a_ball_on_the_floor_of_a_room_is_whole_and_the_floor_is_a_disc_round_it(noise: float) -> None:
+def test_a_ball_on_a_floor_is_whole_and_the_floor_a_disc_round_it(noise: float) -> None:
     cameras = ring(30, 2.5, 1.2)
     found = region(cameras, [ball([0, 0, 0], 0.5), ROOM], noise=noise)
     assert (inside_distance(found, on_ball([0, 0, 0], 0.5)) > found.fade).all()
@@ -139,7 +140,6 @@ def test_a_head_is_whole_in_close_ups_and_before_a_wall_of_uncertain_depth(away:
     centres = np.array([one.centre for one in cameras])[views]
     points[wall] = centres[wall] + (points - centres)[wall] * (1 + uncertain * generator.normal(size=(int(wall.sum()), 1)))
     found = find_foreground(points, views, pixels, cameras)
-    assert found is not None
     for low, high in (*ears, nose):
         assert (inside_distance(found, in_box(low, high)) > found.fade).all()
     assert (inside_distance(found, on_ball(centre, 0.4)) > 0).all()
@@ -173,9 +173,13 @@ def in_front(distance: float, height: float) -> list[Camera]:
     return [camera([distance * np.sin(a), -0.45 - distance * np.cos(a), height], [0, -0.45, 0.2], 55) for a in angles]
 
 
-@pytest.mark.parametrize("wall", [None, 0.5, 4.0])
-@pytest.mark.parametrize(("body", "height", "noise"), [(False, 0.2, 0.0), (False, 0.2, 0.01), (True, 0.2, 0.01), (True, 1.2, 0.01)])
-@pytest.mark.parametrize("kind", PARTS)
+CONDITIONS = [(False, 0.2, 0.0), (False, 0.2, 0.01), (True, 0.2, 0.01), (True, 1.2, 0.01)]  # a body, its height, noise
+
+
+@pytest.mark.parametrize(
+    ("kind", "wall", "body", "height", "noise"),
+    [(kind, (None, 0.5, 4.0)[(n + k) % 3], *CONDITIONS[k]) for n, kind in enumerate(PARTS) for k in range(4)],
+)
 def test_a_head_is_whole_whatever_it_wears(kind: str, body: bool, height: float, noise: float, wall: float | None) -> None:
     """What of it is in one plane is no support: rays pass between and beside its parts, and go on to a wall or to nowhere."""
     cameras, parts = in_front(2.6, height), [*PARTS[kind], NOSE]
@@ -193,7 +197,7 @@ def test_a_head_is_whole_whatever_it_wears(kind: str, body: bool, height: float,
     assert (found.bounds[1] - found.bounds[0]).max() < 5  # of a wall of 40
 
 
-def test_a_table_is_clipped_about_what_stands_on_it_and_a_panel_that_ends_in_view_is_not() -> None:
+def test_a_table_is_clipped_and_a_panel_that_ends_in_view_is_not() -> None:
     """The same plane with and without edges that all photographs show."""
     cameras = in_front(2.5, 0.2)
     wall, panel = ([-20.0, 0.0, -20.0], [20.0, 1.0, 20.0]), ([-0.9, 0.0, -0.9], [0.9, 0.1, 0.9])
@@ -215,8 +219,6 @@ def test_floaters_before_the_cameras_and_scattered_ends_change_little() -> None:
     near = np.isin(views, blob) & (np.linalg.norm(pixels - 0.3, axis=1) < 0.2)
     points[near] = centres[near] + 0.1 * (points - centres)[near]  # a patch before three of the cameras
     noisy = find_foreground(points, views, pixels, cameras)
-    assert clean is not None
-    assert noisy is not None
     assert np.abs(noisy.bounds - clean.bounds).max() < 0.25
 
 
@@ -253,13 +255,6 @@ def test_a_facade_before_all_cameras_is_kept_whole() -> None:
     assert (inside_distance(found, in_box([-0.5, -0.15, -1], [0.5, 0.0, 1])) > found.fade).all()
 
 
-def test_the_same_rays_give_the_same_region() -> None:
-    cameras = ring(20, 2.5, 1.0)
-    first, second = (region(cameras, [ball([0, 0, 0], 0.5), ROOM], noise=0.02) for _ in range(2))
-    assert np.array_equal(first.bounds, second.bounds)
-    assert (first.corner_radius, first.fade) == (second.corner_radius, second.fade)
-
-
 def test_the_scale_of_the_scene_does_not_matter() -> None:
     cameras = ring(20, 2.5, 1.0)
     points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5), ROOM])
@@ -270,14 +265,4 @@ def test_the_scale_of_the_scene_does_not_matter() -> None:
         pose[:3, 3] *= 8
         larger.append(Camera(one.name, one.width, one.height, one.model, one.params, pose))
     scaled = find_foreground(8 * points, views, pixels, larger)
-    assert found is not None
-    assert scaled is not None
     assert scaled.bounds == pytest.approx(8 * found.bounds)
-
-
-def test_rays_that_say_nothing_give_no_region() -> None:
-    cameras = ring(6, 2.0, 1.0)
-    points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5)])
-    assert find_foreground(np.full_like(points, np.inf), views, pixels, cameras) is None
-    assert find_foreground(points, views, pixels, cameras, weights=np.zeros(len(points))) is None
-    assert find_foreground(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)), []) is None

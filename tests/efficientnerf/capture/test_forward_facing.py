@@ -12,11 +12,10 @@ from efficientnerf.capture.forward_facing import detect_forward_facing, mean_pos
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
 from stages.formats import importers
-from stages.framing.camera_paths import spiral_poses, turntable_cameras
+from stages.framing.camera_paths import spiral_poses
 from stages.framing.near_planes import content_depths
 from stages.framing.training_frame import find_training_frame
 from stages.io.capture import Capture, Photo, SparsePoints
-from tests.efficientnerf.walls import wall
 from tests.stages import captures
 from tests.stages.forward_facing import FAR, NEAR, depths, looking, row, some_rotation
 
@@ -63,23 +62,6 @@ def test_a_voxel_is_a_pixel_wide_and_a_pixel_of_parallax_deep() -> None:
     assert focal * baseline * (1 / z - 1 / depth) == pytest.approx(1, rel=1e-6)
 
 
-REFUSED = {
-    "a ring": (captures.cameras(8), None, "view axes deviate"),
-    "a fan": ([looking(np.zeros(3), np.array([np.sin(a), np.cos(a), 0])) for a in np.radians([-50, -20, 0, 20, 50])], None, "deviate by up to 50"),
-    "wide lenses": (row(focal=0.2), None, "rays deviate"),
-    "one camera is in the midst of it": ([*row(), looking(np.array([0, 6.0, 0]), np.array([0, 9.0, 0]))], None, "does not lie in front of all"),
-    "no depths": (row(), np.full((9, 2), np.nan), "unknown"),
-}
-
-
-@pytest.mark.parametrize("which", REFUSED)
-def test_what_is_not_forward_facing_says_why(which: str) -> None:
-    cameras, known, reason = REFUSED[which]
-    found = detect_forward_facing(cameras, depths(cameras) if known is None else known)
-    assert isinstance(found, str)
-    assert reason in found
-
-
 def capture(cameras: list[Camera], kind: str = "llff", **more: object) -> Capture:
     moved = Similarity(3.0, some_rotation(2), np.array([5.0, -2.0, 1.0]))
     photos = tuple(Photo(moved.camera(camera), Path("a.png"), near=3 * NEAR, far=3 * FAR) for camera in cameras)
@@ -101,7 +83,6 @@ def test_the_space_follows_the_kind_of_source_and_the_setting() -> None:
 
 def test_the_reference_camera_is_in_the_training_frame() -> None:
     found = find_training_frame(capture(row()))
-    assert found.forward is not None
     there = [found.world_from_capture.camera(photo.camera) for photo in capture(row()).photos]
     np.testing.assert_allclose(found.forward.ndc.world_from_camera, mean_pose(there), atol=1e-9)
     points = found.world_from_capture.points(Similarity(3.0, some_rotation(2), np.array([5.0, -2.0, 1.0])).points(in_pictures(row(), NEAR, FAR)))
@@ -175,23 +156,3 @@ def test_llff_captures_from_all_around_are_centred_on_what_they_look_at(tmp_path
     assert not found.orbit.forward_facing
     assert found.orbit.radius == pytest.approx(4.3 * unit, rel=0.1)
     assert (found.near_far_planes[:, 0] < found.near_far_planes[:, 1]).all()
-
-
-def test_the_turntable_of_a_forward_facing_asset_is_its_spiral() -> None:
-    tree = wall(voxels=24)
-    assert tree.ndc is not None
-    still = turntable_cameras(tree, frames=4, width=64, height=48)
-    assert all(np.allclose(camera.centre, tree.ndc.world_from_camera[:3, 3]) for camera in still)
-    spiral = {"radii": [0.5, 0.3, 0.1], "focus": 6.0, "tangents": [0.4, 0.5], "far": 40.0}
-    cameras = turntable_cameras(replace(tree, metadata={"spiral": spiral}), frames=8, width=64, height=48)
-    expected = spiral_poses(tree.ndc.world_from_camera, spiral["radii"], 6.0, 8)  # type: ignore[arg-type]
-    for camera, pose in zip(cameras, expected, strict=True):
-        np.testing.assert_array_equal(camera.world_from_camera, pose)
-        # No more is shown than all pictures cover, a twentieth less: across decides here.
-        assert camera.width / 2 / camera.params[0] == pytest.approx(0.95 * 0.4)
-        assert camera.height / 2 / camera.params[0] < 0.5
-    for odd in ({"radii": [1.0]}, {"focus": -1.0}, {"tangents": "wide"}, {"radii": [float("nan"), 0, 0]}):
-        with pytest.raises(BadInput, match="spiral"):
-            turntable_cameras(replace(tree, metadata={"spiral": spiral | odd}), frames=2, width=64, height=48)
-    turned = turntable_cameras(replace(tree, metadata={"spiral": spiral}), frames=4, width=64, height=48, radius=5.0, elevation=10.0)
-    assert np.ptp([camera.centre for camera in turned], axis=0).max() > 1  # asked for, it goes round

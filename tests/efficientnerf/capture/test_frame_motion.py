@@ -59,14 +59,3 @@ def test_noise_a_trembling_hand_and_a_wall_are_no_motion() -> None:
     trembling = [np.roll(still, tuple(random.integers(-2, 3, 2)), (0, 1)) for _ in range(25)]
     assert moved(trembling)[-1] < 4 / DIAGONAL
     assert moved([np.full((HEIGHT, WIDTH, 3), 128, np.uint8)] * 5)[-1] == 0
-
-
-def test_a_blurred_frame_in_between_adds_no_motion() -> None:
-    frames = clips.pan(15, 3.0, width=WIDTH, height=HEIGHT)
-    blurred = clips.pan(15, 3.0, width=WIDTH, height=HEIGHT, blur=(4, 5, 9), length=61)
-    assert moved(blurred)[-1] == pytest.approx(moved(frames)[-1], rel=0.15)
-
-
-def test_a_cut_is_motion() -> None:
-    one, other = (clips.texture(seed, 320)[:HEIGHT, :WIDTH] for seed in (5, 6))
-    assert moved([one] * 3 + [other] * 12)[-1] > 0.03

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio
@@ -20,13 +18,6 @@ def pair(seed: int = 0, height: int = 40, width: int = 53) -> tuple[np.ndarray, 
     return np.clip(truth + random.normal(0, 0.05, truth.shape), 0, 1).astype(np.float32), truth.astype(np.float32)
 
 
-def test_psnr_of_a_constant_difference() -> None:
-    truth = np.full((4, 5, 3), 0.25)
-    assert psnr(truth + 0.1, truth) == pytest.approx(20.0)
-    assert psnr(truth + 0.01, truth) == pytest.approx(40.0)
-    assert psnr(truth, truth) == math.inf
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_psnr_agrees_with_scikit_image(seed: int) -> None:
     image, truth = pair(seed)
@@ -40,19 +31,6 @@ def test_ssim_is_the_papers(seed: int) -> None:
     np.testing.assert_allclose(ssim_map(image, truth), expected, atol=1e-9)
     assert ssim(image, truth) == pytest.approx(expected.mean(), abs=1e-9)
     np.testing.assert_allclose(ssim_map(image[..., 1], truth[..., 1]), expected[..., 1], atol=1e-9)
-
-
-def test_ssim_of_constant_images_is_the_luminance_term() -> None:
-    a, b = 0.3, 0.7
-    expected = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
-    assert ssim(np.full((12, 15, 3), a), np.full((12, 15, 3), b)) == pytest.approx(expected)
-
-
-def test_ssim_is_one_for_equal_images_and_symmetric() -> None:
-    image, truth = pair()
-    assert ssim(image, image) == pytest.approx(1.0)
-    assert ssim(image, truth) == pytest.approx(ssim(truth, image), abs=1e-12)
-    assert ssim(image[..., 0], truth[..., 0]) < 1.0
 
 
 def test_a_mask_of_all_changes_nothing_and_what_it_hides_does_not_count() -> None:
@@ -108,14 +86,3 @@ def test_a_change_of_exposure_and_white_balance_is_fitted_away(seed: int) -> Non
     noisy, truth = pair(seed)
     assert psnr(colour_fitted(noisy, truth), truth) >= psnr(noisy, truth)
     assert colour_fitted(noisy, truth).min() >= 0
-
-
-def test_only_pixels_that_count_are_fitted() -> None:
-    image, truth = pair()
-    mask = np.zeros(truth.shape[:2], bool)
-    mask[:20] = True
-    spoilt = image * 0.7 + 0.1
-    spoilt[20:] = 0.5
-    np.testing.assert_allclose(colour_fitted(spoilt, truth, mask)[mask], colour_fitted(image[:20], truth[:20]).reshape(-1, 3), atol=1e-5)
-    flat = colour_fitted(np.full((4, 5, 3), 0.3), np.full((4, 5, 3), 0.6))
-    np.testing.assert_allclose(flat, 0.6, err_msg="an image of one colour leaves the fit open; any will do")

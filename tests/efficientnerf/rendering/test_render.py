@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 
@@ -10,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.rendering import Rendering, render, render_rays, render_reference
-from efficientnerf.asset.tree import LOOKUPS
+from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from tests import reference
@@ -19,8 +17,7 @@ from tests.efficientnerf.balls import pose, untrained
 from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tensors, uniform_tree
 
 
-@pytest.mark.parametrize("step_size", [0.3, 0.5, 1.0])
-@pytest.mark.parametrize(("brick", "degree"), TREES)
+@pytest.mark.parametrize(("brick", "degree", "step_size"), [(*tree, (0.3, 0.5, 1.0)[n % 3]) for n, tree in enumerate(TREES)])
 def test_the_kernel_is_the_torch_function(brick: int, degree: int, step_size: float) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, step_size=step_size)
     origins, directions = rays_at(tree, 400)
@@ -33,9 +30,8 @@ def test_the_kernel_is_the_torch_function(brick: int, degree: int, step_size: fl
     assert seen.opacity.max() > 0.8
 
 
-@pytest.mark.parametrize("step_size", [0.5, 1.0])
-@pytest.mark.parametrize("lookup", LOOKUPS)
-@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
+@pytest.mark.parametrize(("lookup", "step_size"), [("trilinear", 0.5), ("trilinear", 1.0), ("nearest", 0.5)])
+@pytest.mark.parametrize(("brick", "degree"), TREES[1:3])
 def test_the_torch_function_is_the_loop(brick: int, degree: int, lookup: str, step_size: float) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, lookup=lookup, step_size=step_size)
     origins, directions = rays_at(tree, 24)
@@ -56,11 +52,10 @@ def test_gradients_of_the_torch_function_are_finite_differences() -> None:
     sh = torch.from_numpy(tree.sh).double().requires_grad_()
     assert torch.autograd.gradcheck(lambda d, s: render_reference(tree, origins, directions, d, s), (density, sh), fast_mode=True)
     render_reference(tree, origins, directions, density, sh)[0].sum().backward()
-    assert density.grad is not None
     assert density.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("share", [0.02, 0.5])
 def test_leaping_changes_no_value(share: float) -> None:
     tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
     origins, directions = rays_at(tree, 600)
@@ -86,23 +81,6 @@ def test_a_uniform_box_has_its_closed_form() -> None:
     np.testing.assert_allclose(seen.colour[0], seen.opacity[0] * reference.sigmoid(0.7), atol=1e-3)
 
 
-@pytest.mark.parametrize("sigma", [0.002, 0.02, 0.2, 2.0])
-def test_one_colour_everywhere_gives_that_colour_however_thin(sigma: float) -> None:
-    tree = uniform_tree((24, 24, 24), brick=2, sigma=sigma, logit=0.7)
-    origins, directions = rays_at(tree, 80)
-    seen = render_rays(tree, origins, directions)
-    np.testing.assert_allclose(seen.colour, seen.opacity[:, None] * reference.sigmoid(0.7) * np.ones(3), atol=2e-4)
-
-
-def test_normals_face_the_ray() -> None:
-    tree = uniform_tree(sigma=60.0)
-    middle = (tree.bounds_min + tree.bounds_max) / 2
-    directions = np.concatenate([np.eye(3), -np.eye(3)])
-    seen = render_rays(tree, middle - 3 * directions, directions)
-    np.testing.assert_allclose(seen.normal, -directions, atol=1e-3)
-    np.testing.assert_allclose(seen.depth, 3 - 0.8, atol=0.05)
-
-
 def test_pictures_are_their_rays() -> None:
     from efficientnerf.geometry.cameras import rays
 
@@ -117,14 +95,6 @@ def test_pictures_are_their_rays() -> None:
     np.testing.assert_allclose(picture.depth, flat.depth.reshape(shape) * slant, rtol=1e-5)
     assert np.array_equal(np.isinf(picture.depth), picture.opacity < 0.5)
     assert [getattr(picture, name).dtype for name in ("colour", "opacity", "depth", "normal")] == [np.float32] * 4
-
-
-def test_a_background_lies_behind() -> None:
-    tree = random_tree(0, share=0.7)
-    camera = looking(tree)
-    plain, over = render(tree, camera), render(tree, camera, background=(1.0, 0.5, 0.0))
-    np.testing.assert_allclose(over.colour, plain.colour + (1 - plain.opacity[..., None]) * [1.0, 0.5, 0.0], atol=1e-6)
-    assert np.array_equal(over.opacity, plain.opacity)
 
 
 def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
@@ -144,7 +114,7 @@ def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
         render(tree, camera, supersample=0)
 
 
-@pytest.mark.parametrize("supersample", [1, 2, 3])
+@pytest.mark.parametrize("supersample", [1, 3])
 def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: int) -> None:
     tree = random_tree(4, share=0.7, sigma=20.0)
     picture = render(tree, looking(tree, 40), supersample=supersample)
@@ -153,20 +123,13 @@ def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: i
     assert ((np.abs(length - 1) < 1e-3) | (length == 0)).all()
 
 
-@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
-@pytest.mark.parametrize("supersample", [2, 3])
+@pytest.mark.parametrize(("lookup", "supersample"), [("trilinear", 3), ("nearest", 2)])
 def test_renders_do_not_depend_on_how_they_are_cut(lookup: str, supersample: int) -> None:
     tree = replace(random_tree(0, share=0.7), lookup=lookup)
     whole = render(tree, looking(tree), supersample=supersample)
     cut = render(tree, looking(tree), supersample=supersample, rays_per_band=100)
     for name in ("colour", "opacity", "depth", "normal"):
         assert np.array_equal(getattr(whole, name), getattr(cut, name)), name
-
-
-def test_a_rendering_of_no_rays() -> None:
-    seen = render_rays(random_tree(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    assert isinstance(seen, Rendering)
-    assert seen.colour.shape == (0, 3)
 
 
 @pytest.mark.gpu
@@ -200,17 +163,6 @@ def test_a_fields_picture_is_what_lies_before_in_and_behind_the_box(contracted: 
     assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
 
 
-def test_a_fields_picture_does_not_depend_on_how_it_is_cut() -> None:
-    m = untrained()
-    camera = Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
-    whole = FieldRenderer(m, 0.5, 30.0).render(camera)
-    calls: list[tuple[int, int]] = []
-    cut = FieldRenderer(m, 0.5, 30.0, rays_per_block=11).render(camera, lambda done, total: calls.append((done, total)))
-    np.testing.assert_allclose(cut.colour, whole.colour, atol=1e-6)
-    np.testing.assert_allclose(cut.opacity, whole.opacity, atol=1e-6)
-    assert calls[-1] == (63, 63)
-
-
 def dense(*, contracted: bool) -> FieldRenderer:
     m = untrained(contracted=contracted)
     m.fine.weights[-1].data.mul_(30)
@@ -234,22 +186,11 @@ def test_a_fields_picture_is_split_by_any_box() -> None:
     np.testing.assert_allclose(nothing.behind, usual.colour, atol=1e-5)
 
 
-def test_opacity_within_grows_with_the_box() -> None:
-    field, camera = dense(contracted=True), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
-    bounds = np.asarray(field.model.space.bounds)
-    within = [field.render(camera, box=bounds, reach=bounds * scale).within for scale in (1.0, 2.0, 4.0, 400.0)]
-    for smaller, larger in itertools.pairwise(within):
-        assert (larger - smaller > -1e-6).all()
-    assert within[0].mean() < within[-1].mean()
-    np.testing.assert_allclose(within[-1], field.render(camera).opacity, atol=1e-5)
-
-
 @pytest.mark.parametrize("contracted", [False, True])
 def test_opacity_nearer_than_the_depth_is_half_at_most(contracted: bool) -> None:
     field, camera = dense(contracted=contracted), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
     assert field.render(camera).nearer is None
     at = field.render(camera, limits=lambda origins, directions, distance: distance)
-    assert at.nearer is not None
     assert (at.nearer[at.opacity >= 0.5] < 0.5).all()
     none, everything = (field.render(camera, limits=lambda o, d, distance, limit=limit: np.full(len(distance), limit)) for limit in (0.0, np.inf))
     assert not none.nearer.any()  # type: ignore[union-attr]

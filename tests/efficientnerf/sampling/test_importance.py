@@ -64,7 +64,7 @@ def test_even_samples_tile_the_ray() -> None:
 
 
 @pytest.mark.parametrize("drop", [-1.0, 0.5])
-def test_samples_by_importance_tile_their_intervals_and_contain_the_coarse_ones(drop: float) -> None:
+def test_samples_by_importance_tile_their_intervals(drop: float) -> None:
     coarse, at = pruned(drop)
     o, d, _, _ = rays()
     weight = torch.rand(len(at), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -100,7 +100,6 @@ def same_up_to(capacity: int, padded: Samples, exact: Samples) -> None:
     """Filled from the beginning on, zeros behind; rays that end beyond the capacity are not complete."""
     kept = min(capacity, len(exact.start))
     assert torch.equal(padded.first, exact.first.clamp(max=kept))
-    assert padded.complete is not None
     assert torch.equal(padded.complete, exact.first[1:] <= capacity)
     last = int(padded.first[:-1][padded.complete.logical_not()].min()) if not padded.complete.all() else kept  # a ray that is cut ends elsewhere
     for ours, theirs in zip(padded[1:5], exact[1:5], strict=True):
@@ -109,8 +108,7 @@ def same_up_to(capacity: int, padded: Samples, exact: Samples) -> None:
         assert not ours[kept:].any()
 
 
-@pytest.mark.parametrize("capacity", [30, 70, 120, 5000])
-@pytest.mark.parametrize("outside", [False, True])
+@pytest.mark.parametrize(("capacity", "outside"), [(30, False), (70, True), (5000, True)])
 def test_a_capacity_pads_or_cuts_even_samples(outside: bool, capacity: int) -> None:
     o, d, near, far = rays()
     jitter = torch.rand(len(o), 10, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -122,8 +120,7 @@ def test_a_capacity_pads_or_cuts_even_samples(outside: bool, capacity: int) -> N
         assert len(padded.start) == 120
 
 
-@pytest.mark.parametrize("capacity", [40, 90, 5000])
-@pytest.mark.parametrize("padding", [0, 9])
+@pytest.mark.parametrize(("padding", "capacity"), [(0, 40), (9, 90), (9, 5000)])
 def test_a_capacity_pads_or_cuts_samples_by_importance(padding: int, capacity: int) -> None:
     """Of coarse samples that are padded themselves, or not; some rays have none, also the last."""
     coarse, at = pruned()
@@ -180,9 +177,10 @@ def test_colours_are_differentiable_through_every_sampler() -> None:
             assert torch.autograd.gradcheck(seen, (raw,), fast_mode=True)
 
 
-@pytest.mark.parametrize("field", ["hash", "mlp", "nerf"])
-@pytest.mark.parametrize("strategy", ["uniform", "hierarchical", "valid", "efficient"])
-@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize(
+    ("field", "strategy", "contracted"),
+    [(("hash", "mlp", "nerf")[n % 3], each, n % 2 == 0) for n, each in enumerate(2 * ["uniform", "hierarchical", "valid", "efficient"])],
+)
 def test_every_strategy_serves_every_field(field: str, strategy: str, contracted: bool) -> None:
     m = untrained(contracted=contracted, field=field, sampling=strategy, num_importance_samples=6, num_coarse_samples=10)
     some = pixels()
@@ -227,21 +225,8 @@ def test_counts_are_those_of_the_strategies() -> None:
         model(ContractedSpace(BOUNDS), settings(near_plane=1.0, far_plane=5.0), None, "cpu", (1.0, 5.0))
 
 
-def test_some_rays_are_not_pruned_in_training_only() -> None:
-    m = untrained(occupancy_update_ray_fraction=0.25)
-    m.voxels.values.fill_(-1.0)
-    some = pixels()
-    bundle = [torch.from_numpy(a) for a in some.bundle(np.arange(100, 140))[:4]]
-    offset, behind = torch.full((40,), 0.5), torch.ones(40, 3)
-    seen = render_rays(m, *bundle, offset, behind, rng=np.random.default_rng(0))
-    per_ray = seen.coarse.first.diff()
-    assert (per_ray[:10] > 0).all()
-    assert (per_ray[10:] == 0).all()
-    assert len(render_rays(m, *bundle, offset, behind).coarse.start) == 0
-
-
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
-def test_valid_samples_of_what_is_not_pruned_are_those_that_the_voxels_would_keep(rule: str) -> None:
+def test_valid_samples_are_those_that_the_voxels_would_keep(rule: str) -> None:
     """Equation 5 on a trained NeRF: density above zero, read as the voxels read it."""
     m = untrained(field="mlp", sampling="hierarchical", occupancy_rule=rule, num_importance_samples=6, num_coarse_samples=10)
     bundle = [torch.from_numpy(a) for a in pixels().bundle(np.arange(100, 140))[:4]]

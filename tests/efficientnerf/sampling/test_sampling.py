@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,16 +13,11 @@ from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace, space_f
 from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.sampling import pivotal as pivotal_sampling
 from efficientnerf.sampling import valid as valid_sampling
-from efficientnerf.sampling.samples import Samples
 from tests import reference
 from tests.efficientnerf.coarse_rays import BOUNDS, SIDE, STEP, Rays, coarse_samples_of, make_rays, voxels_of
 
 FINDERS = {"torch": valid_sampling.valid_samples, "kernel": dispatch.valid_samples}
 DIVIDERS = {"torch": pivotal_sampling.pivotal_samples, "kernel": dispatch.pivotal_samples}
-
-
-def double(rays: Rays) -> Rays:
-    return Rays(*(t.double() for t in rays))
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -106,9 +100,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     assert reach.min() > reference.FARTHEST
 
 
-@pytest.mark.parametrize("divider", DIVIDERS)
-@pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("per_pivot", [1, 4, 5])
+@pytest.mark.parametrize(("divider", "contracted", "per_pivot"), [(each, *how) for each in DIVIDERS for how in [(False, 1), (True, 4), (False, 5)]])
 def test_pivotal_slots_tile_their_intervals(divider: str, contracted: bool, per_pivot: int) -> None:
     rays = make_rays("outside")
     space, coarse, pivotal = coarse_samples_of(rays, contracted)
@@ -123,19 +115,3 @@ def test_pivotal_slots_tile_their_intervals(divider: str, contracted: bool, per_
     of = ray_of_sample(fine.first, len(fine.start))
     at = fine.start + rays.offset[of] * fine.extent
     torch.testing.assert_close(fine.point, space.grid(rays.origins[of] + at[:, None] * rays.directions[of]), rtol=0, atol=1e-5)
-
-
-def test_no_point_is_evaluated_twice() -> None:
-    rays = double(make_rays("outside"))
-    space, coarse, _ = coarse_samples_of(rays, False)
-    fine = pivotal_sampling.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, torch.ones(len(coarse.start), dtype=torch.bool), 4)
-    assert len(torch.unique(coarse.point, dim=0)) == len(coarse.point)
-    assert len(torch.unique(fine.point, dim=0)) == len(fine.point)
-
-
-@pytest.mark.parametrize("find", FINDERS.values(), ids=FINDERS.keys())
-def test_no_rays_and_no_slots_are_fine(find: Callable[..., Samples]) -> None:
-    none = Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), torch.zeros(0))
-    found = find(BoundedSpace(BOUNDS), *none, STEP, 60, voxels_of(), 0.4)
-    assert found.first.tolist() == [0]
-    assert found.point.shape == (0, 3)

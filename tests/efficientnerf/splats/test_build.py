@@ -14,7 +14,7 @@ from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.rendering.harmonics import C0
 from efficientnerf.splats import merging, refit
-from efficientnerf.splats.build import Budget, NothingToShow, View, gaussians_of_asset
+from efficientnerf.splats.build import Budget, View, gaussians_of_asset
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.refit import refitted
 from efficientnerf.splats.rendering import gaussians_from, lens_of, render, ungrouped, values_of
@@ -80,7 +80,7 @@ def test_gaussians_of_a_ball_lie_flat_on_it_in_its_colours_as_many_as_wanted() -
     np.testing.assert_allclose(colours[:, :2], 1 / (1 + np.exp(-wanted[:, :2])), atol=0.02)
 
 
-def test_fitting_brings_gaussians_nearer_to_pictures_that_they_were_not_fitted_to() -> None:
+def test_fitting_brings_gaussians_nearer_to_pictures_held_back() -> None:
     tree, cameras = ball(16), ring(12)
     views = photographs(tree, cameras)
     seen, held_back = views[::2], views[1::2]
@@ -91,18 +91,6 @@ def test_fitting_brings_gaussians_nearer_to_pictures_that_they_were_not_fitted_t
     assert error(fitted, held_back) < 0.9 * error(merely, held_back)
     assert [done for done, _, _ in said] == [0, 1, *range(2, 42)]
     assert {total for _, total, _ in said} == {41}
-
-
-def test_what_no_picture_shows_is_no_part_of_it() -> None:
-    tree = ball()
-    away = [replace(camera, world_from_camera=camera.world_from_camera @ np.diag([1.0, -1, -1, 1])) for camera in ring(2)]
-    with pytest.raises(NothingToShow):
-        gaussians_of_asset(tree, photographs(tree, away), Budget(count=100))
-    one_side = merging.merged(tree, ring(8)[:1], 2000, 0)
-    towards = ring(8)[0].centre
-    assert (one_side.means @ towards > -0.3).mean() > 0.99
-    with pytest.raises(ValueError, match="pictures to be fitted to"):
-        gaussians_of_asset(tree, [], Budget())
 
 
 def test_colours_are_those_of_the_asset_from_all_directions() -> None:
@@ -161,7 +149,6 @@ def test_gaussians_of_normalised_device_coordinates_lie_in_the_world() -> None:
     moved[:2, 3] = 0.2, 0.1
     beside = replace(camera, world_from_camera=moved)
     gaussians = merging.merged(tree, [camera, beside], 1100, 0)
-    assert tree.ndc is not None
     depth = tree.ndc.world(np.array([[0.0, 0.0, 23 / 16 - 1]]))[0, 2]
     assert np.abs(gaussians.means[:, 2] - depth).max() < 0.1 * depth
     for view in (camera, beside):
@@ -220,19 +207,7 @@ def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkey
     assert met.min() > 0
 
 
-@pytest.mark.parametrize("wrong", [{"count": 0}, {"steps": -1}, {"degree": 4}, {"degree": -1}])
-def test_budgets_that_make_no_sense_are_refused(wrong: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="expected at least one Gaussian"):
-        Budget(**wrong)
-
-
-@pytest.mark.parametrize("pixels", [np.zeros((24, 24, 3)), np.zeros((24, 23, 3), np.uint8), np.zeros((24, 24), np.uint8)])
-def test_pictures_of_another_kind_are_refused(pixels: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        View(ring(1)[0], pixels)
-
-
-def test_gaussians_are_divided_where_the_error_was_and_those_that_hide_nothing_go() -> None:
+def test_gaussians_are_divided_by_error_and_faint_ones_go() -> None:
     begun = merging.merged(ball(16, 0), ring(3), 100, 0)
     count = len(begun)
     faint = np.where(np.arange(count) < 5, np.float32(0.003), begun.opacities)

@@ -62,17 +62,3 @@ def test_what_the_asset_shows_is_seen_however_small_and_the_rest_is_not() -> Non
     assert seen[2] == seen[3] == 0  # within the ball; and beside it, where the asset shows nothing
     floating = shown_pixels(*joined(ball(0.6), before), [view(0.6)], VOXEL)
     assert floating[1] == 0  # in front of what the asset shows
-
-
-def test_what_is_half_transparent_counts_by_its_opacity() -> None:
-    whole, half, faint = (shown_pixels(*joined(ball(0.6)), [view(0.6, opacity)], VOXEL)[0] for opacity in (1.0, 0.4, 0.1))
-    assert half == pytest.approx(0.4 * whole, rel=1e-3)
-    assert faint == 0
-
-
-def test_nothing_agrees_with_nothing() -> None:
-    nothing = view(0.0)
-    image = mesh_image(np.zeros((0, 3)), np.zeros((0, 3), np.int64), nothing.camera)
-    found = agreement([nothing], [image])
-    assert (found.iou, found.missed, found.added, found.depth) == (1.0, 0.0, 0.0, 0.0)
-    assert len(shown_pixels(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0, np.int64), [nothing], VOXEL)) == 0

@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.backends.numba.mesh.fusion import CONFIDENCE, FILLED, NEAREST, A, B, W, fit_planes, fuse
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.queries import density_at, distance_back
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface import fusion as module
 from efficientnerf.surface.agreement import AssetView, asset_view
-from efficientnerf.surface.fusion import Fusion, front_depth, fused_opacity, fusion_of
+from efficientnerf.surface.fusion import Fusion, front_depth, fused_opacity
 from efficientnerf.surface.mesh import face_vectors, topology
 from efficientnerf.surface.nested import scene_surface
 
@@ -86,16 +85,6 @@ def test_planes_do_not_reach_over_a_step() -> None:
     np.testing.assert_allclose(found[5, 18:23, NEAREST], [1, 1, 1, 1 / far[5, 21], 1 / far[5, 22]], rtol=0.02)
 
 
-def test_what_is_half_seen_through_is_neither_surface_nor_free() -> None:
-    depth = np.full((36, 48), np.inf, np.float32)
-    opacity = np.zeros((36, 48), np.float32)
-    opacity[10, 10] = 0.4
-    found = fitted(depth, opacity)
-    assert (found[..., CONFIDENCE] == 0).all()
-    assert np.isinf(found[9:12, 9:12, NEAREST]).all()
-    assert (found[13:, :, NEAREST] == 0).all()
-
-
 def grid(count: int = 32) -> tuple[np.ndarray, np.ndarray]:
     """Corner of a grid about the origin, and distances (count, count, count) of its voxels' centres from the origin."""
     first = np.full(3, -VOXEL * count / 2)
@@ -129,7 +118,7 @@ def test_a_ball_has_its_distances_on_any_number_of_threads() -> None:
         numba.set_num_threads(before)
 
 
-def test_views_carve_what_they_see_through_and_say_nothing_of_what_they_do_not_show() -> None:
+def test_views_carve_what_they_see_through_and_nothing_else() -> None:
     fusion = fusion_of_views([ball_view(camera(direction)) for direction in DIRECTIONS])
     away, opacity = (grid()[1] - RADIUS) / VOXEL, np.zeros((32,) * 3, np.float32)
     opacity[away <= 0] = 1
@@ -235,13 +224,3 @@ def test_a_region_cuts_cleanly() -> None:
         lid = lid[lid[:, 2] > 0]
         assert topology(mesh.vertices, mesh.faces).watertight
         np.testing.assert_allclose(lid[:, 2], 0.2 - 0.02, atol=0.15 * VOXEL)
-
-
-def test_what_tick_raises_stops_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "RADIUS", 1)
-
-    def stop() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fusion_of(soft_ball(), [ball_view(camera((1, 0, 0)))], stop)

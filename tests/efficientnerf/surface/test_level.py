@@ -9,7 +9,7 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface.agreement import AssetView, agreement, asset_view
 from efficientnerf.surface.isosurface import automatic_threshold, isosurface
-from efficientnerf.surface.level import LEVELS, silhouette_level, surfaces_met
+from efficientnerf.surface.level import silhouette_level, surfaces_met
 from efficientnerf.surface.rasteriser import mesh_image
 from efficientnerf.surface.volume import volume_of
 
@@ -60,19 +60,3 @@ def test_a_ray_meets_the_surface_that_the_mesh_has() -> None:
         image = mesh_image(*isosurface(volume_of(tree), level), camera)
         assert (met[:, number] != image.covered.ravel()).mean() < 0.005
         assert image.covered.any()
-
-
-def test_without_an_edge_it_is_the_highest_level() -> None:
-    tree = ball(1.0, 2000.0)
-    blind = [AssetView(view.camera, np.zeros_like(view.opacity), view.depth) for view in views(tree)]
-    assert silhouette_level(tree, blind, 50.0, lambda: None) == 50.0
-    assert LEVELS[0] == 1
-
-
-def test_what_a_tick_raises_stops_it() -> None:
-    def stop() -> None:
-        raise InterruptedError
-
-    tree = ball(1.0, 2000.0)
-    with pytest.raises(InterruptedError):
-        silhouette_level(tree, views(tree), 50.0, stop)

@@ -25,7 +25,6 @@ def marched() -> NerfTree:
 
 
 def local(tree: NerfTree, world: np.ndarray) -> np.ndarray:
-    assert tree.ndc is not None
     return (world - tree.ndc.world_from_camera[:3, 3]) @ tree.ndc.world_from_camera[:3, :3]
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.surface.extraction import points, surface
-from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import Mesh, PointCloud
 from efficientnerf.surface.nested import scene_points, scene_surface
 from efficientnerf.surface.volume import volume_of
@@ -88,21 +85,6 @@ def test_a_ball_across_the_border_of_two_grids_is_whole_but_for_a_crack() -> Non
     assert distance[~crack].max() < 2.5 * VOXEL
 
 
-def test_what_is_in_outer_grids_alone_is_there() -> None:
-    tree = balls(((1.9, 0, 0), 0.6))
-    for found in (mesh_of(tree).vertices, points_of(tree).positions):
-        assert found.min(axis=0) == pytest.approx([1.3, -0.6, -0.6], abs=4 * VOXEL)
-        assert found.max(axis=0) == pytest.approx([2.5, 0.6, 0.6], abs=4 * VOXEL)
-
-
-def test_the_budget_of_faces_holds_for_all_together() -> None:
-    tree = balls(((0, 0, 0), 0.5), ((1.3, 0, 0), 0.25), ((0, 2.4, 0), 0.6))
-    full, small = mesh_of(tree), mesh_of(tree, faces=600)
-    assert len(full.faces) > 1000
-    assert 100 < len(small.faces) <= 600
-    assert full.facts["cascades"] == 3
-
-
 def test_points_number_as_asked_and_thin_out_outwards() -> None:
     tree = balls(((0, 0, 0), 0.5), ((0, 2.3, 0), 0.6))
     cloud = points_of(tree, 3001)
@@ -111,14 +93,6 @@ def test_points_number_as_asked_and_thin_out_outwards() -> None:
     per_area = near.mean() / 0.5**2, (~near).mean() / 0.6**2
     assert 10 < per_area[0] / per_area[1] < 28  # voxels of four times the side: 16, and the coarse ball is smaller than it should be
     assert np.array_equal(cloud.positions, points_of(tree, 3001).positions)
-
-
-def test_nothing_anywhere_is_said() -> None:
-    tree = balls(((0, 0, 0), 0.5))
-    with pytest.raises(NoSurface, match="no cascade reaches the threshold 1e"):
-        mesh_of(tree, 1e9)
-    with pytest.raises(NoSurface):
-        points_of(replace(tree, density_values=np.zeros_like(tree.density_values)))
 
 
 def test_nothing_is_found_twice_where_grids_overlap() -> None:

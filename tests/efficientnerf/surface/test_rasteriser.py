@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.surface.rasteriser import mesh_image, shown_points
+from efficientnerf.surface.rasteriser import mesh_image
+from tests.efficientnerf.surface.texturing.shapes import shown_points
 
 
 def camera(model: str = "SIMPLE_PINHOLE", extra: tuple[float, ...] = ()) -> Camera:

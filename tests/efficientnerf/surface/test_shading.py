@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import Camera, project, rays
+from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface import shading
 from efficientnerf.surface.mesh import Mesh, Texture
-from efficientnerf.surface.shading import Shader, pyramid_of, vertex_colours
+from efficientnerf.surface.shading import Shader, vertex_colours
 from tests.efficientnerf.surface.texturing.shapes import ball, cameras
 
 FRONT = np.eye(4)
@@ -52,33 +52,12 @@ def test_each_pixel_shows_the_place_of_the_texture_that_its_ray_meets(tilt: floa
     assert np.isinf(depth[far]).all()
 
 
-def test_coverage_is_the_share_of_the_samples() -> None:
-    image, _ = Shader(sheet(np.full((4, 4, 3), 255, np.uint8))).images(VIEW, samples=4)
-    pixels, _ = project(VIEW, sheet(np.zeros((1, 1, 3), np.uint8)).vertices)
-    low, high = pixels.min(0), pixels.max(0)
-    fine = (np.arange(24 * 4) + 0.5) / 4, (np.arange(18 * 4) + 0.5) / 4
-    inside = ((fine[1] > low[1]) & (fine[1] < high[1]))[:, None] & ((fine[0] > low[0]) & (fine[0] < high[0]))
-    expected = inside.reshape(18, 4, 24, 4).mean((1, 3))
-    np.testing.assert_allclose(image.covered, expected, atol=1e-6)
-    np.testing.assert_allclose(image.colour, np.repeat(expected[..., None], 3, 2), atol=1e-6)
-
-
 def test_fine_textures_are_averaged_not_sampled_at_points() -> None:
     """A chequerboard of single texels, 50 of them to a pixel, is grey."""
     board = np.zeros((1024, 1024, 3), np.uint8)
     board[::2, ::2] = board[1::2, 1::2] = 255
     image, _ = Shader(sheet(board)).images(VIEW)
     np.testing.assert_allclose(image.colour[6:12, 8:16], 0.5, atol=0.01)
-
-
-def test_a_pyramid_holds_means_of_fours_down_to_one_texel() -> None:
-    rng = np.random.default_rng(0)
-    picture = rng.integers(0, 256, (8, 6, 3), dtype=np.uint8)
-    pyramid = pyramid_of(Texture(np.zeros((1, 3, 2)), picture))
-    assert pyramid.levels[:, 1:].tolist() == [[6, 8], [3, 4], [2, 2], [1, 1]]
-    first, width, height = pyramid.levels[1]
-    second = pyramid.texels[first : first + width * height].reshape(height, width, 3)
-    np.testing.assert_allclose(second, picture.reshape(4, 2, 3, 2, 3).mean((1, 3)), atol=0.5)
 
 
 def test_vertices_are_blended_across_faces_with_perspective() -> None:
@@ -139,12 +118,3 @@ def test_bands_of_rows_are_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> N
     assert (banded.covered == whole.covered).mean() > 0.99
     np.testing.assert_allclose(banded.colour, whole.colour, atol=0.1)
     np.testing.assert_allclose(banded.depth, whole.depth, rtol=0.01)
-
-
-def test_more_samples_come_nearer_to_the_area_that_is_covered() -> None:
-    vertices, faces = ball(3)
-    mesh = Mesh(vertices, faces, vertices, np.zeros_like(vertices, np.float32))
-    camera = cameras(3, 33)[0]
-    true = Shader(mesh).images(camera, 16)[0].covered
-    errors = [float(np.abs(Shader(mesh).images(camera, samples)[0].covered - true).mean()) for samples in (1, 2, 4)]
-    assert errors[2] < 0.6 * errors[1] < 0.36 * errors[0]

@@ -50,12 +50,6 @@ def test_a_small_ball_gets_the_size_that_its_asset_has(radius: float) -> None:
     assert away.std() < 0.25 * PIXEL
 
 
-def test_what_is_flat_stays_where_depths_have_it() -> None:
-    """A ball of many faces is flat to each of them."""
-    ball = trimesh.creation.icosphere(4, radius=0.47)
-    np.testing.assert_array_equal(fitted(ball, views_of(trimesh.creation.icosphere(5, radius=0.5))).vertices, ball.vertices)
-
-
 def test_a_wire_gets_as_thick_as_it_is() -> None:
     def wire(radius: float) -> trimesh.Trimesh:
         mesh = trimesh.creation.cylinder(radius, 1.0, sections=24)

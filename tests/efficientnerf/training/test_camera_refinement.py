@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from efficientnerf.geometry.cameras import Camera, project, rays
-from efficientnerf.training.alignment import EVERY, _choose, is_due, refine_cameras
+from efficientnerf.training.alignment import EVERY, refine_cameras
 from efficientnerf.training.camera_refinement import (
     Alignment,
     CameraCorrections,
@@ -128,19 +128,6 @@ def photographs(true: list[Camera], given: list[Camera]) -> Pixels:
     return Pixels(given, [photograph(camera) for camera in true], [None] * len(true), np.full(len(true), 1.0), np.full(len(true), 50.0))
 
 
-def test_pixels_are_chosen_inside_the_photograph_and_the_mask() -> None:
-    made = cameras(2, 16)
-    mask = np.ones((16, 16), bool)
-    mask[:, :8] = False
-    p = Pixels(made, [photograph(camera) for camera in made], [None, mask], np.full(2, 1.0), np.full(2, 50.0))
-    rng = np.random.default_rng(6)
-    for view, least in ((0, 1), (1, 9)):
-        y, x = np.divmod(_choose(p, view, 400, rng) - p.offsets[view], 16)
-        assert x.min() == least
-        assert (x.max(), y.min(), y.max()) == (14, 1, 14)
-    assert len(_choose(Pixels(made, [photograph(c) for c in made], [None, np.eye(16) > 0], p.near, p.far), 1, 100, rng)) == 0
-
-
 @pytest.mark.parametrize("changes", [{}, {"sampling": "uniform", "field": "mlp"}], ids=["hash", "mlp"])
 def test_pixels_of_a_device_are_refined_alike(changes: dict[str, str]) -> None:
     """Also with gains of the photographs, and with a field of which nothing is pruned."""
@@ -201,10 +188,3 @@ def test_a_resumed_run_refines_as_an_uninterrupted_one() -> None:
         states.append(state_of(t))
     assert np.abs(states[0]["cameras.pose"].numpy()).max() > 0
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
-
-
-def test_refinement_begins_after_the_first_steps_and_ends_before_the_last() -> None:
-    due = [n for n in range(1, 4001) if is_due(n, n / 4000)]
-    assert due[0] == 600
-    assert due[-1] == 3600
-    assert not is_due(650, 0.2)

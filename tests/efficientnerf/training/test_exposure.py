@@ -24,8 +24,6 @@ from efficientnerf.training.exposure.model import (
     exposure_loss,
     exposure_of,
     image_as_taken,
-    places,
-    squared_error,
     squared_radius,
 )
 from efficientnerf.training.loop import restore, state_of, train, trainer
@@ -33,8 +31,6 @@ from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
 from stages.evaluate.views import subsample
 from tests.efficientnerf.balls import cameras, photograph, untrained
-
-CPU = torch.device("cpu")
 
 
 def random(*shape: int, seed: int = 1) -> torch.Tensor:
@@ -80,13 +76,6 @@ def test_averaged_undoes_exposed_beyond_white_too(strength: float) -> None:
     torch.testing.assert_close(averaged(exposed(colour, view, radius, e), view, radius, e), colour, rtol=1e-9, atol=1e-9)
 
 
-def test_brighter_stays_brighter() -> None:
-    e, colour = some(strength=5.0), torch.linspace(0, 1, 300, dtype=torch.float64)[:, None].expand(300, 3)
-    for view in range(4):
-        seen = exposed(colour, torch.full((300,), view), torch.full((300,), 0.7, dtype=torch.float64), e)
-        assert (seen.diff(dim=0) > 0).all()
-
-
 def test_without_differences_nothing_changes_whatever_the_response() -> None:
     """Of one camera, whose photographs were exposed alike, the response has no effect, and the mean of the gains is of no consequence."""
     colour, radius = torch.rand(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), torch.zeros(20, dtype=torch.float64) + 0.3
@@ -94,17 +83,6 @@ def test_without_differences_nothing_changes_whatever_the_response() -> None:
     e = Exposure(torch.full((3, 3), 4.0, dtype=torch.float64), cameras, torch.zeros(3, dtype=torch.int64))
     torch.testing.assert_close(exposed(colour, torch.arange(20) % 3, radius, e), colour)
     assert exposure_loss(Exposure(e.photographs, 0 * cameras, e.camera_of)) == 0 < exposure_loss(some())
-
-
-def test_a_middling_distance_from_the_middle_keeps_its_brightness() -> None:
-    e = Exposure(torch.zeros(1, 3), torch.tensor([[-9.0, 4.0, 0.0, 0.0]]), torch.zeros(1, dtype=torch.int64))
-    colour, view = torch.full((3, 3), 0.5), torch.zeros(3, dtype=torch.int64)
-    middle, between, corner = exposed(colour, view, torch.tensor([0.0, 1 / 3, 1.0]), e)[:, 0].tolist()
-    assert between == pytest.approx(0.5, abs=1e-6)
-    assert middle > 0.5 > corner
-    y, x = np.mgrid[:60, :80]
-    assert squared_radius(x, y, 80, 60).mean() == pytest.approx(1 / 3, abs=1e-3)
-    assert squared_radius(np.array([0]), np.array([0]), 800, 600).item() == pytest.approx(1, abs=0.01)
 
 
 def test_gradients() -> None:
@@ -116,19 +94,6 @@ def test_gradients() -> None:
 
     colour = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5)) * 0.9 + 0.05
     assert torch.autograd.gradcheck(both, (colour.requires_grad_(), random(4, 3).requires_grad_(), random(2, 4).requires_grad_()))
-
-
-def test_black_has_finite_gradients() -> None:
-    colour = torch.zeros(2, 3, requires_grad=True)
-    e = exposure_of(cameras(2))
-    exposed(colour, torch.tensor([0, 1]), torch.zeros(2), e).sum().backward()
-    assert colour.grad is not None
-    assert all(torch.isfinite(grad).all() for grad in (colour.grad, e.photographs.grad, e.cameras.grad) if grad is not None)
-
-
-def test_clipped_pixels_say_at_least_so_bright() -> None:
-    shown, photo = torch.tensor([[1.4, 0.9, 0.5]]), torch.tensor([[1.0, 1.0, 0.4]])
-    torch.testing.assert_close(squared_error(shown, photo), torch.tensor([[0.0, 0.01, 0.01]]))
 
 
 def test_one_camera_upright_or_not_and_others_by_size_and_focal_length() -> None:
@@ -148,10 +113,8 @@ def test_a_photograph_as_if_exposed_like_the_others() -> None:
     dark, all_used = averaged_image(image, np.array([[True, False]]), 1, e)
     half = np.rint(255 * srgb_from_linear(linear_from_srgb(image[0, :, :3] / 255.0) / 2))
     assert np.abs(bright[0, :, :3] - half).max() <= 1
-    assert used is not None
     assert used.tolist() == [[True, False]]
     assert dark[0, 1].tolist() == [255] * 4
-    assert all_used is not None
     assert all_used.tolist() == [[True, False]]
     assert (bright[..., 3].tolist(), image[0, 0].tolist()) == ([[7, 255]], [100, 200, 10, 7])
 
@@ -177,7 +140,7 @@ def photographs(gains: np.ndarray) -> Pixels:
     return Pixels(made, images, [None] * len(made), np.full(len(made), 1.0), np.full(len(made), 50.0))
 
 
-@pytest.mark.parametrize("begun", [False, True])
+@pytest.mark.parametrize("begun", [True])
 def test_differences_between_photographs_are_found(monkeypatch: pytest.MonkeyPatch, begun: bool) -> None:
     """Without a beginning, and from one that is not quite right."""
     monkeypatch.setattr(module, "BEGIN", 0.0)
@@ -192,19 +155,9 @@ def test_differences_between_photographs_are_found(monkeypatch: pytest.MonkeyPat
             assert np.corrcoef(found.ravel(), logs.ravel())[0, 1] > (0.9 if begun else 0.6)
             again = trainer(untrained(contracted=True, iterations=200), exposure_of(cameras(8)))
             restore(again, state_of(t))
-            assert again.exposure is not None
             assert torch.equal(again.exposure.photographs, t.exposure.photographs)
             assert torch.equal(again.exposure.cameras, t.exposure.cameras)
     assert losses[True] < 0.95 * losses[False]
-
-
-def test_places_of_pixels() -> None:
-    p = photographs(np.ones((3, 3)))
-    index = np.array([0, 255, 256, 700])
-    view, radius = places(p, index, CPU)
-    assert view.tolist() == [0, 0, 1, 2]
-    y, x = np.divmod(index - p.offsets[view.numpy()], 16)
-    np.testing.assert_allclose(radius, ((2 * x + 1 - 16) ** 2 + (2 * y + 1 - 16) ** 2) / 512, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -227,11 +180,3 @@ def test_what_points_show_gives_gains_and_vignetting_despite_outliers(seed: int)
     nothing = fit_exposure(light - gains[view] - vignetting[:, None], point, view, radius, lenses)
     assert nothing.explained < 0.1
     assert np.abs(nothing.gains).max() < 0.03
-
-
-def test_a_photograph_without_points_keeps_the_mean() -> None:
-    light = np.log(np.array([[0.1] * 3, [0.4] * 3, [0.2] * 3, [0.8] * 3]))
-    found = fit_exposure(light, np.array([0, 0, 7, 7]), np.array([0, 1, 0, 1]), np.full(4, 1 / 3), np.zeros(3, np.int64))
-    assert found.observed.tolist() == [2, 2, 0]
-    assert found.gains[1, 0] > found.gains[2, 0] > found.gains[0, 0]
-    assert np.isfinite(found.gains).all()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from efficientnerf.asset.bake import spread_pixels
-from efficientnerf.training import pixels as module
 from tests.efficientnerf.small_views import SIZES, views
 
 
@@ -15,17 +13,6 @@ def masks_of(share: float) -> list[np.ndarray | None]:
     found: list[np.ndarray | None] = [rng.random((h, w)) < share for w, h in SIZES]
     found[1] = np.arange(36).reshape(9, 4) % 20 == 17
     return found
-
-
-class Counting:
-    """A generator that counts the numbers that are drawn."""
-
-    def __init__(self) -> None:
-        self.rng, self.drawn = np.random.default_rng(0), 0
-
-    def integers(self, most: int, size: int) -> np.ndarray:
-        self.drawn += size
-        return self.rng.integers(most, size=size)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6])
@@ -41,30 +28,3 @@ def test_usable_pixels_are_chosen_alike(share: float) -> None:
         assert set(index) <= set(usable)
     counts = np.bincount(some.choose(4000, np.random.default_rng(2)), minlength=len(some))[usable]
     assert np.abs(counts * len(usable) / 4000 - 1).max() < 0.3
-
-
-def test_few_pixels_are_drawn_at_once() -> None:
-    some, rng = views(masks_of(0.0)), Counting()
-    some.choose(1000, rng)  # type: ignore[arg-type]
-    assert rng.drawn == 1000
-
-
-def test_without_masks_pixels_are_chosen_as_ever() -> None:
-    some = views()
-    assert some.usable_count == len(some)
-    assert some.listed is None
-    np.testing.assert_array_equal(some.choose(50, np.random.default_rng(0)), np.random.default_rng(0).integers(len(some), size=50))
-
-
-@pytest.mark.parametrize("part", [8, 16, 2**24])
-def test_spread_pixels_are_as_many_as_are_asked_for_where_masks_allow_them(part: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PART", part)
-    some = views(masks_of(0.5))
-    usable = np.flatnonzero(some.usable_at(np.arange(len(some))))
-    np.testing.assert_array_equal(some.usable_pixels(np.arange(len(usable))), usable)
-    assert some.usable_pixels(np.array([0, 3, len(usable) - 1])).tolist() == usable[[0, 3, -1]].tolist()
-    np.testing.assert_array_equal(spread_pixels(some, 10**6), usable)
-    stride = len(usable) // 5
-    spread = spread_pixels(some, 5)
-    assert np.isin(spread, usable).all()
-    assert len(spread) == -(-len(usable) // stride)

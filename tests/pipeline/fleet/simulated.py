@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import pytest
+
+from pipeline.fleet import scheduler
+from pipeline.fleet.scheduler import Scheduler, StageOf, states_for
+from pipeline.fleet.state import FleetState, Scene, SceneState
 from pipeline.fleet.workers import Message, Task, Worker
 
 STAGES = ("poses", "train", "bake")
@@ -93,3 +99,23 @@ def scene_of(task: Task) -> str:
 
 def what(request: Mapping[str, Any]) -> str:
     return str(request.get("stage") or request["kind"])
+
+
+def scenes(count: int) -> list[Scene]:
+    return [Scene(f"s{number}", (f"/shoots/{number}",)) for number in range(count)]
+
+
+def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scheduler looks at its workers and writes its file whenever it may."""
+    for name in ("LOOK_SECONDS", "WRITE_SECONDS", "TIMES", "LOCKED_PAUSE"):
+        monkeypatch.setattr(scheduler, name, 0.0)
+
+
+def run(fleet: Path, workers: Simulated, chosen: list[Scene], **more: Any) -> FleetState:
+    fleet.mkdir(exist_ok=True)
+    states = states_for(chosen, more.pop("former", None))
+    return Scheduler(fleet, states, [StageOf("poses"), StageOf("train", True), StageOf("bake", True)], workers, **more).run()
+
+
+def state_of(found: FleetState, name: str) -> SceneState:
+    return next(scene for scene in found.scenes if scene.name == name)

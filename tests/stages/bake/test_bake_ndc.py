@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
@@ -17,7 +16,7 @@ from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.pruning import NDC_RAYS_PER_VOXEL
 from stages.bake.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, budget_of, finest_resolution, ndc_pixel
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.io.field_file import load_renderer
 from stages.io.scene import load
 from stages.train import run as train
@@ -46,9 +45,6 @@ def baked(folder: Path, inputs: dict[str, Path], told: list[dict[str, Any]] | No
 def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path) -> None:
     cubes, deep = baked(tmp_path / "cubes", inputs, ndc_voxel_depth=1.0), baked(tmp_path / "deep", inputs)
     space = load_renderer(inputs["train"], "cpu").model.space
-    assert cubes.ndc is not None
-    assert deep.ndc is not None
-    assert space.ndc is not None
     assert cubes.ndc.to_json() == space.ndc.to_json()
     assert deep.ndc.slopes == pytest.approx(tuple(NdcSpace.voxel_depth * slope for slope in space.ndc.slopes))
     # As many voxels across, half as many in depth.
@@ -76,44 +72,10 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     assert not [event for event in told if event["event"] == "warning"]
 
 
-def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path], tmp_path: Path) -> None:
-    made = job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4, discretise=48), poses=inputs["poses"])
-    train.run(made)
-    on_voxels = {**inputs, "train": made.out}
-    told: list[dict[str, Any]] = []
-    tree = baked(tmp_path / "own", on_voxels, told, resolution=48)
-    assert tree.ndc is not None
-    assert tree.ndc.to_json() == load_renderer(made.out, "cpu").model.space.ndc.to_json()
-    assert not [event for event in told if event["event"] == "warning"]
-    baked(tmp_path / "other", on_voxels, told, resolution=48, ndc_voxel_depth=2.0)
-    assert any("bake.ndc_voxel_depth=2" in event["text"] and "train.discretise=48" in event["text"] for event in told if event["event"] == "warning")
-
-
-def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
-    scene = poses(tmp_path / "poses")
-    train.run(job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4), poses=scene))
-    told: list[dict[str, Any]] = []
-    tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_voxel_depth=2.0)
-    assert tree.ndc is None
-    assert len(set(tree.resolution)) == 1
-    assert any("bake.ndc_voxel_depth" in event["text"] for event in told if event["event"] == "warning")
-
-
-def test_a_space_of_deeper_voxels_has_the_same_grid_coordinates(inputs: dict[str, Path]) -> None:
-    space = load_renderer(inputs["train"], "cpu").model.space
-    assert isinstance(space, NdcSpace)
-    flat = space.with_voxel_depth(3.0)
-    world = space.ndc.world(np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3)))
-    np.testing.assert_allclose(flat.ndc.points(world), space.ndc.points(world) * (3, 3, 1), rtol=1e-9, atol=1e-12)
-    one, other = (s.grid(torch.from_numpy(s.ndc.points(world))) for s in (space, flat))
-    torch.testing.assert_close(one, other)
-
-
 def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:
     small, large, huge = (forward_facing(side) for side in (200, 1000, 4000))
     assert budget_of(small, None) == NDC_MIN_MIB
     assert budget_of(huge, None) == NDC_MAX_MIB
-    assert large.forward is not None
     across, down = (large.forward.bounds[1] - large.forward.bounds[0])[:2] / ndc_pixel(large, large.forward)
     assert budget_of(large, None) == int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
     assert budget_of(huge, 7) == 7

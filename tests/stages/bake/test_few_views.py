@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.bake import Visibility, chosen_voxels, grid_of
+from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.refinement.state import initial_state
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import NdcSpace
 from pipeline.stage import Job
 from stages.bake import pruning
-from stages.bake.run import BakeSettings
+from stages.bake.settings import BakeSettings
 from stages.bake.voxels import FEW_VIEWS_RATIO, WELL_SEEN_VIEWS, by_views, seen_by_few
 from stages.framing.scene_bounds import in_view
 from stages.framing.view_coverage import count_views, shows
 from stages.io.field_file import space_of
 from stages.io.scene import Scene
-from tests.stages.balls import job, poses
+from tests.stages.balls import job
 from tests.stages.forward_facing import forward_facing
 
 THRESHOLD = 1e-3  # 2 and 20 times this are between it and what voxels that many see have to weigh; 40 times is above
@@ -92,16 +93,6 @@ def test_of_few_photographs_half_see_well(
     few = seen_by_few(made(tmp_path), fewer, space.ndc, points)
     np.testing.assert_array_equal(few, seen < {1: 1, 2: 1, 3: 2, 6: 3, 7: 4, 9: 4}[count])
     assert not few[seen == count].any()
-
-
-def test_weights_of_other_spaces_stay(tmp_path: Path) -> None:
-    from stages.io.scene import load
-
-    s = load(poses(tmp_path))
-    space = space_of(s)
-    shape, voxel = grid_of(space.bounds, 16, BRICK)
-    given = Visibility(np.arange(int(np.prod(shape))), np.full((int(np.prod(shape)), BRICK**3), 0.5, np.float32))
-    assert by_views(made(tmp_path), s, given, shape, voxel, space) is given
 
 
 def tree_of(capture: tuple[Scene, NdcSpace, tuple[int, int, int], float]) -> NerfTree:

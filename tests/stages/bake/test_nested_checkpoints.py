@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import subset, voxel_cascades
-from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
+from efficientnerf.asset.cascades import subset, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.refinement.schedule import stated_schedule
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state, subset_state
-from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint
 from stages.bake.refine.checkpoint import Point
 from tests.efficientnerf.trees import random_cascades
 
-SCHEDULE = stated_schedule(PHASES, 12)
+SCHEDULE = stated_schedule(12)
 
 
 def job(folder: Path) -> Job:
@@ -48,7 +48,6 @@ def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None
     point = Point(state, SCHEDULE, int(pruned), Pruned(0.25, 0.125, 7) if pruned else None)
     checkpoint.save(job(tmp_path), point)
     found = checkpoint.restored(job(tmp_path), tree, SCHEDULE, cells=5)
-    assert found is not None
     again = found.state
     assert (again.step, found.phase, found.pruned) == (state.step, point.phase, point.pruned)
     for name in STATE:

@@ -26,8 +26,7 @@ def test_the_finest_follows_the_pixels(tmp_path: Path) -> None:
     assert str(told) in held.why
 
 
-@pytest.mark.parametrize("power", [1.6, 2.0, 2.4, 3.0])
-@pytest.mark.parametrize("room", [3_000, 50_000, 800_000, 10_000_000])
+@pytest.mark.parametrize(("power", "room"), [(1.6, 3000), (2.0, 10_000_000), (2.4, 800_000), (3.0, 50_000)])
 def test_the_room_is_used_where_voxels_grow_by_a_power(power: float, room: int) -> None:
     finest = Choice(800, "pixels")
     asked = []
@@ -53,11 +52,3 @@ def test_counts_that_jump_end_in_a_resolution_for_which_there_is_room() -> None:
     choice = affordable_resolution(Choice(400, "pixels"), count, lambda resolution: 9_000)
     assert count(choice.resolution) <= 9_000
     assert choice.resolution >= 200
-
-
-def test_without_room_for_the_coarsest_it_is_taken_all_the_same() -> None:
-    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: resolution**2, lambda resolution: 10).resolution == MIN_RESOLUTION
-
-
-def test_nothing_at_all_is_looked_for_on_the_finest_grid() -> None:
-    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: 0, lambda resolution: 1000).resolution == 400

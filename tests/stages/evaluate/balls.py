@@ -15,7 +15,8 @@ from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.surface.mesh import Mesh
 from pipeline.stage import Job
 from stages.evaluate.mesh import evaluated_mesh
-from stages.evaluate.run import EvaluateSettings, evaluate
+from stages.evaluate.run import evaluate
+from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.splats import EvaluatedSplats
 from stages.figures.plots import to_uint8
 from stages.formats.exporters.frames import frame_from_rendering

@@ -17,12 +17,11 @@ from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import Interrupted
 from stages.evaluate.splats import EvaluatedSplats
-from stages.evaluate.views import evenly_spaced, stride_for, subsample, subsample_camera, upsample
+from stages.evaluate.views import bounded_stride, stride_for, subsample, subsample_camera, upsample
 from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
 from stages.io.scene import View
-from stages.scratch import note
 from tests.fakes import WHITE, BallField
 from tests.stages.evaluate.balls import HEIGHT, TREE, WIDTH, figures_of, job_in, make_scene, measure, settings
 from tests.stages.spoilers import SPOILERS
@@ -111,15 +110,6 @@ def test_on_photographs_the_asset_lies_over_the_networks_background(tmp_path: Pa
     assert metrics["network"]["psnr"] > 50
 
 
-def test_an_asset_that_shows_nothing_is_bad_in_its_box_even_on_a_good_background(tmp_path: Path) -> None:
-    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t", background=None))
-    measure(replace(TREE, sigma=1e-6), lambda: BallField(TREE), job)
-    metrics = figures_of(job)
-    assert metrics["asset"]["psnr_in_box"] < 20
-    assert metrics["asset"]["psnr"] < 25
-    assert metrics["network"]["psnr_in_box"] > 45
-
-
 def test_light_before_the_box_covers_the_asset(tmp_path: Path) -> None:
     class Fog(BallField):
         def render(self, camera: Camera, progress: Any = None, **more: Any) -> Any:
@@ -146,31 +136,7 @@ def test_what_masks_hide_does_not_count(tmp_path: Path, background: tuple[float,
     assert metrics["network"]["psnr"] > 45
 
 
-def test_a_mask_that_hides_everything_leaves_the_view_out_of_the_means(tmp_path: Path) -> None:
-    poses = make_scene(tmp_path / "poses", "tt", masked=True)
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(poses / "images" / "mask0.png")
-    events: list[dict[str, Any]] = []
-    job = job_in(tmp_path, poses, report=events.append)
-    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
-    metrics = figures_of(job)
-    assert metrics["views"][0]["asset"]["psnr"] is None
-    assert metrics["asset"]["psnr"] == metrics["views"][1]["asset"]["psnr"]
-    assert any("v0.png" in event["text"] for event in events if event["event"] == "warning")
-
-
-def test_a_field_of_nans_counts_as_black_with_a_warning(tmp_path: Path) -> None:
-    class Broken(BallField):
-        def render(self, camera: Camera, progress: Any = None, **more: Any) -> Any:
-            return replace(super().render(camera, **more), colour=np.full((camera.height, camera.width, 3), np.nan, np.float32))
-
-    events: list[dict[str, Any]] = []
-    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t"), report=events.append)
-    measure(TREE, lambda: Broken(TREE, background=WHITE), job)
-    assert 0 < figures_of(job)["network"]["psnr"] < 10
-    assert any("not finite" in event["text"] for event in events if event["event"] == "warning")
-
-
-@pytest.mark.parametrize("moment", [1, 2, 4])
+@pytest.mark.parametrize("moment", [1, 4])
 def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp_path: Path, moment: int) -> None:
     poses = make_scene(tmp_path / "poses", "tttt", background=None)
     whole = job_in(tmp_path / "whole", poses, settings(field_views=2))
@@ -187,8 +153,7 @@ def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp
     assert finished == moment // 2
 
 
-@pytest.mark.parametrize("how", SPOILERS)
-@pytest.mark.parametrize("pattern", ["view_*", "picture_*"])
+@pytest.mark.parametrize(("pattern", "how"), [("view_*", "cut"), ("view_*", "link"), ("picture_*", "zero")])
 def test_every_scratch_file_of_an_evaluation_may_be_damaged(tmp_path: Path, pattern: str, how: str) -> None:
     poses = make_scene(tmp_path / "poses", "tttt", background=None)
     whole = job_in(tmp_path / "whole", poses, settings(field_views=2))
@@ -205,51 +170,16 @@ def test_every_scratch_file_of_an_evaluation_may_be_damaged(tmp_path: Path, patt
     assert warned == ["view_00000.json" if pattern == "view_*" else "view_00001.json"]
 
 
-@pytest.mark.parametrize(
-    "value", [None, {}, {"name": "v0.png", "network": None, "asset": {}}, {"name": "v0.png", "network": None, "asset": None}, {"name": "v9.png"}]
-)
-def test_odd_metrics_in_scratch_are_measured_again(tmp_path: Path, value: Any) -> None:
-    poses = make_scene(tmp_path / "poses", "tt")
-    whole = job_in(tmp_path / "whole", poses, settings(field_views=1))
-    measure(TREE, lambda: BallField(TREE, background=WHITE), whole)
-    for k in range(2):
-        (tmp_path / "work").mkdir(exist_ok=True)
-        note(tmp_path / "work" / f"view_{k:05d}.json", value)
-    job = job_in(tmp_path, poses, settings(field_views=1))
-    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
-    assert (job.out / "metrics.json").read_bytes() == (whole.out / "metrics.json").read_bytes()
-
-
-def test_the_field_is_not_loaded_where_nothing_needs_it(tmp_path: Path) -> None:
-    poses = make_scene(tmp_path / "poses", "tt")
-    measure(TREE, lambda: BallField(TREE, background=WHITE), job_in(tmp_path, poses))
-
-    def refuse() -> Any:
-        raise AssertionError("loaded")
-
-    measure(TREE, refuse, job_in(tmp_path, poses, out="again"))
-
-
-def test_spread_is_even_and_complete() -> None:
-    assert evenly_spaced(10, None) == evenly_spaced(10, 12) == list(range(10))
-    assert evenly_spaced(10, 2) == [2, 7]
-    assert evenly_spaced(9, 1) == [4]
-    for count in range(1, 30):
-        for wanted in range(1, count):
-            chosen = evenly_spaced(count, wanted)
-            assert len(set(chosen)) == wanted
-            assert 0 <= chosen[0] <= chosen[-1] < count
-
-
 def test_stride_for_bounds_the_pixels() -> None:
     view = View("a", None, "test", Camera("a", 100, 100, "SIMPLE_PINHOLE", (1.0, 50.0, 50.0), np.eye(4)), None, 0.0, 1.0)
     assert stride_for([view] * 4, 40_000) == 1
     assert stride_for([view] * 4, 10_000) == 2
     assert stride_for([view] * 4, 9_999) == 3
     assert stride_for([], 1) == 1
+    assert stride_for([view], 1) == bounded_stride([view], 10**6) == min(view.camera.width, view.camera.height), "each view keeps a pixel"
 
 
-@pytest.mark.parametrize("stride", [1, 2, 3, 4])
+@pytest.mark.parametrize("stride", [1, 3])
 @pytest.mark.parametrize("model", [("SIMPLE_RADIAL", (70.0, 31.0, 20.0, 0.1)), ("OPENCV_FISHEYE", (70.0, 72.0, 31.0, 20.0, 0.1, 0.01, 0.0, 0.0))])
 def test_a_subsampled_camera_has_the_rays_of_the_pixels_that_are_kept(stride: int, model: tuple[str, tuple[float, ...]]) -> None:
     camera = Camera("a", 61, 44, *model, pose_on_sphere((0.0, 0.0, 0.0), 3.0, 10.0, 20.0))
@@ -258,7 +188,7 @@ def test_a_subsampled_camera_has_the_rays_of_the_pixels_that_are_kept(stride: in
     np.testing.assert_allclose(rays(small)[1].reshape(small.height, small.width, 3), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("stride", [1, 2, 3, 4])
+@pytest.mark.parametrize("stride", [1, 3])
 def test_upsampling_gives_back_what_was_kept_and_straight_lines_between(stride: int) -> None:
     y, x = np.mgrid[0:40, 0:50].astype(np.float32)
     ramp = np.stack([x, y, x + 2 * y, np.ones_like(x)], -1)

@@ -10,10 +10,9 @@ import torch
 
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
-from stages.evaluate.comparison import AGAINST_NETWORK, GAP, lpips_metrics
-from stages.evaluate.lpips_weights import BACKBONES, load_lpips
+from stages.evaluate.comparison import AGAINST_NETWORK, GAP, load_lpips, lpips_metrics
+from stages.evaluate.lpips_weights import BACKBONES
 from stages.evaluate.mesh import FIGURES
-from stages.evaluate.run import STAGE, EvaluateSettings
 from stages.evaluate.summary import summary
 from stages.evaluate.views import GroundTruth
 
@@ -90,13 +89,6 @@ def test_missing_weights_are_named_with_the_remedy(tmp_path: Path) -> None:
         load_lpips("vgg", str(folder), bundled=[])
 
 
-def test_weights_in_torchs_cache_are_found(tmp_path: Path) -> None:
-    folder = Path(written(tmp_path / "weights", "alex"))
-    (tmp_path / "home/hub/checkpoints").mkdir(parents=True)
-    (folder / BACKBONES["alex"]).rename(tmp_path / "home/hub/checkpoints" / BACKBONES["alex"])
-    load_lpips("alex", None, bundled=[folder])
-
-
 def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:
     folder = Path(written(tmp_path / "weights", "alex"))
     torch.save({"lin0.model.1.weight": torch.zeros(1, 3, 1, 1)}, folder / "alex.pth")
@@ -123,14 +115,3 @@ def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
     assert found["network"]["lpips_alex"] == figures["lpips_alex"]
     assert found["asset"]["lpips_alex"] is None
     assert Lpips.__doc__
-
-
-def test_missing_weights_are_told_before_any_stage_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert STAGE.check is not None
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "none"))
-    folder = written(tmp_path / "weights", "alex")
-    STAGE.check({"evaluate": EvaluateSettings()})
-    STAGE.check({"evaluate": EvaluateSettings(lpips="alex", lpips_weights=str(folder))})
-    for lpips in ("vgg", "both"):
-        with pytest.raises(UsageError, match=r"vgg16.*were not found"):
-            STAGE.check({"evaluate": EvaluateSettings(lpips=lpips, lpips_weights=str(folder))})

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from efficientnerf.asset import region
-from efficientnerf.asset.region import Region
 from efficientnerf.asset.rendering import Rendering
+from efficientnerf.asset.tree import Region
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.surface.mesh import Mesh, Texture
+from efficientnerf.surface.mesh import Texture
 from stages.evaluate.mesh import EvaluatedMesh, evaluated_mesh, mesh_image
 from stages.evaluate.run import evaluate
 from stages.io.scene import Scene, load
@@ -53,10 +52,6 @@ def test_less_mesh_is_worse_and_wrong_colours_are_on_its_own_pixels(tmp_path: Pa
     assert wrong["psnr_covered"] < good["psnr_covered"] - 8
     # the same squared error, over all pixels and over those of the mesh
     assert 10 ** (-wrong["psnr"] / 10) == pytest.approx(10 ** (-wrong["psnr_covered"] / 10) * wrong["covered"], rel=0.1)
-
-
-def test_what_masks_hide_does_not_count(tmp_path: Path) -> None:
-    assert score(tmp_path, BALL_MESH, masked=True)["mesh"]["psnr"] > 28
 
 
 def test_the_texture_counts_and_the_vertices_beside_it(tmp_path: Path) -> None:
@@ -118,11 +113,3 @@ def test_foreground_and_surroundings_make_up_the_whole() -> None:
     alone = region.surroundings(tree, all_is_foreground=True)
     assert len(alone.density_values) == 0
     assert alone.environment is tree.environment
-
-
-def test_a_mesh_without_surroundings_of_its_own_stands_before_what_the_asset_is_drawn_on(tmp_path: Path) -> None:
-    scene = load(make_scene(tmp_path / "poses", "t"))
-    empty = evaluated_mesh(Mesh(np.eye(3) * 100, np.array([[0, 1, 2]]), np.eye(3), np.zeros((3, 3), np.float32)), None)
-    image, _, covered = mesh_image(empty, replace(TREE.evaluated(), render=partial(TREE.render)), scene, scene.views[0], None, 1)
-    np.testing.assert_array_equal(image, np.ones_like(image))
-    assert not covered.any()

@@ -18,7 +18,7 @@ from stages.framing.camera_paths import pose_on_sphere
 from stages.io.capture import SparsePoints
 from stages.io.scene import load, save, save_points
 from stages.verdict.grades import GRADES
-from stages.verdict.result import CameraVerdict, ResultVerdict, camera_verdict_of, verdict_on_result
+from stages.verdict.result import CameraVerdict, ResultVerdict, verdict_on_result
 from tests.fakes import WHITE, BallField
 from tests.stages.evaluate.balls import TREE, figures_of, job_in, make_scene, measure, problems_of, settings, verdict_of
 from tests.stages.evaluate.results import WORSE, a_result, worse
@@ -44,11 +44,6 @@ def test_captures_are_graded_as_who_looks_at_them_does(name: str) -> None:
     assert verdict_on_result(a_result(psnr, mean_colour=mean_colour, blurred=blurred)).grade == grade
 
 
-def test_nothing_stands_against_a_good_result() -> None:
-    found = verdict_on_result(a_result(), CameraVerdict("good"))
-    assert (found.grade, found.problems) == ("good", ())
-
-
 SETTINGS = {f"{stage.name}.{name}" for stage in asset.STAGES for name in stage.settings.__dataclass_fields__}
 PICTURES = {
     f"evaluate/{EvaluateOutputs.strip_worst}", f"evaluate/{EvaluateOutputs.contact_sheet}", f"evaluate/{EvaluateOutputs.sparse_points}",
@@ -67,7 +62,7 @@ def check(found: ResultVerdict) -> None:
     assert found.document()["summary"].startswith(f"Result: {found.grade}")
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_worse_figures_never_give_a_better_grade(seed: int) -> None:
     rng = random.Random(seed)
     found, grades = a_result(rng.uniform(10.0, 30.0)), []
@@ -113,32 +108,6 @@ def test_a_cause_that_is_seen_is_named_with_its_own_remedy(name: str) -> None:
     CAUSES[name][0](found)
     (pictures,) = (each for each in verdict_on_result(found).problems if each.what == "pictures")
     assert CAUSES[name][1] in pictures.remedy
-
-
-def test_exposure_that_nobody_can_know_of_a_photograph_is_no_fault_of_the_asset() -> None:
-    found = verdict_on_result(a_result(24.0, fitted=29.0))
-    assert (found.grade, [each.what for each in found.problems]) == ("good", ["colours"])
-    assert verdict_on_result(a_result(16.0, fitted=29.0)).grade == "usable", "no better than one colour"
-
-
-def test_bad_cameras_of_a_good_result_are_named_and_no_more() -> None:
-    found = verdict_on_result(a_result(), CameraVerdict("poor", "Only 10 of 40 photographs have a camera.", "Take more."))
-    assert (found.grade, [each.what for each in found.problems]) == ("usable", ["cameras"])
-    assert verdict_on_result(a_result(), CameraVerdict("usable", "S.", "R.")).grade == "good"
-
-
-@pytest.mark.parametrize("document", [None, [], {}, {"grade": "fine"}, {"grade": 3}])
-def test_a_verdict_on_cameras_that_cannot_be_read_is_none(document: Any) -> None:
-    assert camera_verdict_of(document) is None
-
-
-def test_a_view_that_no_pixel_of_counts_is_left_out() -> None:
-    found = a_result()
-    found["views"][0] |= {"trivial": None, "asset": {"psnr": None, "psnr_colour_fitted": None}}
-    assert verdict_on_result(found).grade == "good"
-    for view in found["views"]:
-        view["trivial"] = None
-    check(verdict_on_result(found))
 
 
 def with_points(poses: Path, xyz: np.ndarray, observers: int = 3) -> None:
@@ -203,14 +172,3 @@ def test_what_the_asset_loses_makes_it_fail(tmp_path: Path) -> None:
     assert found["grade"] == "failed"
     assert {"pictures", "missing", "gap", "holes"} <= problems_of(job)
     assert all((job.out.parent / job.out.name / Path(each["picture"]).name).is_file() for each in found["problems"] if each["picture"].startswith("evaluate/"))
-
-
-def test_grades_fall_with_what_of_the_ball_is_there(tmp_path: Path) -> None:
-    poses = make_scene(tmp_path / "poses", "ttt")
-    blurs = []
-    for radius in (0.6, 0.57, 0.5, 0.4, 0.2):
-        job = job_in(tmp_path / str(radius), poses)
-        measure(replace(TREE, radius=radius), lambda: BallField(TREE, background=WHITE), job)
-        blurs.append(verdict_of(job)["blur"])
-    assert blurs == sorted(blurs)
-    assert blurs[0] < 0.005 < 0.04 < blurs[-1]

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
-from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, error_map, grid_sheet, to_uint8, with_palette
+from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, with_palette
 from stages.io.png import read_png
 
 
@@ -26,36 +25,6 @@ def test_sheet_holds_each_image_at_its_place(tmp_path: Path) -> None:
     assert tuple(pixels[second + 30, MARGIN + 30]) == (0, 255, 0)
     assert (pixels[second + 60 : second + 60 + LABEL_HEIGHT, MARGIN : MARGIN + 60] < 128).any(), "the label is written"
     assert (pixels[:, 60 + MARGIN + 1 : 60 + 2 * MARGIN - 1] == 255).all(), "a long label stays in its column"
-
-
-def test_sheets_and_curves_are_the_same_bytes_twice(tmp_path: Path) -> None:
-    random = np.random.default_rng(0)
-    images = [random.random((30, 40, 3)) for _ in range(7)]
-    for name in ("a", "b"):
-        grid_sheet(images, [str(i) for i in range(7)], tmp_path / f"{name}.png", title="seven")
-        curve(tmp_path / f"{name}_curve.png", {"loss": ([1, 2, 3], [3.0, float("nan"), 1.0])}, x_label="iteration", y_label="loss", log_y=True)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    assert (tmp_path / "a_curve.png").read_bytes() == (tmp_path / "b_curve.png").read_bytes()
-
-
-def test_no_images_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no images"):
-        contact_sheet([[]], None, tmp_path / "sheet.png")
-
-
-def test_eight_bits_clips_and_rounds() -> None:
-    assert to_uint8(np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan])).tolist() == [0, 0, 128, 255, 255, 0]
-    with pytest.raises(ValueError, match="int64"):
-        to_uint8(np.array([1]))
-
-
-def test_error_picture_is_black_where_equal_and_bright_where_not() -> None:
-    truth = np.zeros((2, 2, 3))
-    image = truth.copy()
-    image[0, 0] = 0.25
-    picture = error_map(image, truth)
-    assert picture[1, 1].max() < 10
-    assert picture[0, 0].min() > 150
 
 
 def test_a_palette_halves_a_plot_and_shows_the_same(tmp_path: Path) -> None:

@@ -33,7 +33,6 @@ def sharp(folder: Path) -> tuple[Path, list[Camera]]:
 def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, made = sharp(tmp_path / "a")
     capture = read(folder)
-    assert capture.points is not None
     assert len(capture.points.xyz) > 500
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01, "they lie on the plane"
     assert min(map(len, capture.points.tracks)) >= 3
@@ -46,26 +45,9 @@ def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path, monk
     assert {folder / f"keyframes/depth/img_{index}.png" for index in range(6)} < set(importers.files(folder, Settings()))
     monkeypatch.setattr("stages.formats.importers.depth.MAX_TRACK", 3)
     again = read(folder)
-    assert again.points is not None
     np.testing.assert_array_equal(again.points.xyz, capture.points.xyz)
     assert {len(track) for track in again.points.tracks} == {3}
     assert all(set(few) <= set(many) for few, many in zip(again.points.tracks, capture.points.tracks, strict=True))
-
-
-def test_depth_of_low_confidence_or_out_of_range_is_not_used(tmp_path: Path) -> None:
-    folder, made = sharp(tmp_path / "a")
-    for index in range(6):
-        sure = np.full((48, 64), 127, np.uint8)
-        sure[12:36, 16:48] = 255
-        captures.write_picture(folder / f"keyframes/confidence/img_{index}.png", sure)
-    capture = read(folder)
-    assert capture.points is not None
-    for index, camera in enumerate(made):
-        seen = [point for point, track in zip(capture.points.xyz, capture.points.tracks, strict=True) if index in track]
-        assert (np.abs(project(camera, np.array(seen))[0] - (16, 12)) < (8.1, 6.1)).all(), "in the middle, where the maps are sure"
-    for index, camera in enumerate(made):
-        exports.write_depth(folder / f"keyframes/depth/img_{index}.png", np.where(exports.plane_depth(camera, 64, 48) > 0, 5.5, 0))
-    assert read(folder).points is None
 
 
 def test_depth_that_no_other_image_confirms_is_left_out_with_a_word(tmp_path: Path) -> None:
@@ -91,7 +73,6 @@ def test_depth_of_transforms(key: str, unit: float, more: dict[str, float], tmp_
         exports.write_depth(tmp_path / f"depth/img_{index}.png", exports.plane_depth(camera, 64, 48), unit)
     captures.nerfstudio(tmp_path, frames=frames, **more)
     capture = read(tmp_path)
-    assert capture.points is not None
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01
     assert capture.metric == (key == "depth_file_path")
     assert tmp_path / "depth/img_3.png" in importers.files(tmp_path, Settings())
@@ -111,12 +92,10 @@ def test_record3ds_depth(tmp_path: Path) -> None:
         header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
         openexr.File(header, {"R": values}).write(str(place / f"{photo.image.stem}.exr"))
     capture = read(folder)
-    assert capture.points is not None
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01
     assert place / "3.exr" in importers.files(folder, Settings())
     (place / "3.exr").write_bytes(b"nothing")
     found = read(folder)
-    assert found.points is not None
     assert all(3 not in track for track in found.points.tracks)
     assert any("1 of 6 depth maps are not used, e.g. 3.exr: unreadable" in warning for warning in found.warnings)
 
@@ -155,7 +134,6 @@ def test_points_of_depth_supervise_training(tmp_path: Path, monkeypatch: pytest.
     made = scene.load(tmp_path / "poses")
     assert made.metric
     found = sparse_depth_of(tmp_path / "poses", made)
-    assert found is not None
     ends = found.origins + found.directions * found.distance[:, None]
     there = made.world_from_capture.inverse().points(ends)
     assert np.abs(there[:, 2]).max() < 0.02

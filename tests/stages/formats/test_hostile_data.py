@@ -25,7 +25,6 @@ LONG = 10**400
 DEEP = "[" * 900 + "]" * 900
 HOSTILE: dict[str, str] = {  # as JSON texts
     "an integer of 400 digits": str(LONG),
-    "its negative": str(-LONG),
     "beyond all floats": "1e999",
     "the least of all floats": "5e-324",
     "a list": "[]",
@@ -105,14 +104,6 @@ def test_hostile_values_in_camera_paths(tmp_path: Path, what: str) -> None:
         assert_read_or_refused(lambda: read_camera_path(path, SAME))
 
 
-@pytest.mark.parametrize("angle", [5e-324, 1e-300, 180 - 1e-13])
-def test_angles_of_view_that_no_lens_has(tmp_path: Path, angle: float) -> None:
-    camera = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": angle}
-    (tmp_path / "p.json").write_text(json.dumps({"render_width": 32, "render_height": 24, "camera_path": [camera]}))
-    with pytest.raises(BadInput, match="degrees between 0 and 180"):
-        read_camera_path(tmp_path / "p.json", SAME)
-
-
 # --- poses_bounds.npy
 
 
@@ -152,17 +143,6 @@ def test_the_header_of_poses_bounds_is_not_believed(tmp_path: Path, data: bytes)
     assert str(caught.value).isprintable()
 
 
-@pytest.mark.parametrize("value", [1e300, -1e100, np.nan, np.inf])
-def test_numbers_of_poses_bounds_are_bounded(tmp_path: Path, value: float) -> None:
-    source = captures.llff(tmp_path / "source")
-    for column in range(17):
-        rows = captures.llff_rows(captures.cameras())
-        rows[2, column] = value
-        np.save(source / "poses_bounds.npy", rows)
-        with pytest.raises(BadInput, match=r"row 2"):
-            importers.files(source, Settings())
-
-
 def test_other_types_and_orders_of_poses_bounds_are_read(tmp_path: Path) -> None:
     from stages.formats.importers.llff import read_rows
 
@@ -175,7 +155,7 @@ def test_other_types_and_orders_of_poses_bounds_are_read(tmp_path: Path) -> None
 # --- COLMAP
 
 
-@pytest.mark.parametrize("word", ["²", "1" * 400, "1" * 5000, "-", "--3", "٣", "1e3", "0x10"])
+@pytest.mark.parametrize("word", ["²", "1" * 5000, "-", "1e3"])
 @pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "points3D.txt"])
 def test_numbers_in_colmap_texts(tmp_path: Path, name: str, word: str) -> None:
     source = captures.colmap_txt(tmp_path / "source")
@@ -191,7 +171,7 @@ def test_numbers_in_colmap_texts(tmp_path: Path, name: str, word: str) -> None:
     assert_read_or_refused(lambda: importers.IMPORTERS["colmap"].read(source, Settings()))
 
 
-@pytest.mark.parametrize("value", [1e300, 5e-324, np.nan, np.inf, -1.0])
+@pytest.mark.parametrize("value", [1e300, np.nan, -1.0])
 def test_lenses_and_places_of_colmap_are_bounded(tmp_path: Path, value: float) -> None:
     for offset in range(0, 8 * 3, 8):
         source = captures.colmap_bin(tmp_path / str(offset))
@@ -206,13 +186,3 @@ def test_lenses_and_places_of_colmap_are_bounded(tmp_path: Path, value: float) -
     data[8 + 4 + 32 : 8 + 4 + 40] = struct.pack("<d", value)
     path.write_bytes(data)
     assert_read_or_refused(lambda: importers.IMPORTERS["colmap"].read(source, Settings()))
-
-
-def test_an_image_that_a_model_names_twice_counts_once(tmp_path: Path) -> None:
-    import dataclasses
-
-    made = captures.cameras()
-    made[1] = dataclasses.replace(made[1], name=made[0].name)
-    capture = importers.IMPORTERS["colmap"].read(captures.colmap_bin(tmp_path / "source", made), Settings())
-    assert len({photo.camera.name for photo in capture.photos}) == len(capture.photos) == 5
-    assert "same image" in capture.rejected[0][1]

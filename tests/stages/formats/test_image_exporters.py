@@ -17,7 +17,7 @@ from efficientnerf.geometry.cameras import Camera, Similarity, project
 from efficientnerf.rendering.colour import linear_from_srgb, linear_premultiplied, srgb_from_linear, straight_from_premultiplied
 from pipeline.errors import UsageError
 from stages.formats.exporters.exr import write_exr
-from stages.formats.exporters.frames import background_from_text, frame_from_rendering, over_background
+from stages.formats.exporters.frames import background_from_text, frame_from_rendering
 from stages.formats.exporters.video import write_mp4
 from stages.io.png import read_png, write_png
 from tests.fakes import BallTree
@@ -39,15 +39,12 @@ def test_light_is_taken_of_the_straight_colour() -> None:
     assert (straight_from_premultiplied(np.ones((1, 3)), np.zeros(1)) == 0).all()
 
 
-@pytest.mark.parametrize(("text", "colour"), [("white", (1, 1, 1)), ("black", (0, 0, 0)), ("#ff0080", (1, 0, 128 / 255)), ("transparent", None)])
-def test_backgrounds(text: str, colour: tuple[float, float, float] | None) -> None:
-    assert background_from_text(text) == colour
-
-
-@pytest.mark.parametrize("text", ["", "whit", "#12345", "#gggggg", "123456", "#１２３４５６"])
-def test_unknown_backgrounds_are_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="#rrggbb"):
-        background_from_text(text)
+def test_backgrounds() -> None:
+    for text, colour in [("white", (1, 1, 1)), ("black", (0, 0, 0)), ("#ff0080", (1, 0, 128 / 255)), ("transparent", None)]:
+        assert background_from_text(text) == colour
+    for text in ("whit", "#12345", "#１２３４５６"):
+        with pytest.raises(UsageError, match="#rrggbb"):
+            background_from_text(text)
 
 
 def test_png_keeps_its_pixels_and_bytes(tmp_path: Path) -> None:
@@ -60,13 +57,6 @@ def test_png_keeps_its_pixels_and_bytes(tmp_path: Path) -> None:
         assert (read_png(tmp_path / "a.png") == frame).all()
         assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.png"]
-
-
-def test_frames_with_alpha_over_a_colour_are_frames_on_that_colour() -> None:
-    seen = BallTree(sigma=2.0).render(CAMERA)
-    apart = over_background(frame_from_rendering(seen.colour, seen.opacity, None), (1.0, 1.0, 1.0))
-    direct = frame_from_rendering(seen.colour, seen.opacity, (1.0, 1.0, 1.0))
-    assert np.abs(apart.astype(int) - direct).max() <= 2
 
 
 def test_exr_is_linear_premultiplied_and_in_the_capture_frame(tmp_path: Path) -> None:
@@ -114,14 +104,6 @@ def test_exr_whose_writing_fails_leaves_nothing(tmp_path: Path, monkeypatch: pyt
     assert not list(tmp_path.iterdir())
 
 
-def test_exr_of_a_view_that_is_not_contiguous(tmp_path: Path) -> None:
-    seen = BallTree().render(CAMERA)
-    turned = {name: getattr(seen, name)[:, ::-1] for name in ("colour", "opacity", "depth", "normal")}
-    write_exr(tmp_path / "a.exr", **turned, camera=CAMERA)
-    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
-        np.testing.assert_array_equal(file.channels()["A"].pixels, seen.opacity[:, ::-1])
-
-
 def moving_frames(count: int, height: int, width: int) -> list[np.ndarray]:
     y, x = np.mgrid[0:height, 0:width] / 12.0
     pictures = []
@@ -154,14 +136,14 @@ def test_mp4_decodes_to_its_frames(tmp_path: Path, size: tuple[int, int]) -> Non
 def test_mp4_repeats_to_the_byte_whatever_lies_in_memory(tmp_path: Path) -> None:
     frames = [np.random.default_rng(n).integers(0, 256, (72, 96, 3), np.uint8) // 8 + frame // 2 for n, frame in enumerate(moving_frames(12, 72, 96))]
     contents, clutter = set(), []
-    for attempt in range(12):
+    for attempt in range(4):
         clutter.append(np.random.default_rng(attempt).random(7919 * (attempt + 1)))
         write_mp4(frames, tmp_path / "a.mp4", fps=6)
         contents.add((tmp_path / "a.mp4").read_bytes())
     assert len(contents) == 1
 
 
-def test_mp4_of_more_frames_than_the_encoder_looks_ahead_shows_each_at_its_time(tmp_path: Path) -> None:
+def test_mp4_of_many_frames_shows_each_at_its_time(tmp_path: Path) -> None:
     write_mp4(moving_frames(75, 32, 32), tmp_path / "a.mp4", fps=30)
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
@@ -179,14 +161,10 @@ def test_mp4_index_lies_before_the_pictures_and_no_program_signs_it(tmp_path: Pa
     content = (tmp_path / "a.mp4").read_bytes()
     assert 0 < content.index(b"moov") < content.index(b"mdat")
     assert b"Lavf" not in content
-
-
-def test_mp4_of_nothing_or_of_mixed_sizes_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no frames"):
-        write_mp4([], tmp_path / "a.mp4", fps=30)
-    with pytest.raises(ValueError, match="frame 1 has shape"):
-        write_mp4(moving_frames(1, 32, 32) + moving_frames(1, 32, 34), tmp_path / "a.mp4", fps=30)
-    assert not (tmp_path / "a.mp4").exists()
+    for frames in ([], moving_frames(1, 32, 32) + moving_frames(1, 32, 34)):
+        with pytest.raises(ValueError, match="frame"):
+            write_mp4(frames, tmp_path / "b.mp4", fps=30)
+    assert not (tmp_path / "b.mp4").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

@@ -49,7 +49,6 @@ def test_colmap_lenses(model: str, write: object, tmp_path: Path) -> None:
     capture = read(write(tmp_path / "a", made))  # type: ignore[operator]
     assert_same_rays(capture, made)
     assert capture.photos[0].camera.params == LENSES[model]
-    assert capture.points is not None
     assert capture.points.tracks[0] == tuple(range(6))
     assert capture.points.rgb[0].tolist() == [200, 100, 50]
     assert capture.reprojection_error == pytest.approx(0.5)
@@ -77,24 +76,7 @@ def test_a_model_written_by_colmap_with_rigs_and_frames(tmp_path: Path) -> None:
         assert (other / "sparse/0" / f"frames.{suffix}").is_file()
         capture = read(other, allow_outside=True)
         assert_same_rays(capture, captures.cameras())
-        assert capture.points is not None
         np.testing.assert_allclose(np.sort(capture.points.xyz, 0), np.sort(captures.sparse_points(), 0))
-
-
-def test_of_several_models_the_one_with_most_images_is_taken(tmp_path: Path) -> None:
-    folder = captures.colmap_bin(tmp_path / "a", captures.cameras()[:3])
-    captures.colmap_txt(folder, place="sparse/1")
-    capture = read(folder)
-    assert capture.facts["model"] == "sparse/1"
-    assert len(capture.photos) == 6
-    assert any("sparse/0 (3 images)" in warning for warning in capture.warnings)
-
-
-def test_blenders_splits_and_axes(tmp_path: Path) -> None:
-    capture = read(captures.blender(tmp_path / "a"))
-    assert [photo.split for photo in capture.photos] == ["train"] * 4 + ["test"] * 2
-    assert capture.up is not None
-    assert capture.up.tolist() == [0, 0, 1]
 
 
 def test_nerfstudio_extras(tmp_path: Path) -> None:
@@ -116,7 +98,6 @@ def test_nerfstudio_extras(tmp_path: Path) -> None:
     assert [photo.split for photo in capture.photos] == ["train"] * 4 + ["val", "test"]
     assert capture.photos[0].mask == folder / "masks/img_0.png"
     assert capture.photos[0].mask_ignore == "black"
-    assert capture.points is not None
     np.testing.assert_allclose(capture.points.xyz, points, atol=1e-6)
     assert {folder / "cloud.ply", folder / "masks/img_0.png"} < set(importers.files(folder, Settings()))
 
@@ -150,30 +131,6 @@ def test_llff_takes_the_largest_images_and_scales_the_focal_length(tmp_path: Pat
     assert capture.photos[0].camera.params == (80.0, 32.0, 24.0)
     assert (capture.photos[0].near, capture.photos[0].far) == (2.0, 7.0)
     assert_same_rays(read(folder, llff_factor=4), captures.cameras())
-
-
-def test_masks_beside_photographs(tmp_path: Path) -> None:
-    from stages.formats.importers.masks import masks_of
-    from stages.formats.importers.photographs import photographs
-    from stages.formats.importers.source import Source
-
-    black = np.zeros((HEIGHT, WIDTH), np.uint8)
-    for layout, mask in {"a": "masks/1.png", "b": "masks/1.jpg.png", "images/c": "images/masks/1.png", "images": "masks/1.PNG"}.items():
-        root = tmp_path / layout.replace("/", "_") / "source"
-        image = captures.write_picture(root / ("images" if layout.startswith("images") else ".") / "1.jpg", captures.picture())
-        made = captures.write_picture(root / mask, black)
-        assert photographs(Source(root)) == [image]
-        assert masks_of(Source(root), [image]) == {image: made}
-        assert importers.files(root, Settings()) == sorted([image, made])
-
-
-def test_photographs_anywhere_below(tmp_path: Path) -> None:
-    captures.write_pictures(tmp_path / "a" / "day 1", ["1.png"])
-    captures.write_pictures(tmp_path / "a" / "day 2", ["1.png"])
-    captures.write_pictures(tmp_path / "a" / "masks", ["1.png"])
-    described = describe_source(tmp_path / "a")
-    assert described["format"] == "photographs"
-    assert described["count"] == 2
 
 
 def test_lists_that_have_travelled(tmp_path: Path) -> None:
@@ -214,19 +171,6 @@ def test_cameras_stated_for_the_pixels_as_stored_turn_with_them(tmp_path: Path, 
     assert_same_rays(capture, truth)
 
 
-def test_an_image_listed_twice_counts_once(tmp_path: Path) -> None:
-    frames = captures.frames(captures.cameras())
-    capture = read(captures.nerfstudio(tmp_path / "a", frames=[*frames, frames[0]]))
-    assert len(capture.photos) == 6
-    assert capture.rejected[0][0] == "images/img_0.png"
-
-
-def test_several_formats_in_one_folder_are_named(tmp_path: Path) -> None:
-    folder = captures.nerfstudio(captures.colmap_bin(tmp_path / "a"))
-    assert importers.candidates(folder) == ["nerfstudio", "colmap", "photographs"]
-    assert any("--as colmap" in odd for odd in describe_source(folder)["warnings"])
-
-
 def shared(name: str) -> Path:
     folder = SHARED / name
     if not folder.is_dir():
@@ -264,7 +208,6 @@ def test_door_points_lie_where_colmap_saw_them() -> None:
     folder = shared("lund_door_colmap")
     capture = read(folder)
     assert len(capture.photos) == 12
-    assert capture.points is not None
     assert len(capture.points.xyz) == 11384
     observed: dict[str, dict[int, tuple[float, float]]] = {}
     for _, line, points in colmap_model._image_lines(folder / "sparse/0/images.txt"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import json
 import os
 import shutil
 import subprocess
@@ -21,20 +20,13 @@ from efficientnerf.splats.gaussians import Gaussians, covariances
 from pipeline.errors import BadInput, CorruptArtifact
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
-from stages.formats.exporters.splats.frames import in_capture, moved
+from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import property_names, read_splats
 from stages.formats.exporters.writing import SourceFrame
 from tests.stages.formats.gaussians import read_glb_splats, read_spz, scattered
 from tests.stages.io.meshes import Y_DOWN, Z_UP, accessor, glb_document
 
 SPLAT_TRANSFORM = os.environ.get("SPLAT_TRANSFORM") or shutil.which("splat-transform")
-NODE = shutil.which("node")
-VALIDATE = """
-const file = new Uint8Array(require("fs").readFileSync(process.argv[1]));
-require("gltf-validator").validateBytes(file).then((report) => console.log(JSON.stringify(report.issues.messages)));
-"""
-
-
 def turn(seed: int) -> np.ndarray:
     found, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return found * np.linalg.det(found)
@@ -45,8 +37,7 @@ def colours(gaussians: Gaussians, directions: np.ndarray) -> np.ndarray:
     return np.einsum("dk,nkc->dnc", basis_numpy(directions, gaussians.degree), gaussians.harmonics.astype(np.float64))
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("degree", "seed"), [(0, 0), (1, 1), (3, 2)])
 def test_a_gaussian_looks_the_same_to_an_eye_that_moves_along(degree: int, seed: int) -> None:
     """Colours to each side, places, sizes and axes; and there and back is nothing."""
     before, similarity = scattered(20, degree), Similarity(0.37, turn(seed), np.array([1.0, -2, 3]))
@@ -60,19 +51,6 @@ def test_a_gaussian_looks_the_same_to_an_eye_that_moves_along(degree: int, seed:
     back = moved(after, similarity.inverse())
     np.testing.assert_allclose(back.harmonics, before.harmonics, atol=1e-6)
     np.testing.assert_allclose(np.abs((back.rotations * before.rotations).sum(axis=1)), 1, atol=1e-6)
-
-
-def test_no_turn_changes_no_bit() -> None:
-    before = scattered()
-    after = moved(before, Similarity.identity())
-    for name in ("means", "scales", "opacities"):
-        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
-    np.testing.assert_allclose(after.harmonics, before.harmonics, atol=1e-7)
-
-
-def test_what_is_not_finite_in_the_capture_s_unit_is_refused() -> None:
-    with pytest.raises(BadInput, match="not finite in the capture's frame"):
-        in_capture(scattered(), SourceFrame(Similarity(1e-39, np.eye(3), np.zeros(3))))
 
 
 def test_the_ply_is_that_of_3dgs(tmp_path: Path) -> None:
@@ -113,7 +91,7 @@ def differs_by(found: Gaussians, expected: Gaussians) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("frame", [Z_UP, Y_DOWN], ids=["z up", "y down"])
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 2, 3])
 @pytest.mark.parametrize("extension", SPLAT_EXPORTERS)
 def test_what_was_written_is_read_again(extension: str, degree: int, frame: SourceFrame, tmp_path: Path) -> None:
     """In the capture's frame; the same Gaussians are the same bytes, and nothing else is left beside."""
@@ -153,7 +131,7 @@ def test_spz_codes_are_niantic_s(tmp_path: Path) -> None:
     assert set(above[:, 3:].ravel()) == {124}, "-0.05 is -6 of 128, and that as near to -4 as to -8"
 
 
-@pytest.mark.parametrize(("size", "at"), [(1.0, 0.0), (1e-3, 0.0), (500.0, 0.0), (1.0, 1e5), (1e-4, 7e6)])
+@pytest.mark.parametrize(("size", "at"), [(1e-3, 0.0), (500.0, 0.0), (1e-4, 7e6)])
 def test_places_in_spz_are_as_fine_as_their_bits_allow(size: float, at: float, tmp_path: Path) -> None:
     """Finer than the thinnest Gaussians, unless they lie too far away for 24 bits."""
     some = scattered(30)
@@ -169,7 +147,7 @@ def test_places_in_spz_are_as_fine_as_their_bits_allow(size: float, at: float, t
 def test_spz_refuses_what_lies_beyond_its_places(tmp_path: Path) -> None:
     far = scattered(3)
     far = replace(far, means=far.means + np.float32(2e7))
-    with pytest.raises(BadInput, match=r"Write \.ply or \.glb"):
+    with pytest.raises(BadInput, match=r"\.ply or \.glb"):
         SPLAT_EXPORTERS[".spz"](far, tmp_path / "a.spz", Z_UP)
     assert not list(tmp_path.iterdir())
 
@@ -267,15 +245,3 @@ def test_splat_transform_reads_what_was_written(extension: str, to: str, tmp_pat
         expected = some if extension == ".ply" else read_spz(tmp_path / "a.spz")[1]
     assert max(differs_by(found, expected)) < 2e-3
     np.testing.assert_allclose(np.abs((found.rotations.astype(float) * expected.rotations).sum(axis=1)), 1, atol=1e-5)
-
-
-@pytest.mark.skipif(NODE is None, reason="needs node and the package gltf-validator")
-def test_the_khronos_validator_finds_nothing_but_names_that_it_does_not_know_yet(tmp_path: Path) -> None:
-    SPLAT_EXPORTERS[".glb"](scattered(), tmp_path / "a.glb", Y_DOWN)
-    done = subprocess.run([str(NODE), "-e", VALIDATE, str(tmp_path / "a.glb")], capture_output=True, text=True, check=False)
-    if "Cannot find module" in done.stderr:
-        pytest.skip("needs the package gltf-validator: npm install gltf-validator, and NODE_PATH")
-    names = "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
-    for issue in json.loads(done.stdout):
-        unknown = issue["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and issue["pointer"].startswith(names)
-        assert unknown or issue["code"] == "UNSUPPORTED_EXTENSION", issue

@@ -13,7 +13,7 @@ from efficientnerf.geometry.cameras import Camera, rotated_clockwise
 from stages.formats import importers
 from stages.formats.importers import colmap_model
 from tests.stages import captures
-from tests.stages.captures import FOCAL, HEIGHT, SHARED, WIDTH, Settings, assert_same_rays
+from tests.stages.captures import FOCAL, HEIGHT, WIDTH, Settings, assert_same_rays
 
 
 def turned(folder: Path, names: list[str], orientations: list[int], width: int = WIDTH, height: int = HEIGHT) -> None:
@@ -103,12 +103,6 @@ def test_llff_is_read_where_all_look_one_way_or_the_model_is_of_other_images(tmp
     folder = both(tmp_path / "damaged", captures.cameras())
     (folder / "sparse/0/images.bin").write_bytes((folder / "sparse/0/images.bin").read_bytes()[:-1])
     assert importers.detect(folder) == "llff"
-
-
-def test_fern_stays_llff() -> None:
-    if not (SHARED / "fern_8").is_dir():
-        pytest.skip(f"{SHARED / 'fern_8'} is not there")
-    assert importers.detect(SHARED / "fern_8") == "llff"
 
 
 # --- lenses of COLMAP

@@ -102,7 +102,7 @@ def tree(voxel: float = 0.25, low: float = -1.0, shape: tuple[int, int, int] = (
     return tree_from_voxels(shape, voxel, np.full(3, low), at, density, rng.normal(0, 3, (len(at), 4, 3)).astype(np.float32))
 
 
-def test_density_and_colour_lie_where_the_asset_has_them_in_the_capture_s_units() -> None:
+def test_density_and_colour_lie_where_the_asset_has_them() -> None:
     """What light loses along a way is the same in either frame; of harmonics of degree 0 alone colours are as they are, in linear light."""
     from efficientnerf.asset.queries import colour_at, density_at
 
@@ -161,9 +161,9 @@ def test_cascades_are_grids_of_their_own_that_do_not_overlap() -> None:
 
 def test_what_makes_no_volume_is_refused(tmp_path: Path) -> None:
     forward_facing = replace(tree(), ndc=Ndc(np.eye(4), 50.0, 60, 40, 1.0))
-    with pytest.raises(UsageError, match="points or a mesh"):
+    with pytest.raises(UsageError):
         VOLUME_EXPORTERS[".vdb"](forward_facing, tmp_path / "a.vdb", Z_UP)
-    with pytest.raises(BadInput, match="holds no density"):
+    with pytest.raises(BadInput, match="density"):
         VOLUME_EXPORTERS[".vdb"](tree().with_values(np.zeros(len(tree().density_values)), tree().sh), tmp_path / "a.vdb", Z_UP)
     endless = tree().with_values(np.full(len(tree().density_values), 3e38), tree().sh)
     with pytest.raises(BadInput, match="not finite"):

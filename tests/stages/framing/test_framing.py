@@ -12,7 +12,7 @@ from PIL import Image
 from efficientnerf.geometry.cameras import Camera, Similarity, project, rays
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
-from stages.framing.training_frame import TrainingFrame, estimated_up, find_training_frame, mean_azimuth, rotation_to_z
+from stages.framing.training_frame import TrainingFrame, estimated_up, find_training_frame, rotation_to_z
 from stages.io.capture import Capture, Photo, SparsePoints
 from tests.stages.forward_facing import looking, some_rotation
 
@@ -71,8 +71,7 @@ def check_laws(capture: Capture, framed: TrainingFrame) -> None:
 # -------------------------------------------------------------------------------------------------------------------- up
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("arc", [360.0, 150.0, 40.0])
+@pytest.mark.parametrize(("seed", "arc"), [(0, 360.0), (1, 150.0), (2, 40.0), (3, 40.0)])
 def test_up_is_found_from_level_cameras(seed: int, arc: float) -> None:
     cameras = ring(24, 2.0, 1.0, np.zeros(3), arc=arc, roll=0.01)
     rotation = some_rotation(seed)
@@ -81,18 +80,7 @@ def test_up_is_found_from_level_cameras(seed: int, arc: float) -> None:
     assert np.degrees(np.arccos(found @ rotation[:, 2])) < (1.0 if arc > 100 else 10.0)
 
 
-def test_up_ignores_a_few_tilted_photographs() -> None:
-    cameras = ring(24, 2.0, 1.0, np.zeros(3))
-    cameras[::8] = [looking(camera.centre, np.zeros(3), roll=1.2) for camera in cameras[::8]]
-    assert estimated_up(cameras)[2] > np.cos(np.radians(1.5))
-
-
-def test_parallel_cameras_hold_up_to_the_top_of_the_image() -> None:
-    cameras = [looking(np.array([x, -4.0, z]), np.array([x, 0.0, z])) for x in (-0.3, 0, 0.3) for z in (0, 0.3)]
-    np.testing.assert_allclose(estimated_up(cameras), [0, 0, 1], atol=1e-9)
-
-
-@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, 1, 0], [-1, 0, 0], [0.6, 0.0, -0.8], [0.1, -0.9, 0.2]])
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0.1, -0.9, 0.2]])
 def test_rotation_to_z(up: list[float]) -> None:
     unit = np.array(up) / np.linalg.norm(up)
     rotation = rotation_to_z(unit)
@@ -115,8 +103,7 @@ def test_stated_up_keeps_the_axes() -> None:
 # ------------------------------------------------------------------------------------------------------------------- box
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("arc", [360.0, 170.0])
+@pytest.mark.parametrize(("seed", "arc"), [(0, 360.0), (1, 170.0), (2, 360.0)])
 def test_box_holds_the_subject_and_not_the_room(seed: int, arc: float) -> None:
     subject, wall = scene_points(seed)
     cameras = ring(30, 1.6, 0.8, np.array([0, 0, 0.2]), arc=arc)
@@ -132,14 +119,6 @@ def test_box_holds_the_subject_and_not_the_room(seed: int, arc: float) -> None:
     assert framed.orbit.elevation == pytest.approx(26, abs=8)
     upward = framed.world_from_capture.rotation @ moved.rotation[:, 2]
     assert upward[2] > np.cos(np.radians(2.0))
-
-
-def test_a_few_stray_points_change_little() -> None:
-    subject, _ = scene_points()
-    cameras = ring(30, 1.6, 0.8, np.array([0, 0, 0.2]))
-    stray = np.array([[0.0, 0.0, 0.8], [0.5, 0.5, -0.5], [-0.6, 0.1, 0.2]])
-    clean, dirty = (find_training_frame(capture_of(cameras, xyz)) for xyz in (subject, np.concatenate([subject, stray])))
-    assert dirty.world_from_capture.scale == pytest.approx(clean.world_from_capture.scale, rel=0.05)
 
 
 def test_forward_facing_capture_turns_its_cameras_to_the_front() -> None:
@@ -253,8 +232,10 @@ def shares_outside(pictures: list[np.ndarray], cameras: list[Camera], low: np.nd
     return scene_bounds.shares_outside(pictures, scene_bounds.silhouettes_outside(pictures, cameras, low, high))
 
 
-@pytest.mark.parametrize(("far", "close", "arc"), [(0.3, 1.3, 360), (0.3, 1.6, 360), (1.0, 1.0, 360), (0.6, 1.3, 360), (0.6, 1.3, 150), (1.0, 1.0, 150)])
-@pytest.mark.parametrize("kind", ["ears", "horns"])
+@pytest.mark.parametrize(
+    ("kind", "far", "close", "arc"),
+    [("ears", 0.3, 1.3, 360), ("horns", 0.3, 1.6, 360), ("horns", 1.0, 1.0, 360), ("ears", 0.6, 1.3, 150)],
+)
 def test_what_three_photographs_show_is_in_the_box_of_silhouettes(kind: str, far: float, close: float, arc: float) -> None:
     cameras = near_and_far(4, far, close, arc)
     pictures = [outlines(kind, camera) for camera in cameras]
@@ -273,43 +254,10 @@ def test_what_three_photographs_show_is_in_the_box_of_silhouettes(kind: str, far
         assert (high - low).prod() <= 4 * np.ptp(surface[shown], axis=0).prod()
 
 
-def test_one_damaged_silhouette_widens_no_box() -> None:
-    cameras = near_and_far(4, 1.0, 1.0, 360)
-    pictures = [outlines("ears", camera) for camera in cameras]
-    clean = scene_bounds.whole_visual_hull(pictures, cameras, [(None, None)] * len(cameras), np.zeros(3), True)
-    pictures[5][:20, :20] = True
-    dirty = scene_bounds.whole_visual_hull(pictures, cameras, [(None, None)] * len(cameras), np.zeros(3), True)
-    assert clean is not None
-    assert dirty is not None
-    low, high = scene_bounds.box_round(*dirty)
-    np.testing.assert_array_equal(np.stack([low, high]), np.stack(scene_bounds.box_round(*clean)))
-    outside = shares_outside(pictures, cameras, low, high)
-    assert np.flatnonzero(outside > scene_bounds.MAX_OUTSIDE).tolist() == [5]
-
-
-def test_heading() -> None:
-    angles = np.radians([170, 180, -170, -160])
-    heading, one_side = mean_azimuth(np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1))
-    assert abs(heading) == pytest.approx(175)
-    assert one_side
-    around = np.radians(np.arange(10, 370, 30))
-    heading, one_side = mean_azimuth(np.stack([np.cos(around), np.sin(around), 0 * around], -1))
-    assert heading == pytest.approx(10)
-    assert not one_side
-
-
 def test_one_camera_and_cameras_in_one_place_are_framed() -> None:
     one = looking(np.array([0.0, -2.0, 1.0]), np.zeros(3))
     for cameras in ([one], [one, one, one]):
         capture = capture_of(cameras)
-        check_laws(capture, find_training_frame(capture))
-
-
-def test_cameras_that_look_outwards_are_framed() -> None:
-    cameras = [looking(np.array([0.1 * np.cos(a), 0.1 * np.sin(a), 0.0]), np.array([np.cos(a), np.sin(a), 0.0])) for a in np.arange(0, 6.2, 0.3)]
-    room = np.random.default_rng(0).uniform([-3, -3, -1], [3, 3, 1], (800, 3))
-    for xyz in (None, room):
-        capture = capture_of(cameras, xyz)
         check_laws(capture, find_training_frame(capture))
 
 
@@ -320,7 +268,7 @@ DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 def real(name: str, form: str) -> Capture:
     from stages.formats.importers import IMPORTERS
-    from stages.poses.run import PosesSettings
+    from stages.poses.settings import PosesSettings
 
     if not (DATA / name).is_dir():
         pytest.skip(f"shared/data/{name} is not there")
@@ -347,17 +295,3 @@ def test_chair_lies_in_its_box() -> None:
         origins, directions = rays(framed.world_from_capture.camera(photo.camera))
         opaque = alpha.ravel() > 127
         assert entry(origins, directions, framed.bounds)[opaque].all()
-
-
-def test_fern_and_door_are_framed() -> None:
-    fern = real("fern_8", "llff")
-    framed = find_training_frame(fern)
-    check_laws(fern, framed)
-    assert framed.orbit.forward_facing
-    door = real("lund_door_colmap", "colmap")
-    framed = find_training_frame(door)
-    check_laws(door, framed)
-    assert framed.facts["bounds_from"] == "sparse points"
-    assert door.points is not None
-    inside = np.abs(framed.world_from_capture.points(door.points.xyz)) <= framed.bounds[1]
-    assert inside.all(1).mean() > 0.9

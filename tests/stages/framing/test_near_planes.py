@@ -69,7 +69,6 @@ def masked_share_of_subject(capture: Capture, scale: float, framed: TrainingFram
     """The share of points in the subject that lie in density voxels which are masked before the near planes."""
     world = framed.world_from_capture
     cameras = [world.camera(photo.camera) for photo in capture.photos]
-    assert capture.points is not None
     filled = world.points(capture.points.xyz[reliable_points(capture.points, len(cameras))])
     space = ContractedSpace(framed.bounds)
     cells = cells_before_near(space, cameras, framed.near_far_planes[:, 0].tolist(), SIDE, filled)
@@ -101,7 +100,6 @@ def test_points_that_others_observe_count_as_much_as_a_photographs_own() -> None
 
 def test_outliers_near_a_camera_do_not_pull_its_near_plane() -> None:
     capture = room_capture(0, on_subject=200)
-    assert capture.points is not None
     camera = capture.photos[0].camera
     stray = camera.centre + camera.forward * 0.05 + np.random.default_rng(0).normal(0, 0.001, (4, 3))
     points = SparsePoints(
@@ -112,7 +110,7 @@ def test_outliers_near_a_camera_do_not_pull_its_near_plane() -> None:
     assert dirty == pytest.approx(clean, rel=0.25)
 
 
-def test_cameras_that_look_at_a_subject_never_begin_behind_its_middle_even_without_points() -> None:
+def test_near_planes_never_begin_behind_the_subjects_middle() -> None:
     capture = replace(room_capture(0), points=None)
     framed = find_training_frame(capture)
     placed = [framed.world_from_capture.camera(photo.camera) for photo in capture.photos]

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from efficientnerf.asset import format
-from efficientnerf.asset.cascades import cascades_of, voxel_cascades
-from efficientnerf.asset.tree import voxel_coordinates
+from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates
 from efficientnerf.geometry.cameras import Camera, project, rays
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
@@ -19,9 +18,7 @@ from efficientnerf.training.pixels import Pixels
 from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.framing.view_coverage import (
-    CLEARANCE,
     before_near,
-    bit_reversed_order,
     cells_before_near,
     cells_below_min_views,
     cells_without_view,
@@ -30,7 +27,6 @@ from stages.framing.view_coverage import (
     kept_pixels,
     poorly_seen,
     shows,
-    shrunk,
 )
 from stages.io.field_file import load_renderer, space_of
 from stages.io.png import write_png
@@ -93,9 +89,8 @@ def aimed(at: np.ndarray, count: int) -> list[Camera]:
     return out
 
 
-@pytest.mark.parametrize("side", [24, 17])
-@pytest.mark.parametrize("min_views", [2, 3])
-def test_it_is_the_voxels_in_or_before_the_box_that_few_cameras_project_into_their_pictures(side: int, min_views: int) -> None:
+@pytest.mark.parametrize(("side", "min_views"), [(24, 2), (17, 3)])
+def test_closed_voxels_are_those_that_few_cameras_see(side: int, min_views: int) -> None:
     cameras = [narrow(camera, 1.8) for camera in balls.cameras(12)]
     world, box = centres(side)
     inside = box | between(world, cameras)
@@ -111,8 +106,8 @@ def test_it_is_the_voxels_in_or_before_the_box_that_few_cameras_project_into_the
     np.testing.assert_array_equal(cells_below_min_views(SPACE, cameras, min_views, side), expected)
 
 
-@pytest.mark.parametrize(("watching", "min_views", "closed"), [(0, 2, True), (1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
-def test_a_place_that_enough_cameras_see_is_open_and_one_that_fewer_see_is_not(watching: int, min_views: int, closed: bool) -> None:
+@pytest.mark.parametrize(("watching", "min_views", "closed"), [(1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
+def test_a_place_is_open_where_enough_cameras_see_it(watching: int, min_views: int, closed: bool) -> None:
     """Twelve cameras look at the middle; a place beside it is seen by those alone that look there."""
     beside = np.array([0.85, 0.8, 1.05])
     cameras = [*aimed(np.zeros(3), 12), *aimed(beside, watching)]
@@ -135,7 +130,7 @@ def looking_along_y(z: float, *, x: float = 0.0, away: float = 4.0, back: bool =
     return replace(narrow(balls.cameras(1)[0], 2), world_from_camera=placed)
 
 
-def test_what_stands_before_the_box_for_a_camera_that_just_misses_it_is_poorly_seen_and_a_wall_beside_the_subject_is_not() -> None:
+def test_what_cameras_just_miss_before_the_box_is_poorly_seen() -> None:
     """Eight cameras look at the box from one side; a picture's half is 0.19 of the depth."""
     one_side = [looking_along_y(0.01 * n) for n in range(8)]
     places = {
@@ -154,25 +149,6 @@ def test_what_stands_before_the_box_for_a_camera_that_just_misses_it_is_poorly_s
     assert among([*one_side, looking_along_y(0.0, x=0.45, back=True)]) >= among(one_side)  # something behind it, which could as well be farther away
     assert "before the box" not in among([*one_side, looking_along_y(0.0, x=0.45, back=True), looking_along_y(0.0, x=0.5, back=True)])
     assert not among(one_side[:4])  # of four cameras one is enough
-
-
-@pytest.mark.parametrize(("count", "needed"), [(1, 1), (4, 1), (5, 2), (8, 2), (9, 3), (40, 3)])
-def test_no_more_are_asked_for_than_a_quarter_of_the_cameras(count: int, needed: int) -> None:
-    """All look at the middle, and `needed` or one less of them at a place beside it."""
-    beside = np.array([0.85, 0.8, 1.05])
-    world, inside = centres()
-    lump = tuple(np.argwhere(inside)[np.argmin(np.linalg.norm(world[inside] - beside, axis=-1))])
-    for watching in (needed - 1, needed):
-        cameras = [*aimed(np.zeros(3), count - watching), *aimed(beside, watching)]
-        assert cells_below_min_views(SPACE, cameras, 3, SIDE)[lump] == (1 < needed > watching)
-    assert not cells_below_min_views(SPACE, cameras, 0, SIDE).any()
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
-def test_cameras_are_asked_once_each_far_ones_first(count: int) -> None:
-    order = bit_reversed_order(count)
-    assert sorted(order) == list(range(count))
-    assert count < 3 or abs(order[1] - order[0]) >= count // 2
 
 
 def narrow_scene(folder: Path) -> Scene:
@@ -221,15 +197,6 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, min
     assert few.any() == (min_views == 0)
 
 
-def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_the_box(tmp_path: Path) -> None:
-    narrow_scene(tmp_path / "poses")
-    anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, min_views="off"), poses=tmp_path / "poses")
-    bounded = job(tmp_path / "bounded", balls.settings(iterations=2), poses=poses(tmp_path / "cut", count=10))
-    for made in (anywhere, bounded):
-        train.run(made)
-        assert not torch.isneginf(load_renderer(made.out).model.voxels.values).any()
-
-
 def test_a_view_counts_only_where_its_mask_keeps_the_pixel() -> None:
     cameras = balls.cameras(8)
     points = np.random.default_rng(3).uniform(-0.6, 0.6, (400, 3))
@@ -246,16 +213,6 @@ def test_a_view_counts_only_where_its_mask_keeps_the_pixel() -> None:
     everything = [np.ones((3, 4), bool) for _ in cameras]
     np.testing.assert_array_equal(has_min_views(points, cameras, 2, everything), has_min_views(points, cameras, 2))
     assert not has_min_views(points, cameras, 2, [~mask for mask in everything]).any()
-
-
-def test_small_masks_keep_what_any_pixel_keeps() -> None:
-    mask = np.zeros((30, 47), bool)
-    mask[29, 46] = mask[11, 5] = True
-    small = shrunk(mask, 16)
-    assert small.shape == (11, 16)
-    assert small.sum() == 2
-    assert small[-1, -1]
-    np.testing.assert_array_equal(shrunk(mask, 47), mask)
 
 
 def leaving_out(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
@@ -308,7 +265,7 @@ def test_training_learns_nothing_behind_ignored_pixels(tmp_path: Path) -> None:
     assert expected[(distance > 0.9) & (distance < 0.98)].mean() < 0.3
 
 
-@pytest.mark.parametrize("count", [1, 2, 9])
+@pytest.mark.parametrize("count", [1, 9])
 def test_space_that_cameras_look_through_is_masked_and_no_other(count: int) -> None:
     cameras = balls.cameras(count)
     near = [0.3 * float(np.linalg.norm(camera.centre)) for camera in cameras]
@@ -325,14 +282,3 @@ def test_space_that_cameras_look_through_is_masked_and_no_other(count: int) -> N
         assert masked[tuple((at * side).astype(int))]
         beyond = SPACE.grid(torch.from_numpy(camera.centre + 1.6 * plane * camera.forward)).numpy()
         assert not masked[tuple((beyond * side).astype(int))]
-
-
-def test_the_path_leads_to_neighbours_alone_that_are_close() -> None:
-    first, last = aimed(np.zeros(3), 2)
-    far = float(np.linalg.norm(first.centre - last.centre))
-    middle = (first.centre + last.centre)[None] / 2
-    assert close_to_path(middle, [first, last], [0.6 * far, 0.6 * far])[0]
-    assert not close_to_path(middle, [first, last], [0.3 * far, 0.3 * far])[0]
-    beside = first.centre[None] + np.array([[0.0, 0.0, 1.01 * CLEARANCE * 0.3 * far]])
-    assert not close_to_path(beside, [first], [0.3 * far])[0]
-    assert close_to_path(first.centre[None], [first], [0.3 * far])[0]

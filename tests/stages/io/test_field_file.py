@@ -12,13 +12,11 @@ import torch
 
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import state_of
-from efficientnerf.training.exposure.model import exposure_of
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact
 from stages.artifacts import TrainOutputs
-from stages.io.field_file import EXPOSURE, load_exposure, load_renderer, read_tensors, save_model, write_tensors
-from stages.renamed_settings import RENAMED
-from tests.efficientnerf.balls import cameras, pose, untrained
+from stages.io.field_file import load_renderer, read_tensors, save_model, write_tensors
+from tests.efficientnerf.balls import pose, untrained
 
 CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3))
 
@@ -64,21 +62,6 @@ def test_damage_is_told(tmp_path: Path) -> None:
         load_renderer(tmp_path)
 
 
-def test_files_that_are_something_else_are_told(tmp_path: Path) -> None:
-    from safetensors.torch import save_file
-
-    path = tmp_path / TrainOutputs.field
-    save_file({"a": torch.zeros(1)}, str(path))
-    with pytest.raises(CorruptArtifact, match="field file of format None; this build reads 1"):
-        read_tensors(path)
-    write_tensors({"a": torch.zeros(1)}, {"format": 2}, path)
-    with pytest.raises(CorruptArtifact, match="field file of format 2; this build reads 1"):
-        read_tensors(path)
-    write_tensors({"a": torch.zeros(1)}, {}, path)
-    with pytest.raises(CorruptArtifact, match=r"missing required field `settings`\. Train again"):
-        load_renderer(tmp_path)
-
-
 def test_tensors_that_do_not_fit_are_named(tmp_path: Path) -> None:
     path = tmp_path / TrainOutputs.field
     save_model(untrained(), 0.5, 20.0, path)
@@ -89,44 +72,6 @@ def test_tensors_that_do_not_fit_are_named(tmp_path: Path) -> None:
     write_tensors(tensors, {**about, "settings": {"iterations": "many"}}, path)
     with pytest.raises(CorruptArtifact, match="iterations"):
         load_renderer(tmp_path)
-
-
-def test_exposures_lie_beside_the_field(tmp_path: Path) -> None:
-    m = untrained(contracted=True)
-    given = exposure_of(cameras(2), np.array([[0.1, 0.0, -0.1], [-0.1, 0.0, 0.1]]), np.array([[-0.3, 0.1]])).detached
-    save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field, (["images/b.png", "images/a.png"], given))
-    found = load_exposure(tmp_path)
-    assert found is not None
-    assert found[0] == ["images/b.png", "images/a.png"]
-    for name in ("photographs", "cameras", "camera_of"):
-        np.testing.assert_array_equal(getattr(found[1], name), getattr(given, name))
-    assert load_renderer(tmp_path).model.background is None
-    tensors, about = read_tensors(tmp_path / TrainOutputs.field)
-    for spoilt in (
-        *({other: t for other, t in tensors.items() if other != name} for name in EXPOSURE),
-        tensors | {EXPOSURE[0]: tensors[EXPOSURE[0]][:1]},
-        tensors | {EXPOSURE[0]: tensors[EXPOSURE[0]] * np.nan},
-        tensors | {EXPOSURE[1]: tensors[EXPOSURE[1]][:0]},
-        tensors | {EXPOSURE[2]: tensors[EXPOSURE[2]] + 1},
-        tensors | {EXPOSURE[2]: tensors[EXPOSURE[2]] - 1},
-    ):
-        write_tensors(spoilt, about, tmp_path / TrainOutputs.field)
-        with pytest.raises(CorruptArtifact, match="Train again"):
-            load_exposure(tmp_path)
-    save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field)
-    assert load_exposure(tmp_path) is None
-
-
-def test_a_field_of_before_release_0_1_is_read(tmp_path: Path) -> None:
-    m = untrained(finest_resolution="auto")
-    save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field)
-    tensors, about = read_tensors(tmp_path / TrainOutputs.field)
-    old = {new: old for old, new in RENAMED["train"].items()}
-    chosen = {"time_budget": 0.0, "discretise": 0, "finest_resolution": 0, "distortion_loss_weight": None, "far_plane": 0.0}  # auto and off, as it was
-    settings = {old.get(name, name): chosen.get(name, value) for name, value in about["settings"].items()}
-    assert {"hidden", "log2_table", "warm_up"} <= settings.keys()
-    write_tensors(tensors, {**{k: v for k, v in about.items() if k != "sha256"}, "settings": settings}, tmp_path / TrainOutputs.field)
-    assert load_renderer(tmp_path).model.settings == m.settings
 
 
 def with_metadata(path: Path, text: str) -> None:
@@ -169,7 +114,7 @@ def test_a_small_file_takes_no_memory_for_the_tables_that_it_states(tmp_path: Pa
     def refuse(*_: Any) -> None:
         raise AssertionError("a model of three gigabytes was made")
 
-    monkeypatch.setattr("efficientnerf.model.model", refuse)
+    monkeypatch.setattr("stages.io.field_file.model", refuse)
     stated = dataclasses.asdict(TrainSettings(field="hash", num_levels=24, log2_hashmap_size=24, finest_resolution=8192))
     about = {"settings": stated, "bounds": [[-1, -1, -1], [1, 1, 1]], "contracted": False, "near": 1.0, "far": 5.0, "background": None}
     side = stated["occupancy_resolution"] if isinstance(stated["occupancy_resolution"], int) else 128

@@ -32,7 +32,7 @@ def test_an_edge_keeps_nothing_of_the_background(behind: tuple[int, int, int]) -
     np.testing.assert_array_equal(found[cover == 255], photograph[cover == 255])
 
 
-def test_a_mask_that_is_too_small_or_too_large_gives_no_colours_that_are_nowhere() -> None:
+def test_masks_too_small_or_too_large_give_no_foreign_colours() -> None:
     front, behind = np.array([180.0, 60.0, 40.0]), np.array([20.0, 200.0, 90.0])
     for radius in (12.0, 16.0):
         cover = disc(radius=radius)
@@ -48,11 +48,3 @@ def test_what_has_no_soft_edge_or_no_surroundings_stays() -> None:
     np.testing.assert_array_equal(without_background(photograph, hard), photograph)
     veil = np.full((20, 30), 200, np.uint8)
     np.testing.assert_array_equal(without_background(photograph, veil), photograph)
-
-
-def test_a_wire_thinner_than_a_pixel_takes_colours_of_its_kind() -> None:
-    """No pixel shows it alone: the solution is the colour that explains the pixel."""
-    cover = np.zeros((20, 30), np.uint8)
-    cover[10] = 128
-    photograph = seen(cover, np.array([200.0, 180.0, 20.0]), np.array([90.0, 90.0, 90.0]))
-    assert abs(without_background(photograph, cover)[10].astype(float) - (200, 180, 20)).max() <= 3

@@ -28,22 +28,6 @@ def test_exif_orientation_is_undone(tmp_path: Path, orientation: int) -> None:
     np.testing.assert_array_equal(photo.rgb, seen)
 
 
-def test_focal_length_from_exif() -> None:
-    assert reading.focal_from_exif({41989: 50}, 3600, 2400) == pytest.approx(5000)
-    # 36 mm sensor, 3600 px across, 50 mm lens, the image scaled to a half since
-    assert reading.focal_from_exif({37386: 50.0, 41486: 100.0, 41488: 4, 40962: 3600}, 1800, 1200) == pytest.approx(2500)
-    assert reading.focal_from_exif({37386: 50.0, 41486: 1.0, 41488: 4}, 1800, 1200) is None  # a density that cannot be
-    assert reading.focal_from_exif({}, 1800, 1200) is None
-
-
-@pytest.mark.parametrize("size", [(4000, 3000), (4032, 3024), (3001, 1999), (1999, 3001), (5184, 3456), (1601, 37)])
-def test_working_size_keeps_the_aspect(size: tuple[int, int]) -> None:
-    w, h = reading.working_size(*size, 1600)
-    assert 1560 <= max(w, h) <= 1600
-    assert abs(w / h * size[1] / size[0] - 1) < (0.02 if min(size) < 100 else 2e-4)
-    assert reading.working_size(*size, 5184) == size
-
-
 def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
     Image.fromarray(np.full((8, 8), 65535 // 2, np.uint16)).save(tmp_path / "deep.png")
     assert abs(int(reading.read_photo(tmp_path / "deep.png", 100).rgb[0, 0, 0]) - 127) <= 1
@@ -51,7 +35,6 @@ def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
     rgba[:, :4, 3] = 0
     Image.fromarray(rgba).save(tmp_path / "alpha.png")
     opaque = reading.read_photo(tmp_path / "alpha.png", 100).opaque
-    assert opaque is not None
     assert opaque[:, 4:].all()
     assert not opaque[:, :4].any()
 

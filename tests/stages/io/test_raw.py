@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from stages.formats.importers.photographs import photographs
-from stages.formats.importers.source import Source
 from stages.io import photo, pictures, working_images
 from stages.io.pictures import UnreadableImage
-from tests.stages import captures
 
 WIDTH, HEIGHT = 96, 64
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
@@ -101,13 +97,6 @@ def test_pictures_of_a_set_are_developed_alike(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[0], found[1], atol=1)
 
 
-def test_without_rawpy_it_is_said_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rawpy", None)
-    path = dng(tmp_path / "a.dng", quarters())
-    with pytest.raises(UnreadableImage, match=r"pip install 'efficientnerf\[raw\]'"):
-        pictures.read_header(path)
-
-
 @pytest.mark.parametrize("cut", [0, 10, 1000, 12_000, 12_400])
 def test_a_raw_picture_that_is_cut_short_is_unreadable(cut: int, tmp_path: Path) -> None:
     pytest.importorskip("rawpy")
@@ -115,14 +104,6 @@ def test_a_raw_picture_that_is_cut_short_is_unreadable(cut: int, tmp_path: Path)
     path.write_bytes(dng(path, quarters()).read_bytes()[:cut])
     with pytest.raises(UnreadableImage, match="unreadable"):
         photo.read_photo(path, 1000)
-
-
-def test_the_raw_picture_of_a_jpeg_is_left_aside(tmp_path: Path) -> None:
-    for name in ("a.png", "b.png"):
-        captures.write_picture(tmp_path / name, captures.picture())
-    for name in ("a.dng", "b.CR2", "c.dng"):
-        (tmp_path / name).write_bytes(b"")
-    assert [path.name for path in photographs(Source(tmp_path))] == ["a.png", "b.png", "c.dng"]
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])

@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region
+from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import Foreground
 from efficientnerf.geometry.cameras import Camera, rays
-from pipeline.errors import BadInput, UsageError
+from pipeline.errors import BadInput
 from pipeline.stage import Job
-from stages.framing import mask_use
 from stages.io import scene
 from stages.masking import foreground
 from stages.masking.foreground import cleaned
 from stages.masking.subject import Subject, may_show, subject_of
 from stages.poses import run as poses
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 
 RADIUS = 0.6
@@ -50,12 +49,6 @@ def test_a_subject_is_cut_off_close_to_what_supports_it() -> None:
     assert 0.004 < above < 0.02
     places = np.array([[0, 0, 0.5], [0, 0, above + 0.01], [0, 0, 0.0], [1.5, 0, 0.5], [0.56, 0, 0.4], [0.7, 0, 0.04], [0.7, 0, 0.0]])
     assert found.holds(places).tolist() == [True, True, False, False, True, True, False]
-
-
-def test_a_support_that_few_points_show_stays_as_it_was_found() -> None:
-    grid = np.random.default_rng(0).uniform(0.05, 0.5, (50, 3))
-    found = subject_of(Foreground(Region(np.array([[0.0] * 3, [1.0] * 3])), 0.1, grid, FLOOR), np.full((10, 3), np.inf))
-    assert found.planes == ((FLOOR[0], 0.05),)
 
 
 def test_rays_that_cannot_show_the_subject_are_left_out() -> None:
@@ -163,7 +156,7 @@ def test_masks_are_made_once_and_the_same_bytes_come_of_them_again(source: Path,
 def test_a_photograph_whose_silhouette_does_not_fit_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = captures.cameras(12)
     seen(monkeypatch, ball_pictures(made))
-    monkeypatch.setattr(mask_use, "hull_overlaps", lambda capture, pictures: np.array([0.95] * 5 + [0.6] + [0.95] * 6))
+    monkeypatch.setattr("stages.masking.foreground.hull_overlaps", lambda capture, pictures: np.array([0.95] * 5 + [0.6] + [0.95] * 6))
     events: list[dict[str, Any]] = []
     job = Job(
         settings=PosesSettings(mask_from="foreground"), out=tmp_path / "poses", work=tmp_path / "work", source=captures.nerfstudio(tmp_path / "source", made),
@@ -192,14 +185,3 @@ def test_silhouettes_of_no_compact_thing_are_refused(change: Any, why: str, tmp_
         poses.run(job_of(captures.nerfstudio(tmp_path / "source", made), tmp_path))
     assert error.value.exit_code == 2
     assert not (tmp_path / "poses/scene.json").exists()
-
-
-def test_other_masks_and_alpha_channels_are_not_written_over(source: Path, tmp_path: Path) -> None:
-    captures.write_picture(source / "images/masks/img_0.png", np.zeros((captures.HEIGHT, captures.WIDTH), np.uint8))
-    document = json.loads((source / "transforms.json").read_text())
-    document["frames"][0]["mask_path"] = "images/masks/img_0.png"
-    (source / "transforms.json").write_text(json.dumps(document))
-    with pytest.raises(UsageError, match=r"1 of 8 photographs have a mask or an alpha channel already: .*img_0\.png\. Leave --mask away"):
-        poses.run(job_of(source, tmp_path))
-    with pytest.raises(UsageError, match="--mask foreground and --mask-model"):
-        poses.run(job_of(source, tmp_path, mask_model="/net.onnx"))

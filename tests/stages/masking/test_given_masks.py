@@ -19,7 +19,7 @@ from stages.io.capture import Capture, Photo
 from stages.io.photo import read_mask_file, read_photo
 from stages.masking import photographs
 from stages.masking.polarity import kept_white
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from tests.stages import captures
 
 W, H = 96, 72
@@ -63,14 +63,6 @@ def test_masks_are_found_by_the_names_that_other_programs_give_them(tmp_path: Pa
     with open(tmp_path / place / name, "wb") as file:
         Image.fromarray(np.full((H, W), 255, np.uint8)).save(file, "PNG")
     assert masks_of(Source(tmp_path), sorted((tmp_path / "images").glob("*.jpg"))) == {image: tmp_path / place / name}
-
-
-def test_the_alpha_channel_of_a_mask_counts_where_it_leaves_anything_out(tmp_path: Path) -> None:
-    photo = read_photo(captures.write_picture(tmp_path / "a.png", captures.picture(0, W, H)), 100)
-    alpha = drawn(0, captures.cameras()[0])
-    for name, rgb, level, expected in (("soft", 0, alpha, alpha > 0), ("opaque", 255, np.full_like(alpha, 255), np.ones_like(alpha, bool))):
-        path = captures.write_picture(tmp_path / f"{name}.png", np.dstack([np.full((H, W, 3), rgb, np.uint8), level]))
-        np.testing.assert_array_equal(read_mask_file(path, photo), expected)
 
 
 @pytest.mark.parametrize("black", [False, True])

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BadInput, UsageError
-from pipeline.stage import Job
 from stages.io.png import read_png, write_png
 from stages.masking.made import masks_by_network
-from stages.masking.photographs import mask_choice, masks_made_for
-from stages.poses.run import STAGE, PosesSettings
+from stages.masking.photographs import mask_choice
+from stages.poses.settings import PosesSettings
 
 onnx = pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
@@ -49,15 +48,10 @@ def scene() -> np.ndarray:
 @pytest.mark.parametrize("shape", [(1, 3, SIDE, SIDE), ("batch", 3, "height", "width")])
 def test_the_subject_is_where_the_network_sees_it(tmp_path: Path, logits: bool, shape: tuple[Any, ...]) -> None:
     mask = MaskNetwork(red(tmp_path / "u2net.onnx", logits=logits, shape=shape)).mask(scene())
-    assert mask is not None
     assert mask.shape == ((SIDE, SIDE) if shape[2] == SIDE else (320, 320))
     height, width = mask.shape
     assert mask[int(50 / 96 * height), int(70 / 128 * width)] > 240
     assert mask[2, 2] < 15
-
-
-def test_nothing_is_a_subject_where_the_network_sees_none(tmp_path: Path) -> None:
-    assert MaskNetwork(red(tmp_path / "net.onnx")).mask(np.full((40, 50, 3), 90, np.uint8)) is None
 
 
 def test_pictures_are_normalised_as_rembg_does_for_each_family(tmp_path: Path) -> None:
@@ -111,14 +105,3 @@ def test_a_missing_file_or_package_is_named_with_its_remedy(tmp_path: Path, monk
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[rembg\]'"):
         MaskNetwork(red(tmp_path / "net.onnx"))
-
-
-def test_masks_are_made_in_one_way_and_the_network_counts_as_a_source(tmp_path: Path) -> None:
-    settings = PosesSettings(mask_model=str(red(tmp_path / "net.onnx")), mask_from="green")
-    job = Job(settings=settings, out=tmp_path / "out", work=tmp_path / "work", source=tmp_path)
-    with pytest.raises(UsageError, match="Give one of them"):
-        masks_made_for(job, {"a.png": tmp_path / "a.png"}, lambda *_, **__: None)
-    write_png(scene(), tmp_path / "a.png")
-    assert STAGE.source_files is not None
-    assert tmp_path / "net.onnx" in STAGE.source_files(tmp_path, settings)
-    assert tmp_path / "net.onnx" not in STAGE.source_files(tmp_path, PosesSettings())

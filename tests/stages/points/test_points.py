@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import StageFailed
 from pipeline.stage import Job
 from stages.points import run as points
-from stages.points.run import PointsSettings
-
-from .test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
+from stages.points.settings import PointsSettings
+from tests.stages.mesh.balls import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +37,6 @@ def test_the_same_seed_gives_the_same_points(bake: Path, tmp_path: Path) -> None
     a, b, c = ((tmp_path / name / "points.ply").read_bytes() for name in "abc")
     assert a == b
     assert a != c
-
-
-def test_a_threshold_out_of_reach_names_the_remedy(bake: Path, tmp_path: Path) -> None:
-    with pytest.raises(StageFailed, match=r"Lower points.density_threshold"):
-        points.run(Job(settings=PointsSettings(density_threshold=1e4), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
 
 
 def test_points_lie_on_the_foreground_unless_all_is_asked_for(bake: Path, tmp_path: Path) -> None:

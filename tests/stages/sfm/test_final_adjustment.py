@@ -49,17 +49,3 @@ def test_an_even_choice_of_points_gives_the_cameras_of_all(monkeypatch: pytest.M
     every, some = errors
     assert errors[every] < errors[some] < 3 * errors[every] < 0.003
     assert points[some] == pytest.approx(points[every], rel=0.03)
-
-
-def test_a_photograph_with_few_points_keeps_all_of_them() -> None:
-    model, _, _ = made_model()
-    for point in sorted(model.point3D_ids())[100:]:
-        model.delete_observation(1, next(e.point2D_idx for e in model.points3D[point].track.elements if e.image_id == 1))
-    some = mapping.thinned(model, model.compute_num_observations() // 4)
-    assert some.images[1].num_points3D == 100
-    assert [some.images[i].num_points3D for i in (2, 12)] == [275, 275], "a quarter of the other 700, and the hundred"
-
-
-def test_few_observations_are_all_used() -> None:
-    model, _, _ = made_model()
-    assert mapping.thinned(model, mapping.MANY_OBSERVATIONS) is None

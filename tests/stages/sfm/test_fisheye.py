@@ -58,8 +58,3 @@ def test_the_lens_is_told_by_exif_and_overruled_by_the_setting(room: tuple[Path,
         images = prepared(folder, tmp_path / lens, lens)
         assert [image.fisheye for image in images] == expected
         assert len({image.camera_key for image in images}) == len(set(expected))
-
-
-def test_another_lens_makes_the_scratch_folder_anew(room: tuple[Path, list[Camera]], tmp_path: Path) -> None:
-    for lens in ("perspective", "fisheye"):
-        assert {image.fisheye for image in prepared(room[0], tmp_path, lens)} == {lens == "fisheye"}

@@ -51,14 +51,10 @@ def test_positions_are_read_on_all_sides(tmp_path: Path, position: tuple[float, 
     np.testing.assert_allclose(found, position, atol=1e-7)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("change", [{2: None}, {6: None}, {1: "X"}, {4: (200.0, 0.0, 0.0)}, {2: (1.0,)}, {3: "N"}])
+@pytest.mark.parametrize("change", [{2: None}, {1: "X"}, {4: (200.0, 0.0, 0.0)}])
 def test_half_a_position_or_an_impossible_one_is_none(tmp_path: Path, change: dict[int, Any]) -> None:
     gps = {tag: value for tag, value in (tags(HOME) | change).items() if value is not None}
     assert read_gps_position(write(tmp_path / "a.jpg", gps)) is None
-
-
-def test_a_picture_without_exif_data_has_no_position(tmp_path: Path) -> None:
-    assert read_gps_position(write(tmp_path / "a.jpg", None)) is None
 
 
 def test_metres_are_those_of_colmap() -> None:
@@ -123,32 +119,13 @@ def test_exact_positions_give_metres_and_the_upward_axis(tmp_path: Path) -> None
     np.testing.assert_allclose(lengths(found), true, rtol=0.01, atol=0.01)
     heights = np.array([photo.camera.centre[2] for photo in found.photos])
     np.testing.assert_allclose(heights - heights.mean(), CIRCLE[:, 2] - CIRCLE[:, 2].mean(), atol=0.8)
-    assert found.points is not None
     np.testing.assert_allclose(found.points.xyz, [photo.camera.centre for photo in found.photos], atol=1e-9)  # moved together
     for photo, before in zip(found.photos, given.photos, strict=True):
         np.testing.assert_allclose(photo.camera.world_from_camera[:3, :3] @ photo.camera.world_from_camera[:3, :3].T, np.eye(3), atol=1e-9)
         assert photo.camera.params == before.camera.params
 
 
-def test_coarser_ones_give_the_scale_alone(tmp_path: Path) -> None:
-    given, files, _ = capture(tmp_path, CIRCLE, 1.6, np.random.default_rng(3))
-    found, sentence = with_gps(given, files)
-    assert (found.metric, found.up) == (True, None)
-    assert found.facts["gps"]["used"] == "scale"  # type: ignore[index]
-    true = np.linalg.norm(CIRCLE[:, None] - CIRCLE[None], axis=2)
-    ratio = lengths(found)[true > 0] / true[true > 0]
-    assert abs(ratio.mean() - 1) < 0.05
-    assert "the scale is taken" in sentence
-
-
-def test_a_straight_walk_gives_no_upward_axis(tmp_path: Path) -> None:
-    line = np.array([[3.0 * n, 1.0 * n, 2.0] for n in range(20)])
-    given, files, _ = capture(tmp_path, line, 0.05, np.random.default_rng(4))
-    found, _ = with_gps(given, files)
-    assert (found.metric, found.up) == (True, None)
-
-
-@pytest.mark.parametrize(("extent", "noise", "known"), [(0.05, 4.0, 99), (1.0, 0.1, 5), (1.0, 0.1, 11), (0.0, 0.0, 99)])
+@pytest.mark.parametrize(("extent", "noise", "known"), [(0.05, 4.0, 99), (1.0, 0.1, 11)])
 def test_positions_that_say_nothing_change_nothing(tmp_path: Path, extent: float, noise: float, known: int) -> None:
     given, files, _ = capture(tmp_path, CIRCLE, 0.0, np.random.default_rng(5), known)
     rng = np.random.default_rng(6)
@@ -176,7 +153,7 @@ def stated_for(found: Capture, centres: np.ndarray, **changes: Any) -> Capture:
     return Capture("polycam", tuple(photos), None, up=np.array([0.0, 1.0, 0.0]), metric=True, **changes)
 
 
-def test_cameras_that_were_found_come_into_the_frame_of_those_that_the_source_states(tmp_path: Path) -> None:
+def test_found_cameras_come_into_the_frame_of_stated_ones(tmp_path: Path) -> None:
     given, _, _ = capture(tmp_path, CIRCLE, 0.0, np.random.default_rng(2), 0)
     drifted = 0.1 * CIRCLE + np.random.default_rng(3).normal(0, 0.05, CIRCLE.shape)  # the phone's tracking
     drifted[5] += 3.0  # which was lost once
@@ -185,7 +162,6 @@ def test_cameras_that_were_found_come_into_the_frame_of_those_that_the_source_st
     np.testing.assert_array_equal(found.up, [0, 1, 0])
     centres = np.array([photo.camera.centre for photo in found.photos])
     np.testing.assert_allclose(centres, 0.1 * CIRCLE, atol=0.06)
-    assert found.points is not None
     np.testing.assert_allclose(found.points.xyz, centres, atol=1e-9)
     assert "24 of the 24 photographs (polycam)" in sentence
 
@@ -201,8 +177,3 @@ def test_stated_cameras_that_do_not_agree_change_nothing(tmp_path: Path, places:
     assert (found.metric, found.up, found.facts["stated_cameras"]["used"]) == (False, None, "nothing")  # type: ignore[index]
     assert why in sentence
     np.testing.assert_array_equal(lengths(found), lengths(given))
-
-
-def test_without_positions_nothing_is_said(tmp_path: Path) -> None:
-    given, files, _ = capture(tmp_path, CIRCLE, 0.0, np.random.default_rng(7), 0)
-    assert with_gps(given, files) == (given, "")

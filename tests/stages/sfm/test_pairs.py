@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.sfm import ladder, pairs
+from stages.sfm import pairs
 
 
 def views(count: int, seen: int, step: int, rng: np.random.Generator) -> list[np.ndarray]:
@@ -15,13 +15,7 @@ def views(count: int, seen: int, step: int, rng: np.random.Generator) -> list[np
     return [(things[some] + rng.normal(0, 4.0, (seen, 128))).clip(0, 255).astype(np.uint8) for some in rows]
 
 
-def test_exhaustive_pairs_are_all_pairs_once() -> None:
-    found = [pair for block in pairs.in_blocks(pairs.all_pairs(23)) for pair in block]
-    assert len(found) == len(set(found)) == 23 * 22 // 2
-    assert all(i < j for i, j in found)
-
-
-@pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
+@pytest.mark.parametrize("share", [0.01, 1.0])
 def test_blocks_hold_every_pair_once_and_stay_small(share: float) -> None:
     rng = np.random.default_rng(0)
     wanted = {pair for pair in pairs.all_pairs(60) if rng.random() < share}
@@ -39,7 +33,7 @@ def test_sequential_pairs_reach_neighbours_and_close_loops() -> None:
     assert len(found) < 400 * 20
 
 
-def test_retrieval_finds_what_shows_the_same_things_whatever_the_order_of_the_files() -> None:
+def test_retrieval_finds_what_shows_the_same_in_any_order_of_files() -> None:
     rng = np.random.default_rng(1)
     count = 90
     ring = views(count, 120, 12, rng)  # each shares things with the nine before and after it
@@ -74,23 +68,9 @@ def test_nearest_words_are_those_of_exact_arithmetic() -> None:
     assert (pairs._nearest(some, words) == distances.argmin(1)).all()
 
 
-def test_few_images_are_all_compared() -> None:
-    likeness = np.ones((6, 6))
-    assert pairs.retrieved_pairs(likeness) == pairs.all_pairs(6)
-
-
-def test_weak_images_are_compared_with_more_and_with_the_neighbours_of_their_neighbours() -> None:
+def test_weak_images_are_compared_with_neighbours_of_neighbours() -> None:
     likeness = -np.abs(np.subtract.outer(np.arange(100.0), np.arange(100.0)))
     near = {i: {i - 1, i + 1} & set(range(100)) for i in range(100)} | {0: {50}, 50: {0, 90}}
     found = pairs.wider_pairs(likeness, [0], near, 12)
     assert found == {(0, j) for j in [*range(1, 13), 90]}
     assert pairs.wider_pairs(likeness, [], near, 12) == set()
-
-
-def test_components_are_parts_without_a_path_between_them() -> None:
-    near = {0: {1}, 1: {0, 2}, 2: {1}, 3: {4}, 4: {3}, 5: set[int]()}
-    assert ladder.components(near) == [[0, 1, 2], [3, 4], [5]]
-
-
-def test_all_pairs_of_few_photographs_and_retrieval_of_many() -> None:
-    assert [ladder.matching_for(count) for count in (3, 60, 61, 1000)] == ["exhaustive", "exhaustive", "retrieval", "retrieval"]

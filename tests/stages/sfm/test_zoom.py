@@ -61,7 +61,7 @@ def test_two_zooms_are_told_where_the_matches_agree_with_one(tmp_path: Path) -> 
     assert off(found.models[0], taken) < 0.01
 
 
-def test_photographs_that_were_cropped_get_their_principal_points_and_one_lens(tmp_path: Path) -> None:
+def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -> None:
     cut = [(int(x), int(y)) for x, y in np.random.default_rng(0).integers((0, 0), (120, 90), (COUNT, 2)) - (60, 45)]
     taken = cameras(cut=cut)
     images = matched(tmp_path, taken)
@@ -78,22 +78,6 @@ def test_photographs_that_were_cropped_get_their_principal_points_and_one_lens(t
     assert zoom.principal_point_spread(model) < ladder.APART / 2
     assert off(model, taken) < 0.5 * off(shared, taken) < 0.005
     assert numbers(found_for(tmp_path, images)) == numbers(found)
-
-
-def test_the_spread_of_principal_points_does_not_depend_on_where_all_of_them_are(tmp_path: Path) -> None:
-    """All cropped alike: one principal point, off the middle."""
-    images = matched(tmp_path, cameras(cut=((20, -12),) * COUNT))
-    shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    assert zoom.principal_point_spread(shared) < ladder.APART
-    assert zoom.focal_length_spread(shared) < ladder.SPREAD
-
-
-def test_one_zoom_is_not_looked_at_again(tmp_path: Path) -> None:
-    images = matched(tmp_path, cameras())
-    found = found_for(tmp_path, images)
-    assert [rung["rung"] for rung in found.rungs] == ["exhaustive"]
-    assert found.rung == "exhaustive"
-    assert not (tmp_path / "own_cameras").exists()
 
 
 def test_a_copy_with_own_cameras_has_the_same_features_and_matches(tmp_path: Path) -> None:

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import rays
-from efficientnerf.geometry.spaces import BoundedSpace, NdcSpace
-from efficientnerf.model import model
 from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import settings_from
 from stages.bake.resolution import ndc_pixel
-from stages.io.field_file import load_renderer, space_of
-from stages.io.scene import load as load_scene
-from stages.train import run as train
 from stages.train.hash_resolution import MAX_LOG2_TABLE, MAX_RESOLUTION, with_auto_sizes
-from tests.efficientnerf.balls import BOUNDS, settings
-from tests.stages.balls import job, poses
 from tests.stages.forward_facing import forward_facing
 
 
 def test_grid_points_lie_a_pixel_apart_in_forward_facing_scenes() -> None:
     for side in (400, 1000):
         s = forward_facing(side)
-        assert s.forward is not None
         pixels = sum(v.camera.width * v.camera.height for v in s.views)
         found = with_auto_sizes(TrainSettings(), s, pixels)
         wide = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
@@ -49,38 +39,6 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
     assert with_auto_sizes(TrainSettings(), s, 10**9).log2_hashmap_size == MAX_LOG2_TABLE
     given = with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=77), s, 10**9)
     assert (given.log2_hashmap_size, given.finest_resolution, given.num_coarse_samples) == (14, 512, 77)
-
-
-def test_spaces_have_defaults_of_their_own() -> None:
-    s = forward_facing(400)
-    small = TrainSettings(log2_hashmap_size=8, num_levels=2, occupancy_resolution=8)
-    m, usual = model(space_of(s), small, None), model(BoundedSpace(BOUNDS), small, None)
-    assert m.settings.num_coarse_samples == with_auto_sizes(TrainSettings(), s, 1000).num_coarse_samples == NdcSpace.num_coarse_samples
-    assert m.step == pytest.approx(2 * math.sqrt(3) / NdcSpace.num_coarse_samples, rel=1e-6)  # the box is 2 deep
-    assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.05)
-    assert 1 - math.exp(-usual.voxels.threshold * usual.step) == pytest.approx(0.01)
-    assert (m.distortion, usual.distortion) == (0.002, 0.01)
-    stated = model(space_of(s), dataclasses.replace(small, num_coarse_samples=64, occupancy_alpha_threshold=0.2, distortion_loss_weight=0.0), None)
-    assert (stated.settings.num_coarse_samples, stated.distortion) == (64, 0.0)
-    assert 1 - math.exp(-stated.voxels.threshold * stated.step) == pytest.approx(0.2)
-
-
-def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path: Path) -> None:
-    s = load_scene(poses(tmp_path))
-    found = [with_auto_sizes(TrainSettings(), s, pixels) for pixels in (1, 2**22, 2**24, 2**26, 2**34)]
-    assert [each.log2_hashmap_size for each in found] == [17, 17, 18, 19, 19]
-    assert {each.finest_resolution for each in found} == {FINEST}
-    assert with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512), s, 2**26) == TrainSettings(
-        log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=BoundedSpace.num_coarse_samples
-    )
-
-
-def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
-    made = job(tmp_path, settings(log2_hashmap_size="auto", finest_resolution="auto", iterations=2, sample_batch_size=256), poses=poses(tmp_path / "poses"))
-    train.run(made)
-    m = load_renderer(made.out).model
-    assert (m.settings.log2_hashmap_size, m.settings.finest_resolution) == (LOG2_TABLE, FINEST)
-    assert max(m.fine.sides) == FINEST
 
 
 @pytest.mark.parametrize(("name", "least", "most"), [("log2_hashmap_size", 8, 24), ("finest_resolution", 16, 16384), ("num_coarse_samples", 8, 1024)])

@@ -40,7 +40,3 @@ def test_the_time_left_follows_the_last_steps(tmp_path: Path) -> None:
     assert found[300]["left"] == pytest.approx(0.2 * 1700, abs=0.1)
     last = len(slow) + len(fast)
     assert found[last]["left"] == pytest.approx(0.05 * (2000 - last), abs=0.1)
-
-
-def test_nothing_is_left_after_the_last_step(tmp_path: Path) -> None:
-    assert shown(tmp_path, 0, iter([0.5] * 30), 30)[30]["left"] == 0

@@ -32,17 +32,6 @@ def test_rows_are_those_of_an_array(tmp_path: Path, channels: int) -> None:
     assert rows[at[:0]].shape == (0, channels)
 
 
-@pytest.mark.parametrize("index", [[1000], [-1]])
-def test_rows_that_are_not_there_are_refused(tmp_path: Path, index: list[int]) -> None:
-    with pytest.raises(IndexError, match="of 1000"):
-        filled(tmp_path)[0][np.array(index)]
-
-
-def test_rows_of_another_shape_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="uint8"):
-        PixelFile(10, 3, tmp_path)[0:5] = np.zeros((5, 4), np.uint8)
-
-
 def test_the_file_has_no_name(tmp_path: Path) -> None:
     rows, _ = filled(tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -56,22 +45,6 @@ def test_a_full_disk_shows_before_an_image_is_read(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(OSError, match="space"):
         PixelFile(10, 3, tmp_path)
-
-
-def test_where_room_cannot_be_reserved_the_file_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unsupported(*_: object) -> None:
-        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
-
-    monkeypatch.setattr(os, "posix_fallocate", unsupported)
-    rows, values = filled(tmp_path)
-    assert np.array_equal(rows[0:1000], values)
-
-
-def test_a_file_that_became_shorter_is_an_error(tmp_path: Path) -> None:
-    rows, _ = filled(tmp_path)
-    os.ftruncate(rows._number, 100)
-    with pytest.raises(OSError, match="training pixels"):
-        rows[np.array([900])]
 
 
 def test_training_pixels_are_the_same_in_memory_and_in_a_file(tmp_path: Path) -> None:

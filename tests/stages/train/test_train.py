@@ -22,7 +22,7 @@ from stages.io.capture import SparsePoints
 from stages.io.field_file import load_exposure, load_renderer
 from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.train import data
 from stages.train import run as train
 from stages.train.averaged import as_taken
@@ -45,7 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_curve(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Drawing the curve takes longer than this little training; one test wants it."""
     if "curve" not in request.node.name:
-        monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+        monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:
@@ -85,7 +85,7 @@ def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Pat
     assert np.isfinite(load_renderer(made.out).model.voxels.values.numpy()).all()
 
 
-@pytest.mark.parametrize("calls", [(1,), (7,), (2, 3, 9), (13,)])
+@pytest.mark.parametrize("calls", [(1,), (2, 9), (13,)])
 def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, undisturbed: str, calls: tuple[int, ...]) -> None:
     stop = StopAt(*calls)
     for _ in calls:
@@ -100,67 +100,19 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, un
     assert lines == [5, 10, 13]
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "other", "flipped"])
+@pytest.mark.parametrize("damage", ["cut", "flipped"])
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path: Path, undisturbed: str, damage: str) -> None:
-    from stages.io.field_file import write_tensors
-
     with pytest.raises(Interrupted):
         run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(9)))
     newest = sorted((tmp_path / "work").glob("checkpoint_*"))[-1]
     assert newest.name == "checkpoint_00000009.safetensors"
-    if damage == "other":
-        write_tensors({}, {}, newest)
-    elif damage == "flipped":
-        data = bytearray(newest.read_bytes())
-        data[len(data) // 2] ^= 4
-        newest.write_bytes(bytes(data))
-    else:
-        newest.write_bytes(newest.read_bytes()[: 5000 if damage == "cut" else 0])
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 4
+    newest.write_bytes(data[:5000] if damage == "cut" else data)
     events: list[dict[str, Any]] = []
     assert run(job(tmp_path, settings(**QUICK), poses=scene, events=events)) == undisturbed
     assert any(event["event"] == "warning" and "checkpoint_00000009" in event["text"] for event in events)
     assert any("goes on from step 8" in event.get("text", "") for event in events)
-
-
-def test_a_kill_leaves_rubbish_that_does_no_harm(scene: Path, tmp_path: Path, undisturbed: str) -> None:
-    with pytest.raises(Interrupted):
-        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(6)))
-    work = tmp_path / "work"
-    (work / ".checkpoint_00000007.safetensors.123.part").write_bytes(b"half of it")
-    with open(work / "log.jsonl", "a", encoding="utf-8") as log:
-        log.write('{"step": 6, "psnr": 1.0}\n{"step": 10, "ps')
-    assert run(job(tmp_path, settings(**QUICK), poses=scene)) == undisturbed
-
-
-def test_all_checkpoints_gone_means_from_the_start(scene: Path, tmp_path: Path, undisturbed: str) -> None:
-    with pytest.raises(Interrupted):
-        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(6)))
-    for path in (tmp_path / "work").glob("checkpoint_*"):
-        path.write_bytes(b"")
-    assert run(job(tmp_path, settings(**QUICK), poses=scene)) == undisturbed
-
-
-def test_other_settings_give_other_bytes(scene: Path, tmp_path: Path, undisturbed: str) -> None:
-    assert run(job(tmp_path, settings(**{**QUICK, "seed": 1}), poses=scene)) != undisturbed
-
-
-def test_photographs_with_masks(tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    from PIL import Image
-
-    folder = poses(tmp_path / "poses", photographs=True)
-    s = scenes.load(folder)
-    mask = np.full((16, 16), 255, np.uint8)
-    mask[:8] = 0
-    Image.fromarray(mask).save(folder / "images" / "mask.png")
-    scenes.save(replace(s, views=tuple(replace(view, mask="images/mask.png") for view in s.views)), folder)
-    few = settings(**{**QUICK, "iterations": 3})
-    train.run(job(tmp_path / "a", few, poses=folder))
-    assert load_renderer(tmp_path / "a" / "out").model.background is None
-    Image.fromarray(0 * mask).save(folder / "images" / "mask.png")
-    with pytest.raises(ValueError, match="masks leave no pixel"):
-        train.run(job(tmp_path / "b", few, poses=folder))
 
 
 def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) -> None:
@@ -219,35 +171,36 @@ def test_refined_cameras_are_recorded_and_used(tmp_path: Path) -> None:
         assert new.source_camera.params[0] / old.source_camera.params[0] == pytest.approx(new.camera.params[0] / old.camera.params[0])
     report = json.loads((made.out / "report.json").read_text())["cameras"]
     assert 0 < report["mean_pixels"] <= report["max_pixels"]
-    made = job(tmp_path / "off", settings(**REFINED | {"camera_refinement": "off"}), poses=scene)
+    made = job(tmp_path / "off", settings(**REFINED | {"camera_refinement": "off", "iterations": 3}), poses=scene)
     train.run(made)
     assert not (made.out / TrainOutputs.cameras).exists()
     assert [view.camera.params for view in load_scene(scene, made.out).views] == [view.camera.params for view in before.views]
 
 
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda d: d.update(format=2), "or the format is another one"),
-        (lambda d: d["cameras"].update({"images/none.png": next(iter(d["cameras"].values()))}), "none.png' is no such view"),
-        (lambda d: next(iter(d["cameras"].values())).update(width=9), "is no such view"),
-        (lambda d: next(iter(d["cameras"].values())).update(world_from_camera=np.eye(4)[::-1].tolist()), "not a rigid motion"),
-        (lambda d: next(iter(d["cameras"].values())).update(params=[-1.0, 8.0, 8.0]), "not positive"),
-        (lambda d: next(iter(d["cameras"].values())).update(params=[1.0]), "parameters"),
-        (lambda d: d.pop("cameras"), "missing required field"),
-    ],
-)
-def test_other_cameras_than_training_wrote_are_refused(tmp_path: Path, spoil: Callable[[dict[str, Any]], None], message: str) -> None:
+SPOILED: list[Callable[[dict[str, Any]], object]] = [
+    lambda d: d.update(format=2),
+    lambda d: d["cameras"].update({"images/none.png": next(iter(d["cameras"].values()))}),
+    lambda d: next(iter(d["cameras"].values())).update(width=9),
+    lambda d: next(iter(d["cameras"].values())).update(world_from_camera=np.eye(4)[::-1].tolist()),
+    lambda d: next(iter(d["cameras"].values())).update(params=[-1.0, 8.0, 8.0]),
+    lambda d: next(iter(d["cameras"].values())).update(params=[1.0]),
+    lambda d: d.pop("cameras"),
+]
+
+
+def test_other_cameras_than_training_wrote_are_refused(tmp_path: Path) -> None:
     scene = poses(tmp_path / "poses", photographs=True)
     views = scenes.views_of(scenes.load(scene), "train")
     path = TrainOutputs(tmp_path).cameras
     refined_cameras.write(views, [view.camera for view in views], path)
-    document = json.loads(path.read_text())
+    written = path.read_text()
     load_scene(scene, tmp_path)
-    spoil(document)
-    path.write_text(json.dumps(document))
-    with pytest.raises(CorruptArtifact, match=message):
-        load_scene(scene, tmp_path)
+    for spoil in SPOILED:
+        document = json.loads(written)
+        spoil(document)
+        path.write_text(json.dumps(document))
+        with pytest.raises(CorruptArtifact, match=path.name):
+            load_scene(scene, tmp_path)
 
 
 def test_exposures_are_saved(tmp_path: Path) -> None:
@@ -273,10 +226,6 @@ def test_exposures_are_saved(tmp_path: Path) -> None:
     assert as_taken(tmp_path) is None
 
 
-def test_where_exposure_is_not_learned_the_bytes_are_those_without_it(scene: Path, tmp_path: Path, undisturbed: str) -> None:
-    assert run(job(tmp_path, settings(**QUICK, exposure="off"), poses=scene)) == undisturbed
-
-
 @pytest.mark.parametrize("differ", [True, False])
 def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, differ: bool) -> None:
     """Photographs of the same points, of one brightness or of several; without points nothing is known, and before a constant background nothing is learned."""
@@ -293,7 +242,6 @@ def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, di
         used[choice] = begin_exposure(scene, s, pixels_of(scene, scenes.views_of(s, "train")), choice, "cpu")
     assert (used["auto"] is not None) == differ
     assert used["off"] is None
-    assert used["on"] is not None
     stops = used["on"].log_gains().detach().numpy()[:, 1] / np.log(2)
     if differ:
         assert stops[1] - stops[0] == pytest.approx(np.log2(linear_from_srgb(121.5 / 255) / linear_from_srgb(71.5 / 255)), abs=0.1)
@@ -304,24 +252,19 @@ def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, di
     assert begin_exposure(scene, replace(s, background=(1.0, 1.0, 1.0)), pixels, "auto", "cpu") is None
 
 
-@pytest.mark.parametrize("planes", [{"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}])
-def test_planes_are_stated_both_and_in_order(planes: dict[str, float], scene: Path, tmp_path: Path) -> None:
-    chosen = settings(**QUICK, **planes)
-    for refused in (lambda: train.STAGE.check({"train": chosen}), lambda: train.run(job(tmp_path, chosen, poses=scene))):
-        with pytest.raises(UsageError, match=r"train\.near_plane=.*, train\.far_plane=.*: expected two numbers, the second one greater, or auto for both"):
-            refused()
-
-
-def test_planes_in_a_contracted_scene_are_refused_by_the_name_of_what_contracts_it(tmp_path: Path) -> None:
+def test_planes_are_stated_both_and_in_order_and_not_of_a_contracted_scene(scene: Path, tmp_path: Path) -> None:
+    for planes in ({"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}):
+        chosen = settings(**QUICK, **planes)
+        for refused in (lambda chosen=chosen: train.STAGE.check({"train": chosen}), lambda chosen=chosen: train.run(job(tmp_path, chosen, poses=scene))):
+            with pytest.raises(UsageError, match=r"train\.near_plane=.*, train\.far_plane="):
+                refused()
     chosen = settings(**QUICK, near_plane=2.0, far_plane=6.0)
-    with pytest.raises(UsageError, match=r"poses\.space=contracted"):
-        train.run(job(tmp_path / "a", chosen, poses=poses(tmp_path / "poses", space="contracted")))
     with pytest.raises(UsageError, match=r"poses\.space=contracted"):
         train.STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
     train.STAGE.check({"train": chosen, "poses": PosesSettings()})
 
 
-def test_planes_that_miss_the_scene_are_refused_and_those_that_cut_into_it_are_told(scene: Path) -> None:
+def test_planes_that_miss_the_scene_are_refused(scene: Path) -> None:
     """The views have 1 to 5 of the training frame before them, which is 2 to 10 in the capture's units."""
     s = scenes.load(scene)
     pixels = pixels_of(scene, scenes.views_of(s, "train"))
@@ -334,20 +277,11 @@ def test_planes_that_miss_the_scene_are_refused_and_those_that_cut_into_it_are_t
         return found
 
     for near, far in ((10.0, 12.0), (0.1, 2.0)):
-        with pytest.raises(UsageError, match=rf"near_plane .* are {near:g} to {far:g} in .*, and the scene lies 2 to 10 before .* miss all of it"):
+        with pytest.raises(UsageError, match=rf"near_plane .* {near:g} to {far:g} .* 2 to 10"):
             told(near, far)
     assert told(2.0, 10.0) == told(0.0, 100.0) == told(2.5, 9.0) == []
     for near, far in ((5.0, 10.0), (1.0, 6.0)):
         assert [f"are {near:g} to {far:g} " in text and "miss a part of it" in text for text in told(near, far)] == [True]
-
-
-def test_two_training_views_are_enough_for_sparse_depth_and_none_is_told(tmp_path: Path) -> None:
-    folder = poses(tmp_path / "poses", count=3, points=True)
-    events: list[dict[str, Any]] = []
-    for tracks, some in ((((0, 1),), True), (((0,),), False)):
-        scenes.save_points(SparsePoints(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), tracks), folder)
-        assert (train.sparse_depth(job(tmp_path, None, events=events), folder, scenes.load(folder), settings()) is not None) == some
-    assert ["no sparse point lies before" in event["text"] for event in events] == [True]
 
 
 def test_of_many_observations_some_are_drawn_with_all_views_of_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -404,7 +338,7 @@ def test_a_view_that_shows_something_else_is_left_out_here_and_after(tmp_path: P
     assert (made.out / TrainOutputs.wrong_views).is_file()
     later = load_scene(scene, made.out)
     assert [view.image for view in scenes.views_of(later, "train")] == [f"images/v{n:02}.png" for n in range(19) if n != 5]
-    for calls in ((45,), (55, 65)):
+    for calls in ((55,),):
         again, stop = tmp_path / f"stopped{calls[0]}", StopAt(*calls)
         for _ in calls:
             with pytest.raises(Interrupted):
@@ -412,9 +346,6 @@ def test_a_view_that_shows_something_else_is_left_out_here_and_after(tmp_path: P
         assert run(job(again, settings(**SWAPPED), poses=scene, stop=stop)) == digest
         assert (again / "out" / TrainOutputs.cameras).read_bytes() == (made.out / TrainOutputs.cameras).read_bytes()
         assert (again / "out" / TrainOutputs.wrong_views).read_bytes() == (made.out / TrainOutputs.wrong_views).read_bytes()
-    off = job(tmp_path / "off", settings(**SWAPPED, wrong_views="off"), poses=scene)
-    assert run(off) != digest
-    assert not (off.out / TrainOutputs.cameras).exists()
 
 
 def test_without_wrong_views_the_checks_change_nothing(tmp_path: Path, early_checks: None) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import Camera, Similarity
+from efficientnerf.geometry.cameras import Camera
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.verdict.parallax import SMALL_ANGLE, parallax
 from stages.verdict.verdict import verdict_on
@@ -107,16 +107,6 @@ def test_a_camera_that_only_turns_is_in_one_place(made: Callable[[], tuple[Spars
     found = parallax(points, photos)
     assert (found.subject, found.small) == (False, True)
     assert {"parallax", "one place"} <= verdict_words(points, photos)
-
-
-def test_parallax_is_the_same_in_any_frame() -> None:
-    points, photos = ring()
-    rotation = np.linalg.qr(RNG(6).normal(size=(3, 3)))[0]
-    frame = Similarity(17.0, rotation * np.sign(np.linalg.det(rotation)), np.array([5.0, -3.0, 40.0]))
-    moved = [Photo(frame.camera(photo.camera), photo.image) for photo in photos]
-    found, again = parallax(points, photos), parallax(SparsePoints(frame.points(points.xyz), points.rgb, points.error, points.tracks), moved)
-    assert again.subject == found.subject
-    assert again.angle == pytest.approx(found.angle, rel=1e-6)
 
 
 def test_no_points_and_hardly_a_camera_show_no_depth() -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,14 +12,13 @@ from PIL import Image
 from pipeline.errors import BadInput
 from stages.formats.importers import IMPORTERS
 from stages.io.photo import read_photo
-from stages.poses.run import PosesSettings
+from stages.poses.settings import PosesSettings
 from stages.sfm import matches
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, open_database
 from stages.sfm.images import prepare_images
 from stages.verdict import preflight
 from stages.verdict.preflight import Small, check, overlap_of
-from stages.verdict.verdict import Problem, Verdict
 from tests.stages import captures, turntables
 
 SIZE = 240, 180
@@ -72,10 +69,8 @@ def test_overlap_counts_what_moves_alike_and_what_stands_still(tmp_path: Path) -
     scene = panorama(0)
     one, near, far, other = (small_of(p, tmp_path / "p.png") for p in (relief(scene, 0), relief(scene, 12), relief(scene, 400), relief(panorama(1), 0)))
     same = overlap_of(one, one)
-    assert same is not None
     assert (same.still, same.plane) == (1.0, 1.0)
     moved = overlap_of(one, near)
-    assert moved is not None
     assert moved.matches >= preflight.OVERLAP
     assert moved.still < 0.1
     assert overlap_of(one, far) is None
@@ -94,27 +89,11 @@ def test_photographs_along_a_way_overlap(tmp_path: Path) -> None:
     assert forecast["poses_bytes"] > 100 * 2**20
 
 
-def test_photographs_that_overlap_with_no_other_are_forecast_to_be_matched_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ticks = itertools.count()
-    monkeypatch.setattr(preflight, "time", SimpleNamespace(thread_time=lambda: preflight.REFERENCE * next(ticks)))
-    folder = write(tmp_path / "a", along(0, 14))
-    longer = {}
-    for lost in (0, 5):
-        monkeypatch.setattr(preflight, "_share_in_largest", lambda count, overlaps, lost=lost: 1 - lost / count)
-        about = check(folder, PosesSettings(), 1).figures["forecast"]
-        longer[lost] = about["poses_seconds_at_most"] - about["poses_seconds"]
-    assert longer[5] > longer[0] > 0
-
-
 def test_two_scenes_in_one_folder_are_told(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", along(0, 9) | along(1, 5, "z{}.png"))
     found = check(folder, PosesSettings(), 2)
     assert {problem.what: problem.images for problem in found.problems}["overlap"] == tuple(f"z{k}.png" for k in range(5))
     assert found.grade == "usable"
-
-
-def test_photographs_without_anything_in_common_fail(tmp_path: Path) -> None:
-    assert problems(write(tmp_path / "a", {f"{k}.png": relief(panorama(k), 0) for k in range(6)}))["overlap"] == "failed"
 
 
 def test_a_camera_that_stood_still_is_told(tmp_path: Path) -> None:
@@ -124,14 +103,6 @@ def test_a_camera_that_stood_still_is_told(tmp_path: Path) -> None:
     found = problems(write(tmp_path / "a", noisy))
     assert found["stands still"] == "poor"
     assert found["duplicates"] == "poor"
-
-
-def test_a_subject_that_turns_before_a_standing_background_is_told(tmp_path: Path) -> None:
-    background, subject = relief(panorama(0), 0), along(1, 12, step=6.0)
-    mask = np.zeros(SIZE[::-1], bool)
-    mask[30:150, 60:180] = True
-    found = problems(write(tmp_path / "a", {name: np.where(mask, picture, background) for name, picture in subject.items()}))
-    assert found.get("background") == "usable"
 
 
 def test_a_small_subject_that_turns_before_much_of_a_wall_is_told(tmp_path: Path) -> None:
@@ -159,15 +130,6 @@ def test_noise_and_tiny_pictures_are_told(tmp_path: Path) -> None:
     assert "noise" not in found
 
 
-def test_strong_compression_is_told(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", along(0, 6))
-    for path in sorted(folder.glob("*.png")):
-        with Image.open(path) as image:
-            image.save(path.with_suffix(".jpg"), quality=7)
-        path.unlink()
-    assert problems(folder)["compression"] == "usable"
-
-
 def test_time_of_matching_follows_the_number_of_features(tmp_path: Path) -> None:
     """Against COLMAP's own detector, on one side of the size below which it looks at twice the size and on the other."""
     still_life = Path(__file__).resolve().parents[3] / "examples" / "still_life"
@@ -188,22 +150,6 @@ def test_time_of_matching_follows_the_number_of_features(tmp_path: Path) -> None
             counts = [database.num_keypoints_for_image(k + 1) for k in range(len(names))]
         for name, count in zip(names, counts, strict=True):
             assert preflight.count_features(read_photo(folder / name, 1600).rgb) == pytest.approx(count, rel=0.25)
-
-
-def test_fewer_features_are_forecast_to_match_sooner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert preflight.pair_seconds(4096) == pytest.approx(0.036)
-    assert preflight.pair_seconds(2048) - preflight.pair_seconds(0) == pytest.approx((preflight.pair_seconds(4096) - preflight.pair_seconds(0)) / 4)
-    ticks = itertools.count()  # a clock of which each look takes as long
-    monkeypatch.setattr(preflight, "time", SimpleNamespace(thread_time=lambda: preflight.REFERENCE * next(ticks)))
-    monkeypatch.setattr(preflight, "count_features", lambda rgb: 1500)
-    folder = write(tmp_path / "a", along(0, 14))
-
-    def seconds(limit: int) -> float:
-        return float(check(folder, PosesSettings(max_features=limit), 1).figures["forecast"]["poses_seconds"])
-
-    pairs = 14 * 13 // 2
-    assert seconds(1500) - seconds(500) == pytest.approx(pairs * (preflight.pair_seconds(1500) - preflight.pair_seconds(500)), abs=0.11)
-    assert seconds(4096) == seconds(1500)
 
 
 def test_zooms_and_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
@@ -241,15 +187,3 @@ def test_stated_cameras_that_a_run_would_refuse_are_told(tmp_path: Path) -> None
     with pytest.raises(BadInput):
         IMPORTERS["blender"].read(tmp_path / "good", PosesSettings())
     assert "cameras" not in problems(tmp_path / "good", format="photographs")
-
-
-def test_of_many_photographs_an_even_choice_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preflight, "CHOSEN", 5)
-    found = check(write(tmp_path / "a", along(0, 14, step=5.0)), PosesSettings(), 2)
-    assert (found.figures["photographs"], found.figures["looked_at"]) == (14, 5)
-    assert sorted(found.images) == ["00.png", "03.png", "06.png", "09.png", "12.png"]
-
-
-def test_its_summary_speaks_of_photographs_not_of_cameras() -> None:
-    assert Verdict("good", (), {"photographs": 36}).summary() == "Photographs: good; 36 of them, no problems."
-    assert Verdict("usable", (Problem("small", "usable", "Small.", "Larger."),), {"photographs": 5}).summary() == "Photographs: usable; 5 of them, 1 problem."

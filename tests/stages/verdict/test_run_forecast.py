@@ -30,46 +30,28 @@ def test_each_stage_after_the_cameras_is_forecast() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "more"),
+    ("stages", "more"),
     [
-        ("train", {"train__iterations": 2 * DEFAULTS["train"].iterations}),
-        ("bake", {"whole": False}),
-        ("mesh", {"views": 300}),
-        ("evaluate", {"megapixels": 600.0}),
-        ("turntable", {"turntable__frames": 4 * DEFAULTS["turntable"].frames}),
+        (["train"], {"train__iterations": 2 * DEFAULTS["train"].iterations}),
+        (["bake"], {"whole": False}),
+        (["mesh"], {"views": 300}),
+        (["bake", "evaluate"], {"megapixels": 600.0}),
+        (["turntable"], {"turntable__frames": 4 * DEFAULTS["turntable"].frames}),
     ],
 )
-def test_more_of_it_takes_longer_and_nothing_else_does(stage: str, more: dict[str, Any]) -> None:
+def test_more_of_it_takes_longer_and_nothing_else_does(stages: list[str], more: dict[str, Any]) -> None:
     before, after = seconds(), seconds(**more)
-    assert [name for name in before if after[name] != before[name]] == [stage]
-    assert after[stage] > 1.2 * before[stage]
+    assert [name for name in before if after[name] != before[name]] == stages
+    assert all(after[stage] > 1.2 * before[stage] for stage in stages)
 
 
-def test_a_slower_machine_takes_longer_and_more_cores_less_by_what_they_share() -> None:
+def test_slower_machines_take_longer_and_more_cores_less() -> None:
     before = sum(seconds().values())
     assert sum(seconds(slower=3.0).values()) == pytest.approx(2 * before, rel=1e-2)
     assert 0.28 * sum(seconds(threads=1).values()) < sum(seconds(threads=64).values()) < 0.5 * before
-
-
-def test_a_time_budget_is_what_a_stage_takes_on_any_machine() -> None:
-    assert seconds(train__time_budget=50.0, slower=9.0)["train"] == 50.0
-    assert seconds(bake__time_budget=70.0)["bake"] == 70.0
-
-
-def test_what_is_not_made_takes_nothing() -> None:
-    assert seconds(splats__make="off")["splats"] == 0
-
-
-def test_networks_that_were_not_measured_are_not_forecast() -> None:
-    assert seconds(train__field="nerf") == {}
 
 
 def test_a_packed_asset_holds_more_voxels_in_as_many_bytes_and_takes_longer() -> None:
     assert seconds(bake__layout="packed", bake__max_mib=8.0, whole=False)["bake"] > 3 * seconds(bake__max_mib=8.0, whole=False)["bake"]
     packed = {"bake": replace(DEFAULTS["bake"], layout="packed", max_mib=8.0)}
     assert run_forecast.bytes_of(DEFAULTS | packed) > run_forecast.bytes_of(DEFAULTS | {"bake": replace(DEFAULTS["bake"], max_mib=8.0)})
-
-
-def test_a_larger_asset_takes_more_memory() -> None:
-    small, large = (run_forecast.bytes_of(DEFAULTS | {"bake": replace(DEFAULTS["bake"], max_mib=mib)}) for mib in (4.0, 64.0))
-    assert 5e8 < small < run_forecast.bytes_of(DEFAULTS) < large

@@ -46,13 +46,6 @@ def test_a_view_shows_what_lies_in_its_directions(view: int) -> None:
     np.testing.assert_allclose(np.degrees(np.arctan2(middle[0], middle[2])) % 360, 360 * view / VIEWS, atol=1e-9)
 
 
-def test_views_have_the_resolution_of_the_panorama_in_their_middle() -> None:
-    for width in (256, 5760):
-        side = view_side(width, 10_000)
-        assert np.degrees(np.arctan(2 / side)) == pytest.approx(360 / width, rel=0.03)
-    assert view_side(5760, 800) == 800
-
-
 def test_panoramas_are_recognised_by_shape_and_what_they_say(tmp_path: Path) -> None:
     assert is_panorama(write(tmp_path / "a.jpg", xmp=GPANO))
     assert is_panorama(write(tmp_path / "a.webp", xmp=GPANO))
@@ -84,13 +77,3 @@ def test_views_are_written_with_their_focal_length_and_again_after_a_kill(tmp_pa
         views_of(pictures, work=tmp_path / "killed", safe_point=stop, **quiet)
     again = views_of(pictures, work=tmp_path / "killed", safe_point=lambda: None, **quiet)
     assert {name: path.read_bytes() for name, path in again.items()} == {name: path.read_bytes() for name, path in whole.items()}
-
-
-def test_a_panorama_that_cannot_be_read_is_left_out_with_a_word(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"no picture")
-    warnings: list[str] = []
-    found = views_of(
-        {"a.png": tmp_path / "a.png"}, max_side=99, work=tmp_path / "work", safe_point=lambda: None, progress=lambda *values: None, warn=warnings.append
-    )
-    assert not found
-    assert "a.png: unreadable" in warnings[0]

@@ -17,7 +17,6 @@ def carried(page: str) -> bytes:
 
 def facts(page: str) -> dict[str, object]:
     found = re.search(r'<script id="facts" type="application/json">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
     out: dict[str, object] = json.loads(found[1])
     return out
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
 from stages.viewer.page import viewer_page

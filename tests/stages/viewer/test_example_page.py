@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -16,26 +15,6 @@ from tests.stages.viewer.pages import carried, check_no_other_place, check_polic
 from tests.stages.viewer.scenes import decibels
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "still_life_viewer.html"
-VOID = {"meta", "link", "input", "img", "br"}
-
-
-class Elements(HTMLParser):
-    """Which elements stand open, and the numbers of those that were met."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.met: dict[str, int] = {}
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.met[tag] = self.met.get(tag, 0) + 1
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-
 @pytest.fixture(scope="module")
 def text() -> str:
     return PAGE.read_text(encoding="utf-8")
@@ -45,15 +24,6 @@ def text() -> str:
 def asset(text: str, tmp_path: Path) -> Path:
     (tmp_path / "asset.nerftree").write_bytes(carried(text))
     return tmp_path / "asset.nerftree"
-
-
-def test_its_elements_close(text: str) -> None:
-    elements = Elements()
-    elements.feed(text)
-    elements.close()
-    assert elements.open == []
-    assert (elements.met["html"], elements.met["canvas"]) == (1, 2)
-    assert PAGE.stat().st_size < 400_000
 
 
 def test_it_may_run_its_own_script_alone_and_asks_for_nothing(text: str) -> None:

@@ -139,20 +139,6 @@ def test_a_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> No
         assert page.console == []
 
 
-def test_an_altered_page_says_so(chromium: Any, tmp_path: Path) -> None:
-    good = serialize(random_tree(1), "compact")
-    altered = bytearray(good)
-    altered[-1] ^= 1
-    with browser.opened(chromium, written(tmp_path, bytes(altered))) as page:
-        assert "refused" in page.refusal()
-        assert "SHA-256" in page.refusal()
-        assert page.console == []
-    text = viewer_page(good).decode().replace(f'"bytes":{len(good)}', f'"bytes":{len(good) - 1}')
-    (tmp_path / "viewer.html").write_text(text)
-    with browser.opened(chromium, tmp_path / "viewer.html") as page:
-        assert "longer than it states" in page.refusal()
-
-
 def test_a_large_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> None:
     """Of several parts of data, cut short or altered anywhere: the asset in it, or the page itself."""
     good = serialize(random_tree(1, shape=(20, 20, 20), brick=4, degree=2, share=0.6), "compact")
@@ -202,16 +188,6 @@ def test_a_large_page_that_was_damaged_says_so(chromium: Any, tmp_path: Path) ->
         page.page.wait_for_selector("#late", state="visible")
         assert "cut short" in page.page.inner_text("#late")
         assert page.page.evaluate("typeof enerf") == "undefined"
-
-
-def test_a_browser_without_webgl2_is_told(chromium: Any, tmp_path: Path) -> None:
-    context = chromium.new_context()
-    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    page = context.new_page()
-    page.goto(written(tmp_path, serialize(random_tree(1), "compact")).as_uri())
-    page.wait_for_selector(".failed")
-    assert "WebGL2" in page.inner_text("#status")
-    context.close()
 
 
 def test_its_own_digests_and_base64_are_those_of_the_standards(chromium: Any, tmp_path: Path) -> None:

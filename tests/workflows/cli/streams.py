@@ -10,6 +10,7 @@ runs in a fork of this process, which saves the imports, and ends as any Python 
 from __future__ import annotations
 
 import gc
+import importlib
 import json
 import os
 import sys
@@ -18,8 +19,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from tests.workflows.toys import TOYS
-from workflows.asset import Workflow
 from workflows.cli.main import main
+from workflows.workflow import Workflow
 
 
 def attach(number: int, how: str, kept: BinaryIO) -> None:
@@ -56,7 +57,8 @@ def ran(case: dict[str, Any], presets: Path) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    import workflows.report.page  # noqa: F401  what the cases import is imported once
+    for module in ("efficientnerf.asset.format", "stages.viewer.page", "workflows.cli.request", "workflows.report.page", "workflows.report.viewer"):
+        importlib.import_module(module)  # what the cases import is imported once
 
     gc.freeze()  # else each fork copies what it never looks at
     given, folder = json.load(sys.stdin), Path(sys.argv[1])

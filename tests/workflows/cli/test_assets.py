@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,58 +27,40 @@ def asset(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_layouts_are_those_there_are() -> None:
-    assert tuple(WRITERS) == LAYOUTS
-
-
 def test_a_bare_asset_is_verified(enerf: Enerf, asset: Path) -> None:
+    assert tuple(WRITERS) == LAYOUTS
     result = enerf("verify", asset)
-    assert result.code == 0, result.err
-    assert "format 1.0, sparse" in result.out
-    assert "all as written" in result.out
+    assert (result.code, "format 1.0, sparse" in result.out) == (0, True), result.err
     assert enerf("verify", asset, "--json").object["damaged"] == []
     assert enerf("verify", asset, "--quiet") == Result(0, "", "")
     data = asset.read_bytes()
-    asset.write_bytes(data[:-100] + bytes([data[-100] ^ 1]) + data[-99:])
-    broken = enerf("verify", asset, "--json")
-    assert broken.code == 4
-    assert broken.objects[-1]["damaged"] == [str(asset)]
-    assert "the file is damaged" in broken.err
-    asset.write_bytes(data[:-1])
-    assert "cut short" in enerf("verify", asset).err
+    for damaged in (data[:-100] + bytes([data[-100] ^ 1]) + data[-99:], data[:-1]):
+        asset.write_bytes(damaged)
+        broken = enerf("verify", asset, "--json")
+        assert (broken.code, broken.objects[-1]["damaged"]) == (4, [str(asset)])
     assert enerf("verify", asset.with_name("none.nerftree")).code == 2
 
 
-def test_equal_assets_are_equal(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
-    (tmp_path / "b.nerftree").write_bytes(asset.read_bytes())
-    result = enerf("diff", asset, tmp_path / "b.nerftree", "--views", 2, "--size", 32)
-    assert (result.code, result.out) == (0, "equal\n")
-    found = enerf("diff", asset, tmp_path / "b.nerftree", "--views", 2, "--json").object
-    assert found["equal"]
-    assert found["psnr"] == 100.0
-    assert set(found["tensors"].values()) == {"same"}
-
-
 def test_what_differs_is_said(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
+    other = tmp_path / "b.nerftree"
+    other.write_bytes(asset.read_bytes())
+    assert enerf("diff", asset, other, "--views", 2, "--size", 32).code == 0
+    found = enerf("diff", asset, other, "--views", 2, "--json").object
+    assert (found["equal"], found["psnr"], set(found["tensors"].values())) == (True, 100.0, {"same"})
     tree = load(asset)
-    other = tree.with_values(tree.density_values * 2, tree.sh).with_metadata(licence="MIT")
-    save(other, tmp_path / "b.nerftree")
-    result = enerf("diff", asset, tmp_path / "b.nerftree", "--size", 48)
+    save(tree.with_values(tree.density_values * 2, tree.sh).with_metadata(licence="MIT"), other)
+    result = enerf("diff", asset, other, "--size", 48)
     assert result.code == 6
-    assert 'licence                  "CC0-1.0" -> "MIT"' in result.out
-    assert "voxel.density            other values" in result.out
+    assert all(name in result.out for name in ("CC0-1.0", "MIT", "voxel.density"))
     assert "voxel.sh" not in result.out
-    found = enerf("diff", asset, tmp_path / "b.nerftree", "--size", 48, "--json").object
-    assert found["exit_code"] == 6
-    assert not found["equal"]
-    assert found["metadata"] == {"licence": ["CC0-1.0", "MIT"]}
+    found = enerf("diff", asset, other, "--size", 48, "--json").object
+    assert (found["exit_code"], found["equal"], found["metadata"]) == (6, False, {"licence": ["CC0-1.0", "MIT"]})
     assert {name for name, said in found["tensors"].items() if said != "same"} == {"voxel.density"}
-    assert len(found["views"]) == 4
-    assert 5 < found["psnr"] < 40
-    assert enerf("diff", asset, tmp_path / "b.nerftree", "--views", 0, "--json").object["psnr"] is None
-    assert enerf("diff", asset, tmp_path / "b.nerftree", "--views", 0, "--quiet") == Result(6, "", "")
-    (tmp_path / "b.nerftree").write_bytes(asset.read_bytes()[:-1])
-    assert enerf("diff", asset, tmp_path / "b.nerftree").code == 4
+    assert (len(found["views"]), 5 < found["psnr"] < 40) == (4, True)
+    assert enerf("diff", asset, other, "--views", 0, "--json").object["psnr"] is None
+    assert enerf("diff", asset, other, "--views", 0, "--quiet") == Result(6, "", "")
+    other.write_bytes(asset.read_bytes()[:-1])
+    assert enerf("diff", asset, other).code == 4
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -110,22 +91,20 @@ def test_resolution_and_degree(enerf: Enerf, asset: Path, tmp_path: Path) -> Non
     about = describe(out)
     assert (about["resolution"], about["sh_degree"], about["layout"]) == ([12, 12, 12], 1, "compact")
     assert about["voxel_side"] == pytest.approx(2 * describe(asset)["voxel_side"])
-    for option, value, said in (("--sh-degree", 3, "degree 3 from an asset of degree 2"), ("--resolution", 21, "resolution 21 from an asset of 20")):
-        refused = enerf("convert", asset, tmp_path / "more.nerftree", option, value)
-        assert refused.code == 2
-        assert said in refused.err
-    assert not (tmp_path / "more.nerftree").exists()
-
-
-def test_what_convert_refuses(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
     (tmp_path / "folder.nerftree").mkdir()
-    for out, said in (("a.ply", "expected .nerftree"), ("none/a.nerftree", "does not exist"), ("folder.nerftree", "is a folder")):
-        refused = enerf("convert", asset, tmp_path / out)
-        assert refused.code == 2
-        assert said in refused.err
-    assert enerf("convert", tmp_path / "none.nerftree", tmp_path / "a.nerftree").code == 2
-    asset.write_bytes(b"no asset")
-    assert enerf("convert", asset, tmp_path / "a.nerftree").code == 4
+    (tmp_path / "odd.nerftree").write_bytes(b"no asset")
+    for name, more in (
+        ("more.nerftree", ("--sh-degree", 3)),
+        ("more.nerftree", ("--resolution", 21)),
+        ("a.ply", ()),
+        ("none/a.nerftree", ()),
+        ("folder.nerftree", ()),
+    ):
+        refused = enerf("convert", asset, tmp_path / name, *more)
+        assert (refused.code, str(more[1] if more else name) in refused.err) == (2, True)
+    assert enerf("convert", tmp_path / "none.nerftree", tmp_path / "more.nerftree").code == 2
+    assert enerf("convert", tmp_path / "odd.nerftree", tmp_path / "more.nerftree").code == 4
+    assert not (tmp_path / "more.nerftree").exists()
 
 
 def test_what_a_layout_has_no_place_for_is_refused(enerf: Enerf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,17 +131,11 @@ def test_inspect_tells_what_a_coded_asset_holds(enerf: Enerf, asset: Path, tmp_p
     out = tmp_path / "a.nerftree"
     enerf("convert", asset, out, "--layout", "compact")
     found = enerf("inspect", out, "--json").object
-    assert found["layout"] == "compact"
-    assert found["bytes_per_voxel"] == 12
+    assert (found["layout"], found["bytes_per_voxel"], found["sh_groups"], found["licence"]) == ("compact", 12, [1] * 8, "CC0-1.0")
     assert sum(found["bytes_per_part"].values()) == out.stat().st_size == found["bytes"]
-    assert found["sh_groups"] == [1] * 8
-    assert found["licence"] == "CC0-1.0"
     data = out.read_bytes()
     out.write_bytes(data[: 8 + int.from_bytes(data[:8], "little")] + bytes(len(data) - 8 - int.from_bytes(data[:8], "little")))
-    words = enerf("inspect", out)  # the tensors are not read
-    assert words.code == 0
-    assert "sh degree" in words.out
-    assert json.loads(enerf("inspect", out, "--json").out)["voxels"] == found["voxels"]
+    assert enerf("inspect", out, "--json").object["voxels"] == found["voxels"], "the tensors are not read"
 
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
@@ -171,11 +144,7 @@ GOLDEN = Path(__file__).parents[2] / "data" / "golden"
 def test_a_whole_scene_is_inspected_verified_compared_and_converted(enerf: Enerf, tmp_path: Path) -> None:
     scene = tmp_path / "scene.nerftree"
     scene.write_bytes((GOLDEN / "nested-1.4.nerftree").read_bytes())
-    words = enerf("inspect", scene).out
-    assert "3, each with voxels twice as large as the one before" in words
-    assert "1: voxels of 0.2, [12, 12, 12] of them, from [-1.3, -0.4, -1.7] to [1.1, 2, 0.7]" in words
-    assert "a map of 12 x 6 colours, beyond all voxels" in words
-    assert "from [-0.7, 0.2, -1.1] to [0.2, 1.1, -0.2], radius of its upright edges 0.2, fading over 0.1, some of the bricks in it" in words
+    assert "[-1.3, -0.4, -1.7] to [1.1, 2, 0.7]" in enerf("inspect", scene).out
     found = enerf("inspect", scene, "--json").object
     assert [cascade["voxel_side"] for cascade in found["cascades"]] == [0.1, 0.2, 0.4]
     assert found["environment"] == [6, 12]
@@ -184,7 +153,6 @@ def test_a_whole_scene_is_inspected_verified_compared_and_converted(enerf: Enerf
     tree = load(scene)
     save(replace(tree, environment=tree.environment * 0), tmp_path / "dark.nerftree")  # type: ignore[operator]
     compared = enerf("diff", scene, tmp_path / "dark.nerftree", "--views", 0, "--json").object
-    assert not compared["equal"]
     assert {name for name, said in compared["tensors"].items() if said != "same"} == {"environment"}
     for layout in LAYOUTS:
         out = tmp_path / f"{layout}.nerftree"
@@ -198,5 +166,4 @@ def test_a_whole_scene_is_inspected_verified_compared_and_converted(enerf: Enerf
     assert [cascade["resolution"] for cascade in about["cascades"]] == [[4, 4, 4]] * 3
     assert (about["brick"], about["environment"], about["sh_degree"]) == (1, [6, 12], 0)
     refused = enerf("convert", scene, tmp_path / "none.nerftree", "--resolution", 6)
-    assert refused.code == 2
-    assert "resolution 6 from cascades of 12 voxels in bricks of 3; expected one of 12, 4" in refused.err
+    assert (refused.code, "12, 4" in refused.err) == (2, True)

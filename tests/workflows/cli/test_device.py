@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from pipeline.errors import UsageError
 from workflows.cli import device
@@ -21,11 +22,11 @@ def test_the_device_that_is_taken(monkeypatch: pytest.MonkeyPatch, devices: int,
     assert device.resolve_device(wanted) == taken
 
 
-@pytest.mark.parametrize(("devices", "built", "words"), [(1, False, "torch was built without CUDA"), (0, True, "no CUDA device")])
-def test_cuda_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, devices: int, built: bool, words: str) -> None:
+@pytest.mark.parametrize(("devices", "built"), [(1, False), (0, True)])
+def test_cuda_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, devices: int, built: bool) -> None:
     monkeypatch.setattr(device, "cuda_device_count", lambda: devices)
     monkeypatch.setattr(device, "torch_has_cuda", lambda: built)
-    with pytest.raises(UsageError, match=words):
+    with pytest.raises(UsageError, match="CUDA"):
         device.resolve_device("cuda")
 
 
@@ -37,17 +38,12 @@ def test_torch_has_the_last_word_where_cuda_is_asked_for(monkeypatch: pytest.Mon
     assert device.resolve_device("auto") == "cpu"
 
 
-@pytest.mark.parametrize("hidden", ["", "-1"])
-def test_hidden_devices_do_not_count(monkeypatch: pytest.MonkeyPatch, hidden: str) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
-    assert device.cuda_device_count() == 0
-
-
-def test_it_agrees_with_torch() -> None:
-    import torch
-
+def test_it_agrees_with_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device.torch_has_cuda() == (torch.version.cuda is not None)
     assert device.has_cuda() == torch.cuda.is_available()
+    for hidden in ("", "-1"):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
+        assert device.cuda_device_count() == 0
 
 
 def test_asking_does_not_import_torch() -> None:

@@ -14,23 +14,22 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from efficientnerf.asset import format, region
+from efficientnerf.asset import format
 from efficientnerf.asset.cascades import cascade_grids, nested
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
 from stages.formats.exporters.splats.ply import read_splats
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
-from stages.mesh.run import MeshSettings
-from stages.turntable.run import TurntableSettings
+from stages.mesh.settings import MeshSettings
+from stages.turntable.settings import TurntableSettings
 from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
-from workflows.cli.files import EXR, REGIONS, TEXTURES
-from workflows.cli.main import enerf as enerf_commands
+from workflows.cli.files import EXR, TEXTURES
+from workflows.cli.main import COMMANDS
 from workflows.exporting import faces_from_text
 
 Enerf = Callable[..., Result]
@@ -62,17 +61,6 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_meshes_lie_in_the_frame_of_the_capture(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
-    files = [tmp_path / f"ball{extension}" for extension in (".ply", ".glb", ".obj")]
-    result = enerf("export", ball, "--to", *files, "--set", "mesh.max_faces=500", "--json")
-    assert result.code == 0, result.err
-    assert [entry["path"] for entry in result.objects[-1]["written"]] == [str(path) for path in files]
-    for path in files:
-        found = enerf("inspect", path, "--json").object
-        assert 100 < found["faces"] <= 500
-        np.testing.assert_allclose(found["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 0.6 / SCALE, atol=0.1)
-
-
 def test_a_texture_of_the_asset_in_all_formats(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     """The ball is red. Nothing is written twice: OBJ and USDC share their picture."""
     names = ["ball.glb", "ball.obj", "ball.stl", *(["ball.usdz", "ball.usdc"] if find_spec("pxr") else [])]
@@ -88,19 +76,21 @@ def test_a_texture_of_the_asset_in_all_formats(enerf: Enerf, ball: Path, tmp_pat
     picture = np.asarray(Image.open(tmp_path / "ball.png"))
     dark, bright = 255 / (1 + np.exp(8 * 0.2820948)), 255 / (1 + np.exp(-8 * 0.2820948))
     np.testing.assert_allclose(np.median(picture[picture.any(-1)], axis=0), [bright, dark, dark], atol=3)
-    for name in names[:3]:
-        np.testing.assert_allclose(enerf("inspect", tmp_path / name, "--json").object["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 1.2, atol=0.1)
-    again = enerf("export", ball, "--to", tmp_path / "other.obj", "--texture", "off", "--faces", 500)
-    assert again.code == 0, again.err
-    assert not (tmp_path / "other.mtl").exists()
+    without = tmp_path / "without"
+    without.mkdir()
+    assert enerf("export", ball, "--to", without / "a.obj", without / "a.ply", "--texture", "off", "--faces", 500).code == 0
+    assert enerf("export", ball, "--points", "--to", without / "p.ply", without / "p.xyz", "--set", "points.num_points=300").code == 0
+    assert sorted(path.name for path in without.iterdir()) == ["a.obj", "a.ply", "p.ply", "p.xyz"]
+    assert enerf("inspect", without / "p.ply", "--json").object["vertices"] == 300
+    for path in (*(tmp_path / name for name in names[:3]), without / "a.ply"):  # in the frame of the capture
+        np.testing.assert_allclose(enerf("inspect", path, "--json").object["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 0.6 / SCALE, atol=0.1)
 
 
 def test_an_obj_replaces_none_of_its_three_files_without_force(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     for name in ("ball.obj", "ball.mtl", "ball.png"):
         (tmp_path / name).write_text("mine", encoding="utf-8")
         result = enerf("export", ball, "--to", tmp_path / "ball.obj")
-        assert result.code == 2
-        assert f"{tmp_path / name}: exists" in result.err
+        assert (result.code, str(tmp_path / name) in result.err) == (2, True)
         assert [each.name for each in tmp_path.iterdir()] == [name]
         (tmp_path / name).unlink()
     for name in ("ball.obj", "ball.mtl", "ball.jpg"):
@@ -113,18 +103,17 @@ def test_an_obj_replaces_none_of_its_three_files_without_force(enerf: Enerf, bal
 
 
 def test_the_list_names_every_format(enerf: Enerf) -> None:
-    lines = enerf("export", "--list").out.splitlines()
     rows = enerf("export", "--list", "--json").objects[-1]["formats"]
     others = {".json", ".html", ".png", ".exr", ".mp4", ".nerftree"}
     assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *SPLAT_EXPORTERS, *VOLUME_EXPORTERS, *others}
     assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
-    assert sum("pip install 'efficientnerf[usd]'" in line for line in lines) == 2
-    assert sum("pip install 'efficientnerf[las]'" in line for line in lines) == 2
-    assert all(row["command"].split()[1] in enerf_commands.commands for row in rows)
-    assert len(lines) == 4 * len(rows)
+    assert all(row["command"].split()[1] in COMMANDS for row in rows)
+    listed = enerf("export", "--list").out
+    assert all(row["command"] in listed for row in rows)
+    assert all(listed.count(f"pip install 'efficientnerf[{extra}]'") == 2 for extra in ("usd", "las"))
 
 
-def test_the_textures_that_can_be_asked_for_are_those_that_there_are() -> None:
+def test_what_can_be_asked_for_is_what_there_is() -> None:
     assert typing.get_args(typing.get_type_hints(MeshSettings)["texture"]) == TEXTURES
     assert typing.get_args(typing.get_type_hints(TurntableSettings)["exr"]) == EXR
 
@@ -132,20 +121,9 @@ def test_the_textures_that_can_be_asked_for_are_those_that_there_are() -> None:
 @pytest.mark.parametrize(("text", "expected"), [("20k", 20_000), ("0.5K", 500), ("1m", 1_000_000), ("150000", 150_000)])
 def test_faces_may_be_given_in_thousands(text: str, expected: int) -> None:
     assert faces_from_text(text) == expected
-
-
-@pytest.mark.parametrize("text", ["", "k", "-5", "1e6", "nan", "inf", "0", "5kk", "٣k", "1_000"])
-def test_what_is_no_number_of_faces(text: str) -> None:
-    with pytest.raises(UsageError, match="--faces"):
-        faces_from_text(text)
-
-
-def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
-    result = enerf("export", ball, "--points", "--to", tmp_path / "ball.ply", tmp_path / "ball.xyz", "--set", "points.num_points=300")
-    assert result.code == 0, result.err
-    assert "300 points" in result.out
-    assert len((tmp_path / "ball.xyz").read_text(encoding="utf-8").splitlines()) == 300
-    assert enerf("inspect", tmp_path / "ball.ply", "--json").object["vertices"] == 300
+    for other in ("", "k", "-5", "1e6", "nan", "0", "5kk", "٣k", "1_000"):
+        with pytest.raises(UsageError, match="--faces"):
+            faces_from_text(other)
 
 
 def test_a_volume_of_what_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
@@ -188,38 +166,53 @@ def test_every_frame_has_its_passes_where_asked_for(enerf: Enerf, ball: Path, tm
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "words"),
+    ("arguments", "code", "remedy"),
     [
-        (["--to", "ball.fbx"], 2, ".ply, .glb, .obj, .usdz, .usdc, .stl, .vdb"),
-        (["--to", "ball.obj", "--points"], 2, ".ply, .xyz, .las, .laz, .vdb"),
-        (["--to", "ball.obj", "--splats"], 2, ".ply, .spz, .glb, .vdb"),
-        (["--to", "ball.ply", "--splats", "--points"], 2, "one of the two at a time"),
-        (["--to", "ball.glb", "--splats", "--texture", "asset"], 2, "None of the files keeps a texture"),
+        (["--to", "ball.fbx"], 2, ".ply, .glb, .obj"),
+        (["--to", "ball.obj", "--points"], 2, ".ply, .xyz"),
+        (["--to", "ball.obj", "--splats"], 2, ".ply, .spz"),
+        (["--to", "ball.ply", "--splats", "--points"], 2, "one"),
+        (["--to", "ball.glb", "--splats", "--texture", "asset"], 2, "texture"),
         (["--to", "ball.ply", "--splats", "--set", "splats.sh_degree=4"], 2, "splats.sh_degree"),
         (["--to", "ball.ply", "--splats", "--memory", "100m"], 2, "Lower splats.count (200000)"),
-        (["--to", "no/where/ball.ply"], 2, "does not exist"),
-        (["--to", "cameras.json"], 2, "has no cameras"),
-        (["--to", "ball.ply", "--set", "mesh.max_facs=3"], 2, "Nearest: mesh.max_faces."),
-        (["--to", "ball.ply", "--memory", "100m"], 2, "100 MiB may be taken (--memory)"),
+        (["--to", "no/where/ball.ply"], 2, "no/where"),
+        (["--to", "cameras.json"], 2, "cameras"),
+        (["--to", "ball.ply", "--memory", "100m"], 2, "--memory"),
         (["--to", "ball.ply", "--points", "--set", "points.num_points=1000000000"], 2, "Lower points.num_points (1000000000)"),
-        (["--to", "ball.ply", "--memory", "much"], 2, "expected a size, as in 512m, 8g or 1.5GiB"),
         (["--to", "ball.ply", "--set", "mesh.density_threshold=1e9"], 3, "Lower mesh.density_threshold"),
-        (["--to", "ball.glb", "--texture", "photographs"], 2, "holds no photographs. Give a run with its cameras, or --texture asset."),
-        (["--to", "ball.stl", "--texture", "asset"], 2, "None of the files keeps a texture"),
-        (["--to", "ball.ply", "--jpeg"], 2, "None of the files keeps a texture"),
-        (["--to", "ball.glb", "--faces", "many"], 2, "expected a number of faces, such as 20k"),
+        (["--to", "ball.glb", "--texture", "photographs"], 2, "--texture asset"),
+        (["--to", "ball.stl", "--texture", "asset"], 2, "texture"),
+        (["--to", "ball.ply", "--jpeg"], 2, "texture"),
+        (["--to", "ball.glb", "--faces", "many"], 2, "20k"),
         (["--to", "ball.glb", "--texture-size", "100"], 2, "mesh.texture_size"),
         ([], 2, "--to"),
     ],
 )
 def test_exports_that_are_refused(
-    enerf: Enerf, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, words: str
+    enerf: Enerf, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, remedy: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     result = enerf("export", ball, *arguments)
-    assert result.code == code
-    assert words in result.err
+    assert (result.code, remedy in result.err) == (code, True), result.err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "remedy"),
+    [
+        (["--width", 8192, "--height", 8192, "--memory", "2g"], "--width"),
+        (["--background", "pink"], "background"),
+        (["--video", "ball.avi"], ".mp4"),
+        (["--path", "captured"], "captured"),
+        (["--path", "odd.json"], "odd.json"),
+    ],
+)
+def test_renders_that_are_refused(enerf: Enerf, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[object], remedy: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("odd.json").write_text('{"frames": []}', encoding="utf-8")
+    result = enerf("render", ball, "--out", "frames", *arguments)
+    assert (result.code, remedy in result.err) == (2, True), result.err
+    assert [path.name for path in tmp_path.iterdir()] == ["odd.json"]
 
 
 def test_a_turntable_with_its_video(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
@@ -228,9 +221,7 @@ def test_a_turntable_with_its_video(enerf: Enerf, ball: Path, tmp_path: Path) ->
     assert result.code == 0, result.err
     assert sorted(path.name for path in out.glob("*.png")) == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
     pixels = np.asarray(Image.open(out / "frame_0001.png"))
-    assert pixels.shape == (24, 32, 3)
-    assert pixels[0, 0].tolist() == [0, 0, 255]
-    assert pixels[12, 16, 0] > 200
+    assert (pixels.shape, pixels[0, 0].tolist(), pixels[12, 16, 0] > 200) == ((24, 32, 3), [0, 0, 255], True)
     assert video.read_bytes()[4:8] == b"ftyp"
 
 
@@ -242,28 +233,6 @@ def test_a_camera_path(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     assert result.code == 0, result.err
     assert result.objects[-1]["written"][0].endswith("frame_0000.png")
     assert np.asarray(Image.open(tmp_path / "frames/frame_0000.png")).shape == (30, 40, 3)
-    path.write_text('{"frames": []}', encoding="utf-8")
-    assert enerf("render", ball, "--out", tmp_path / "frames", "--path", path).code == 2
-
-
-def test_frames_that_do_not_fit_into_memory_are_refused(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
-    result = enerf("render", ball, "--out", tmp_path / "frames", "--width", 8192, "--height", 8192, "--memory", "2g")
-    assert result.code == 2
-    assert "2.0 GiB may be taken (--memory). Render smaller frames (--width, --height)." in result.err
-    assert not (tmp_path / "frames").exists()
-
-
-def test_what_cannot_be_rendered(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
-    assert enerf("render", tmp_path, "--out", tmp_path / "frames").code == 2
-    assert enerf("render", ball, "--out", tmp_path / "frames", "--background", "pink").code == 2
-    assert enerf("render", ball, "--out", tmp_path / "frames", "--video", tmp_path / "ball.avi").code == 2
-    assert not (tmp_path / "frames").exists()
-
-
-def test_describing_an_asset(enerf: Enerf, ball: Path) -> None:
-    found = enerf("inspect", ball, "--json").object
-    assert (found["what"], found["resolution"], found["sh_degree"]) == ("asset", [24, 24, 24], 0)
-    assert "resolution               [24, 24, 24]" in enerf("inspect", ball).out
 
 
 def test_describing_gaussians(enerf: Enerf, tmp_path: Path) -> None:
@@ -272,30 +241,26 @@ def test_describing_gaussians(enerf: Enerf, tmp_path: Path) -> None:
         kind.write(scattered(20), tmp_path / f"a{extension}", Z_UP)
         found = enerf("inspect", tmp_path / f"a{extension}", "--json").object
         assert (found["what"], found["gaussians"], found["sh_degree"]) == ("splats", 20, 2)
-        assert "gaussians                20" in enerf("inspect", tmp_path / f"a{extension}").out
     MESH_EXPORTERS[".glb"].write(block(), tmp_path / "mesh.glb", Z_UP)
     assert enerf("inspect", tmp_path / "mesh.glb", "--json").object["what"] == "mesh"
     (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-30])
     result = enerf("inspect", tmp_path / "a.spz")
-    assert result.code == 2
-    assert "a.spz: " in result.err
+    assert (result.code, "a.spz" in result.err) == (2, True)
 
 
 def test_broken_assets(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
-    cut, altered, other = tmp_path / "cut.nerftree", tmp_path / "altered.nerftree", tmp_path / "other.nerftree"
+    found = enerf("inspect", ball, "--json").object
+    assert (found["what"], found["resolution"], found["sh_degree"]) == ("asset", [24, 24, 24], 0)
     content = ball.read_bytes()
-    cut.write_bytes(content[:-100])
-    altered.write_bytes(content[:-1] + b"x")
-    other.write_text("no asset", encoding="utf-8")
-    for path in (cut, altered, other):
-        result = enerf("render", path, "--out", tmp_path / "frames")
-        assert result.code == 4
-        assert str(path) in result.err
-        assert len(result.err.splitlines()) <= 2
-    assert enerf("inspect", cut).code == 4
-    assert enerf("inspect", ball.parent / "nothing.nerftree").code == 2
+    for damaged in (content[:-100], content[:-1] + b"x", b"no asset"):
+        (tmp_path / "a.nerftree").write_bytes(damaged)
+        result = enerf("render", tmp_path / "a.nerftree", "--out", tmp_path / "frames")
+        assert (result.code, str(tmp_path / "a.nerftree") in result.err, len(result.err.splitlines()) <= 2) == (4, True, True)
+    assert enerf("inspect", tmp_path / "a.nerftree").code == 4
     (tmp_path / "mesh.ply").write_text("ply\nbroken", encoding="utf-8")
-    assert enerf("inspect", tmp_path / "mesh.ply").code == 2
+    for name in ("mesh.ply", "nothing.nerftree"):
+        assert enerf("inspect", tmp_path / name).code == 2
+    assert enerf("render", tmp_path, "--out", tmp_path / "frames").code == 2
 
 
 @pytest.fixture(scope="module")
@@ -316,10 +281,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_regions_that_can_be_asked_for_are_those_that_there_are() -> None:
-    assert REGIONS == region.REGIONS
-
-
 def test_exports_take_the_foreground_unless_all_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
     """The blue ball is at 3.2 along x in the capture's frame, the red one's radius is 1.2."""
     both = ["--set", "mesh.region=all", "--region", "foreground"]
@@ -328,11 +289,7 @@ def test_exports_take_the_foreground_unless_all_is_asked_for(enerf: Enerf, scene
         assert enerf("inspect", tmp_path / f"{name}.ply", "--json").object["bounds"][1][0] == pytest.approx(reach, abs=0.25)
     assert enerf("export", scene, "--points", "--to", tmp_path / "points.ply", "--region", "all", "--set", "points.num_points=500").code == 0
     assert enerf("inspect", tmp_path / "points.ply", "--json").object["bounds"][1][0] == pytest.approx(3.9, abs=0.45)
-
-
-def test_inspecting_an_asset_tells_its_captured_cameras_by_their_number(enerf: Enerf, scene: Path) -> None:
-    lines = [line for line in enerf("inspect", scene).out.splitlines() if line.startswith("captured path")]
-    assert [line.split(maxsplit=2)[2] for line in lines] == ["11 cameras, listed with --json"]
+    assert "11 cameras" in enerf("inspect", scene).out
     assert len(enerf("inspect", scene, "--json").object["captured_path"]["poses"]) == 11
 
 
@@ -340,14 +297,10 @@ def test_a_crop_is_in_the_frame_of_the_capture_and_replaces_the_region(enerf: En
     found = enerf("export", scene, "--to", tmp_path / "a.ply", "--crop", 4, 1, 1, 2, -1, -1, "--set", "mesh.max_faces=3000")
     assert found.code == 0, found.err
     low, high = enerf("inspect", tmp_path / "a.ply", "--json").object["bounds"]
-    assert low[0] == pytest.approx(2.6, abs=0.25)
-    assert high[0] == pytest.approx(3.9, abs=0.25)
-    assert enerf("export", scene, "--to", tmp_path / "b.ply", "--crop", 4, 1, 1, 2, -1, -1, "--region", "foreground").code == 2
-    nothing = "nothing of the asset lies in this box of the capture's frame, where it reaches from -1."
-    for numbers, words in (((0, 0, 0, 1, 1, 0), "some volume"), ((50, 50, 50, 51, 51, 51), nothing), ((0, 0, 0, 1, 1, "nan"), "some volume")):
-        refused = enerf("export", scene, "--to", tmp_path / "c.ply", "--crop", *numbers)
-        assert refused.code == 2
-        assert words in refused.err
+    assert (low[0], high[0]) == (pytest.approx(2.6, abs=0.25), pytest.approx(3.9, abs=0.25))
+    ours = (4, 1, 1, 2, -1, -1)
+    for numbers, more in ((ours, ("--region", "foreground")), ((0, 0, 0, 1, 1, 0), ()), ((50, 50, 50, 51, 51, 51), ()), ((0, 0, 0, 1, 1, "nan"), ())):
+        assert enerf("export", scene, "--to", tmp_path / "c.ply", "--crop", *numbers, *more).code == 2
     assert not (tmp_path / "c.ply").exists()
 
 
@@ -367,27 +320,10 @@ def test_renders_show_all_with_its_surroundings_or_the_foreground(enerf: Enerf, 
     cropped = frame(enerf, scene, tmp_path / "crop", "--crop", 4, 1, 1, 2, -1, -1)
     assert cropped[18, 24, 2] > 200, "the crop is what is framed"
     assert (cropped[..., 0] > 200).sum() == (cropped.min(axis=2) > 200).sum(), "nothing red"
-
-
-def test_renders_of_the_foreground_show_nothing_else(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
-    subject = frame(enerf, scene, tmp_path / "subject", "--region", "foreground")
-    assert subject[0, 0].tolist() == [255, 255, 255]
-    assert subject[18, 24, 0] > 200
-    assert not ((subject[..., 2] > 200) & (subject[..., 0] < 100)).any(), "the blue ball"
-    assert np.array_equal(frame(enerf, scene, tmp_path / "set", "--set", "turntable.region=foreground"), subject)
-    on_black = frame(enerf, scene, tmp_path / "black", "--region", "foreground", "--background", "black")
-    assert on_black[0, 0].tolist() == [0, 0, 0]
-
-
-def test_paths_by_name(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
     ways = ("auto", "orbit", "sway", "captured")
-    pictures = {way: frame(enerf, scene, tmp_path / way, "--region", "foreground", "--path", way) for way in ways}
-    assert np.array_equal(pictures["auto"], pictures["sway"]), "cameras on an arc sway"
-    assert not np.array_equal(pictures["auto"], pictures["orbit"])
-    assert not np.array_equal(pictures["captured"], pictures["orbit"])
-
-
-def test_an_asset_without_cameras_has_no_captured_path(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
-    result = enerf("render", ball, "--out", tmp_path / "frames", "--path", "captured")
-    assert result.code == 2
-    assert "keeps no captured cameras" in result.err
+    subject, orbit, sway, captured = (frame(enerf, scene, tmp_path / way, "--region", "foreground", "--path", way) for way in ways)
+    assert (subject[0, 0].tolist(), subject[18, 24, 0] > 200) == ([255, 255, 255], True)
+    assert not ((subject[..., 2] > 200) & (subject[..., 0] < 100)).any(), "the blue ball"
+    assert np.array_equal(subject, sway), "cameras on an arc sway"
+    assert not any(np.array_equal(each, orbit) for each in (subject, captured))
+    assert np.array_equal(frame(enerf, scene, tmp_path / "set", "--set", "turntable.region=foreground"), subject)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -207,10 +205,9 @@ def test_hostile_paths(enerf: Enerf, toys: Path, tmp_path: Path, asset: Path, co
 
 DEEP = "[" * 3000 + "]" * 3000
 VALUES = {
-    "400 digits": "9" * 400, "5000 digits": "9" * 5000, "minus": "-" + "9" * 400, "hexadecimal": "0x" + "f" * 9000, "not a number": "nan", "infinite": "inf",
-    "large float": "1e999", "deep list": DEEP, "deep table": "{a=" * 500 + "1" + "}" * 500, "dots": "{" + ".".join("a" for _ in range(30_000)) + "=1}",
-    "text": '"x"', "escapes": "\x1b[31m\u202e\n\udcff", "nothing": "", "list": "[1, [2, [3]]]", "date": "1979-05-27", "table": "{a=1}", "broken": '"',
-    "long": "x" * 100_000, "nul": "\0",
+    "400 digits": "9" * 400, "minus": "-" + "9" * 400, "hexadecimal": "0x" + "f" * 9000, "not a number": "nan", "large float": "1e999", "deep list": DEEP,
+    "deep table": "{a=" * 500 + "1" + "}" * 500, "dots": "{" + ".".join("a" for _ in range(30_000)) + "=1}", "escapes": "\x1b[31m\u202e\n\udcff",
+    "nothing": "", "list": "[1, [2, [3]]]", "date": "1979-05-27", "broken": '"', "long": "x" * 100_000, "nul": "\0",
 }  # fmt: skip
 
 
@@ -230,32 +227,24 @@ def test_hostile_values(enerf: Enerf, toys: Path, tmp_path: Path, name: str) -> 
         assert not (tmp_path / "run").exists()
 
 
-CONFIGS = {
+CONFIGS: dict[str, str | bytes] = {
     "400 digits": f"[train]\niterations = {'9' * 400}", "5000 digits": f"seed = {'9' * 5000}", "a large seed": f"seed = {2**64}",
     "hexadecimal": f"seed = 0x{'f' * 9000}", "not a number": "[train]\nrate = nan", "infinite": "[train]\nrate = -inf", "deep": f"a = {DEEP}",
     "deep setting": f"[train]\nrate = {'[' * 100}{']' * 100}", "a list": "train = [1]", "tables": "[[train]]\nrate = 1",
-    "a table in a table": "[train.rate]\na = 1", "a list as preset": "preset = []", "a table as device": "[device]", "an unknown device": 'device = "tpu"',
-    "a flag as seed": "seed = true", "dots": ".".join("a" for _ in range(30_000)) + " = 1", "large": "#" * 70_000 + "\n", "binary": "\0\1\2",
+    "a list as preset": "preset = []", "a table as device": "[device]", "an unknown device": 'device = "tpu"', "a flag as seed": "seed = true",
+    "dots": ".".join("a" for _ in range(30_000)) + " = 1", "large": "#" * 70_000 + "\n", "binary": "\0\1\2",
     "a key with escapes": '[train]\n"\\u001b[31m\\n" = 1', "a stage with escapes": '["\\u001b[31m\\n"]\na = 1', "a surrogate": 'a = "\\ud800"',
-    "deep tables": "a = " + "{a = " * 400 + "1" + "}" * 400, "deeper tables": "train = " + "{a = " * 5000 + "1" + "}" * 5000,
-    "escapes outside": '"\\u001b\\n" = 1',
+    "deeper tables": "train = " + "{a = " * 5000 + "1" + "}" * 5000, "no text": b"\xff\xfe", "much that is no text": b"\xc3" * 70_000,
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_hostile_configurations(enerf: Enerf, toys: Path, tmp_path: Path, name: str) -> None:
-    path = tmp_path / "odd.toml"
-    path.write_text(CONFIGS[name], encoding="utf-8")
+    path, content = tmp_path / "odd.toml", CONFIGS[name]
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
     result = called(enerf, ["run", str(toys), "--out", str(tmp_path / "run"), "--config", str(path), "--json"])
     check_failure(result, {2}, as_json=True)
     assert not (tmp_path / "run").exists()
-
-
-def test_a_configuration_that_is_no_text(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
-    path = tmp_path / "odd.toml"
-    for content in (b"\xff\xfe", b"\xc3" * 70_000, b"a = '\xff'"):
-        path.write_bytes(content)
-        check_failure(called(enerf, ["run", str(toys), "--out", str(tmp_path / "run"), "--config", str(path)]), {2}, as_json=False)
 
 
 METADATA = {
@@ -303,10 +292,3 @@ def test_pipes_among_photographs_are_not_waited_for(tmp_path: Path) -> None:
     )  # fmt: skip
     assert images == []
     assert [name for name, _ in rejected] == names
-
-
-def test_help_answers_within_a_second() -> None:
-    done = subprocess.run([sys.executable, "-X", "importtime", "-m", "workflows.cli.main", "--help"], capture_output=True, text=True, check=True)
-    lines = [line.split("|") for line in done.stderr.splitlines() if line.startswith("import time:") and line.split("|")[1].strip().isdigit()]
-    assert sum(int(line[0].removeprefix("import time:")) for line in lines) < 1e6  # microseconds
-    assert "Exit codes" in done.stdout

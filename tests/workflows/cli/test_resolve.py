@@ -14,8 +14,6 @@ from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from pipeline.run import Run
 from pipeline.runner import refuse_what_cannot_work
-from stages.renamed_settings import REMOVED, RENAMED
-from stages.settings import describe_settings
 from workflows.asset import STAGES
 from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
@@ -43,14 +41,13 @@ TYPES = {"toy": Toy, "other": Other}
     ("option", "expected"),
     [
         ("toy.steps=20", 20),
-        ("toy.rate=1", 1.0),
         ("toy.rate=1e-3", 0.001),
         ("toy.kind=fancy", "fancy"),
-        ("toy.label=some words", "some words"),
         ("toy.label=8", "8"),
         ('toy.label="8"', "8"),
         ("toy.label=a=b", "a=b"),
         ("toy.label=", ""),
+        ("toy.label=x\nsteps = 3", "x\nsteps = 3"),
         ("toy.box=[1, 2, 3.5]", (1.0, 2.0, 3.5)),
         ("toy.box=1,2,3", (1.0, 2.0, 3.0)),
         ("toy.box=auto", "auto"),
@@ -62,66 +59,44 @@ def test_options_are_read_in_the_type_of_the_setting(option: str, expected: obje
     settings.put_option(option)
     name = option.partition("=")[0].partition(".")[2]
     found = getattr(settings.resolved()["toy"], name)
-    assert found == expected
-    assert type(found) is type(expected)
+    assert (found, type(found)) == (expected, type(expected))
+    assert settings.resolved()["toy"] == Toy(**{name: expected})
 
 
 @pytest.mark.parametrize(
-    ("option", "error", "words"),
+    ("option", "error", "remedy"),
     [
         ("toy.stepps=1", UnknownSetting, "toy.steps"),
+        ("tow.steps=1", UnknownSetting, "toy"),
         ("steps=1", UsageError, "stage.name=value"),
         ("toy.steps", UsageError, "stage.name=value"),
-        ("tow.steps=1", UnknownSetting, "Nearest: toy."),
         ("toy.steps=many", UsageError, "whole number"),
-        ("toy.steps=1.5", UsageError, "whole number"),
-        ("toy.steps=true", UsageError, "whole number"),
-        ("toy.steps=0", UsageError, "at least 1"),
         ("toy.steps=101", UsageError, "at most 100"),
-        ("toy.rate=nan", UsageError, "a number, at least 0"),
         ("toy.rate=inf", UsageError, "finite"),
         ("toy.kind=fancier", UsageError, "plain, fancy"),
-        ("toy.box=[1, 2]", UsageError, "3"),
-        ("toy.flag=1", UsageError, "true or false"),
-        ("toy.label=x\nsteps = 3", None, ""),
     ],
 )
-def test_what_does_not_fit_is_refused(option: str, error: type[PipelineError] | None, words: str) -> None:
-    settings = Settings(TYPES)
-    if error is None:
-        settings.put_option(option)
-        assert settings.resolved()["toy"] == Toy(label=option.partition("=")[2])
-        return
+def test_what_does_not_fit_is_refused(option: str, error: type[PipelineError], remedy: str) -> None:
     with pytest.raises(error) as caught:
-        settings.put_option(option)
-    assert words in str(caught.value)
+        Settings(TYPES).put_option(option)
+    assert remedy in str(caught.value)
     assert f"--set {option}" in str(caught.value)
-    assert caught.value.exit_code == 2
     assert "\n" not in str(caught.value)
 
 
-def test_the_last_word_wins() -> None:
+def test_the_last_word_wins_and_comes_back_from_a_record() -> None:
     settings = Settings(TYPES)
     settings.put_table({"toy": {"steps": 2, "rate": 2}, "other": {"steps": 5}}, "preset")
     settings.put_table({"toy": {"steps": 3}}, "config")
-    settings.put_option("toy.seed=1")
+    settings.put_option("toy.box=[0, 0, 1]")
     settings.put_seed(7)
-    assert settings.resolved() == {"toy": Toy(steps=3, rate=2.0, seed=7), "other": Other(steps=5)}
-    assert table_of(settings.resolved())["toy"]["box"] == "auto"
-
-
-def test_what_a_run_recorded_comes_back() -> None:
-    before = Settings(TYPES)
-    before.put_option("toy.box=[0, 0, 1]")
-    after = Settings(TYPES)
-    assert after.put_recorded(table_of(before.resolved())) == []
-    assert after.resolved() == before.resolved()
-
-
-def test_recorded_settings_of_another_version_are_named() -> None:
-    settings = Settings(TYPES)
-    assert settings.put_recorded({"toy": {"steps": 4, "gone": 1}, "lost": {"x": 1}}) == ["toy.gone", "lost.x"]
-    assert settings.resolved()["toy"].steps == 4
+    assert settings.resolved() == {"toy": Toy(steps=3, rate=2.0, seed=7, box=(0.0, 0.0, 1.0)), "other": Other(steps=5)}
+    recorded = table_of(settings.resolved())
+    again = Settings(TYPES)
+    assert again.put_recorded({**recorded, "toy": {**recorded["toy"], "gone": 1}, "lost": {"x": 1}}) == ["toy.gone", "lost.x"]
+    assert again.resolved() == settings.resolved()
+    for value in (True, 3, 0.25, [1, 2], "words"):
+        assert value in parse_value(shown(value))
 
 
 def test_config_files(tmp_path: Path) -> None:
@@ -134,122 +109,39 @@ def test_config_files(tmp_path: Path) -> None:
     assert settings.resolved()["toy"] == Toy(steps=4)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"steps = ", "not valid TOML"),
-        (b"\xff\xfe", "not a text file"),
-        (b"steps = 3", "outside a table"),
-        (b"seed = 'x'", "whole number"),
-        (None, "cannot be read"),
-    ],
-)
-def test_broken_config_files(tmp_path: Path, content: bytes | None, words: str) -> None:
+@pytest.mark.parametrize("content", [b"steps = ", b"\xff\xfe", b"steps = 3", b"seed = 'x'", None])
+def test_broken_config_files(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "mine.toml"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(PipelineError, match=words) as caught:
+    with pytest.raises(PipelineError, match=re.escape(str(path))) as caught:
         read_config(path)
-    assert str(path) in str(caught.value)
     assert caught.value.exit_code == 2
-
-
-def test_an_unknown_preset_names_the_nearest() -> None:
-    with pytest.raises(UsageError, match=r"Nearest: preview\."):
+    with pytest.raises(UsageError, match="preview"):
         read_preset("previw")
 
 
-def test_values_are_shown_as_they_are_given() -> None:
-    for value in (True, 3, 0.25, [1, 2], "words"):
-        assert value in parse_value(shown(value))
-
-
-def test_what_settings_say_about_themselves() -> None:
-    about = {info.name: info for info in describe_settings(Toy)}
-    assert about["rate"].unit == "per second"
-    assert about["steps"].minimum == 1
-    assert about["kind"].choices == ("plain", "fancy")
-    assert about["kind"].listed
-    assert not about["box"].listed
-    assert (about["box"].advanced, about["steps"].advanced) == (True, False)
-    assert about["box"].type_name == "a list of 3, each a number, or auto"
-    assert about["steps"].type_name == "a whole number, at least 1, at most 100"
-
-
-@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("1.5m", 90), (" 2m30s ", 150), ("0", 0)])
+@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("10m", 600), ("1h30m", 5400), ("1.5m", 90), (" 2m30s ", 150), ("0", 0)])
 def test_times_are_read(text: str, seconds: float) -> None:
     assert seconds_of(text) == seconds
+    for other in ("", "soon", "10 minutes", "m", "-3s", "5s1m"):
+        with pytest.raises(UsageError, match="as in 90s, 10m or 1h30m"):
+            seconds_of(other)
 
 
-@pytest.mark.parametrize("text", ["", "soon", "10 minutes", "m", "-3s", "5s1m"])
-def test_what_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"--budget .*expected a time, as in 90s, 10m or 1h30m"):
-        seconds_of(text)
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ("train.hidden=64", "train.hidden is now train.hidden_dim."),
-        ("bake.final_rate=1", "bake.final_rate is now bake.lr_final_ratio."),
-        ("train.coarse=voxels", "train.coarse was removed: pivots are always chosen by the coarse field."),
-        ("train.rate_hold=5", "train.rate_hold was removed"),
-    ],
-)
-def test_old_names_are_answered_with_the_new_ones(option: str, words: str) -> None:
+@pytest.mark.parametrize("text", ["turntable.background=pink", "turntable.background=#12345", "mesh.density_threshold=0", "points.density_threshold=-3.5"])
+def test_values_that_no_stage_can_work_with_are_refused_when_they_are_given(text: str) -> None:
     settings = Settings({stage.name: stage.settings for stage in STAGES})
-    with pytest.raises(UnknownSetting, match=re.escape(words)) as caught:
-        settings.put_option(option)
-    assert caught.value.exit_code == 2
-    stage, _, name = option.partition("=")[0].partition(".")
-    with pytest.raises(UnknownSetting, match=re.escape(words)):
-        settings.put_table({stage: {name: 1}}, "--config mine.toml")
-
-
-def test_the_table_of_old_names_leads_to_settings_of_today() -> None:
-    for stage in STAGES:
-        known = {info.name for info in describe_settings(stage.settings)}
-        for old, new in RENAMED.get(stage.name, {}).items():
-            assert new in known
-            assert old not in known, "an old name cannot be used again: recorded settings could not be told apart"
-        assert not known & REMOVED.get(stage.name, {}).keys()
-
-
-def test_recorded_settings_of_before_are_read_under_their_new_names() -> None:
-    types = {stage.name: stage.settings for stage in STAGES}
-    old = {"hidden": 64, "log2_table": 0, "budget": 0.0, "samples": 0, "distortion": None, "near": 0.0, "far": 0.0, "crop_steps": 0, "rate_hold": 0}
-    settings = Settings(types)
-    assert settings.put_recorded({"train": old, "evaluate": {"views": 0, "lpips": "none"}, "turntable": {"exr": "none", "fov": None}}) == []
-    train, evaluate, turntable = (settings.resolved()[name] for name in ("train", "evaluate", "turntable"))
-    assert (train.hidden_dim, train.log2_hashmap_size, train.time_budget, train.sample_batch_size) == (64, "auto", "off", "off")
-    assert (train.distortion_loss_weight, train.far_plane, train.precrop_steps) == ("auto", "auto", 0)
-    assert (evaluate.field_views, evaluate.lpips, turntable.exr, turntable.fov) == ("all", "off", "off", "auto")
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("turntable.background=pink", "expected auto, white, black, transparent or a colour as #rrggbb"),
-        ("turntable.background=#12345", "expected auto, white, black, transparent or a colour as #rrggbb"),
-        ("mesh.density_threshold=0", "expected a number, more than 0, or auto"),
-        ("points.density_threshold=-3.5", "expected a number, more than 0, or auto"),
-    ],
-)
-def test_values_that_no_stage_can_work_with_are_refused_when_they_are_given(text: str, found: str) -> None:
-    settings = Settings({stage.name: stage.settings for stage in STAGES})
-    with pytest.raises(UsageError, match=re.escape(found)):
+    with pytest.raises(UsageError, match=re.escape(text.partition("=")[0])):
         settings.put_option(text)
-    for stage, value in (("turntable", "#00ff7F"), ("turntable", "transparent")):
-        settings.put_option(f"{stage}.background={value}")
+    for value in ("#00ff7F", "transparent"):
+        settings.put_option(f"turntable.background={value}")
 
 
 def test_the_preset_whose_field_cannot_be_baked_is_refused_where_it_would_be(tmp_path: Path) -> None:
     """And a mesh whose normal map has no texture to lie on, before hours of training."""
-    run = Run.create(tmp_path / "run", tmp_path, {"train": {"field": "nerf"}, "mesh": {"normal_map": True, "texture": "off"}})
-    with pytest.raises(UsageError, match=r"can't be baked"):
-        refuse_what_cannot_work(STAGES, run)
-    refuse_what_cannot_work(STAGES[:2], run)
-    run = Run.create(tmp_path / "other", tmp_path, {"mesh": {"normal_map": True, "texture": "off"}})
-    with pytest.raises(UsageError, match=r"mesh\.texture is off"):
-        refuse_what_cannot_work(STAGES, run)
-    refuse_what_cannot_work(STAGES[:3], run)
+    for name, settings, fine in (("run", {"train": {"field": "nerf"}}, 2), ("other", {"mesh": {"normal_map": True, "texture": "off"}}, 3)):
+        run = Run.create(tmp_path / name, tmp_path, settings)
+        with pytest.raises(UsageError, match=next(iter(settings)) if name == "other" else "baked"):
+            refuse_what_cannot_work(STAGES, run)
+        refuse_what_cannot_work(STAGES[:fine], run)

@@ -19,18 +19,13 @@ def sources(tmp_path: Path) -> list[Path]:
 
 def test_all_are_taken_and_recorded(enerf: Enerf, sources: list[Path], tmp_path: Path) -> None:
     result = enerf("run", *sources, "--out", tmp_path / "run", "--until", "poses", "--dry-run", "--frames", "20")
-    assert (result.code, "poses" in result.out + result.err) == (0, True)
-
-
-def test_what_does_not_fit_together_is_refused(enerf: Enerf, sources: list[Path], tmp_path: Path) -> None:
-    twice = enerf("run", *sources, tmp_path / "photos" / "..", tmp_path / "photos", "--out", tmp_path / "run")
-    assert (twice.code, "given twice" in twice.err) == (2, True)
+    assert result.code == 0
+    for refused in (["run", *sources, tmp_path / "photos" / ".." / "photos"], ["run", sources[1], "--frames", "1", "--dry-run"]):
+        assert enerf(*refused, "--out", tmp_path / "run").code == 2
     posed = captures.nerfstudio(tmp_path / "posed")
-    result = enerf("run", sources[1], posed, "--out", tmp_path / "run", "--until", "poses")
-    assert (result.code, "is read as nerfstudio; of several sources photographs and videos alone" in result.err) == (2, True)
+    assert enerf("run", sources[1], posed, "--out", tmp_path / "run", "--until", "poses").code == 2, "photographs and videos alone"
     about = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (about["source"], about["also"]) == (str(sources[1]), [str(posed)])
-    assert enerf("run", sources[1], "--out", tmp_path / "other", "--frames", "1", "--dry-run").code == 2
 
 
 def test_networks_that_match_are_given_as_two_files(enerf: Enerf, sources: list[Path], tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ from pipeline.errors import RunLocked
 from pipeline.manifest import read_manifest
 from pipeline.run import Run
 from tests.workflows.command import Enerf
-from workflows.asset import Workflow
 from workflows.cli.request import Options, plan_run
+from workflows.workflow import Workflow
 
 
 def recorded(run: Path) -> dict[str, dict[str, object]]:
@@ -31,7 +31,7 @@ def test_settings_that_another_run_changed_meanwhile_are_kept(enerf: Enerf, toys
             assert others.pop()().code == 0
         return "cpu"
 
-    monkeypatch.setattr("workflows.cli.device.resolve_device", meanwhile)
+    monkeypatch.setattr("workflows.cli.run.resolve_device", meanwhile)
     assert enerf("run", "--out", run, "--set", "train.rate=9").code == 0
     assert (recorded(run)["poses"]["repeat"], recorded(run)["train"]["rate"]) == (2, 9)
     for stage in ("poses", "train"):

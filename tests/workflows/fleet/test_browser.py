@@ -75,9 +75,8 @@ def test_keys(browser: Any, page_file: Path) -> None:
         for key in ("j", "j", "ArrowDown", "k"):
             page.keyboard.press(key)
         assert page.evaluate("document.activeElement.scene.name") == "scene-001"
-        page.keyboard.press("j")
-        page.keyboard.press("j")
-        page.keyboard.press(" ")
+        for key in ("j", "j", " "):
+            page.keyboard.press(key)
         assert "last" in page.inner_text("tr.details pre")
         page.keyboard.press(" ")
         assert page.query_selector("tr.details") is None
@@ -86,9 +85,13 @@ def test_keys(browser: Any, page_file: Path) -> None:
         assert names(page) == ["scene-004"]
         page.keyboard.press("Escape")
         assert len(names(page)) == sum(totals(page_file).values())
-        page.keyboard.press("j")
-        page.keyboard.press("Enter")
+        for key in ("j", "Enter"):
+            page.keyboard.press(key)
         page.wait_for_url("**/scene-000/report.html")
+    with opened(browser, page_file, viewport={"width": 360, "height": 700}, color_scheme="dark") as each:
+        each.page.click("button.more >> nth=3")
+        assert each.page.evaluate("document.documentElement.scrollWidth") <= 360
+        assert each.console == []
 
 
 def test_only_what_is_seen_is_asked_for(browser: Any, page_file: Path) -> None:
@@ -133,11 +136,3 @@ def test_a_turntable_plays_where_one_taps(browser: Any, page_file: Path) -> None
         assert each.page.evaluate("document.querySelectorAll('video').length") == 1
         each.page.tap("h1")
         each.page.wait_for_selector("video", state="detached")
-
-
-def test_nothing_runs_over_a_narrow_page(browser: Any, page_file: Path) -> None:
-    for width in (360, 700, 1200):
-        with opened(browser, page_file, viewport={"width": width, "height": 700}, color_scheme="dark") as each:
-            each.page.click("button.more >> nth=3")
-            assert each.page.evaluate("document.documentElement.scrollWidth") <= width
-            assert each.console == []

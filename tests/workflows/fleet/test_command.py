@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 
+from pipeline.fleet import requests
 from tests.pipeline.toy import contents
 from tests.workflows.command import Enerf
+from workflows.fleet.running import held
 
 ROOT = Path(__file__).resolve().parents[3]
-ONLY_FAILS = {"bad": "found nothing, expected something", "error": "first line", "memory": "memory ran out again"}
 
 
 @pytest.fixture
@@ -52,65 +53,59 @@ def states(fleet: Path) -> dict[str, str]:
 
 
 def test_the_scenes_of_a_folder_are_as_one_by_one(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
+    """And the same command again does nothing, or what is stale after a change."""
     fleet = tmp_path / "fleet"
-    result = enerf("fleet", scenes, "--out", fleet, "--preset", "tiny", "--jobs", 2)
+    command = ["fleet", scenes, "--out", fleet, "--preset", "tiny"]
+    result = enerf(*command, "--jobs", 2)
     assert result.code == 0, result.err
-    assert set(states(fleet).values()) == {"done"}
+    assert fleet_json(fleet)["totals"] == {"waiting": 0, "running": 0, "done": 4, "failed": 0, "quarantined": 0}
     assert (fleet / "index.html").is_file()
     assert (fleet / "fleet.csv").read_text(encoding="utf-8").count("done") == 4
-    assert fleet_json(fleet)["totals"] == {"waiting": 0, "running": 0, "done": 4, "failed": 0, "quarantined": 0}
     for number in (0, 3):
         alone = tmp_path / f"alone{number}"
         assert enerf("run", scenes / f"s{number}", "--out", alone, "--preset", "tiny", "--quiet").code == 0
         assert stages_of(fleet / f"s{number}") == stages_of(alone)
         assert (fleet / f"s{number}" / "report.html").is_file()
+    before = {path: path.stat().st_mtime_ns for path in fleet.glob("*/*/manifest.json")}
+    assert len(before) == 12
+    again = enerf(*command, "--json")
+    assert [each["event"] for each in again.objects] == ["scene_done"] * 4 + ["summary"]
+    assert before == {path: path.stat().st_mtime_ns for path in fleet.glob("*/*/manifest.json")}
+    (scenes / "s3" / "a.txt").write_text("another", encoding="utf-8")
+    (fleet / "s2" / "points" / "points.ply").write_text("altered", encoding="utf-8")
+    assert enerf(*command).code == 0
+    made = {path.parent.relative_to(fleet).as_posix() for path, time in before.items() if path.stat().st_mtime_ns != time}
+    assert made == {"s3/poses", "s3/train", "s3/points", "s2/points"}
 
 
 def stages_of(run: Path) -> dict[str, bytes]:
     return {name: data for name, data in contents(run).items() if name.startswith(("poses/", "train/", "points/"))}
 
 
-def test_the_same_command_again_does_nothing_and_after_a_change_what_is_stale(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet"
-    assert enerf("fleet", scenes, "--out", fleet, "--preset", "tiny").code == 0
-    before = {path: path.stat().st_mtime_ns for path in fleet.glob("*/*/manifest.json")}
-    assert len(before) == 12
-    again = enerf("fleet", scenes, "--out", fleet, "--preset", "tiny", "--json")
-    assert again.code == 0
-    assert [each["event"] for each in again.objects] == ["scene_done"] * 4 + ["summary"]
-    assert before == {path: path.stat().st_mtime_ns for path in fleet.glob("*/*/manifest.json")}
-    (scenes / "s3" / "a.txt").write_text("another", encoding="utf-8")
-    (fleet / "s2" / "points" / "points.ply").write_text("altered", encoding="utf-8")
-    assert enerf("fleet", scenes, "--out", fleet, "--preset", "tiny").code == 0
-    made = {path.parent.relative_to(fleet).as_posix() for path, time in before.items() if path.stat().st_mtime_ns != time}
-    assert made == {"s3/poses", "s3/train", "s3/points", "s2/points"}
-
-
 def test_bad_scenes_are_quarantined_with_their_reason_and_the_others_done(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
     fleet = tmp_path / "fleet"
-    kinds = dict(zip(("s1", "s2", "s3"), ONLY_FAILS, strict=True))
+    kinds = {"s1": "bad", "s2": "error", "s3": "disk"}  # a full disk is no fault of the scene
     result = enerf("fleet", manifest(scenes, **kinds), "--out", fleet, "--jobs", 2)
     assert result.code == 3, result.err
-    found = {scene["name"]: scene for scene in fleet_json(fleet)["scenes"]}
-    for name, scene in found.items():
-        assert scene["state"] == ("quarantined" if name in kinds else "done")
-        if name in kinds:
-            assert ONLY_FAILS[kinds[name]] in scene["reason"]
-            assert any(line for line in scene["last_lines"])
-            assert scene["stages"]["train"]["state"] == "failed"
+    assert states(fleet) == {"s0": "done", "s1": "quarantined", "s2": "quarantined", "s3": "failed"}
+    for scene in fleet_json(fleet)["scenes"][1:]:
+        assert scene["reason"]
+        assert any(scene["last_lines"])
+        assert scene["stages"]["train"]["state"] == "failed"
     assert f"enerf fleet retry {fleet}" in result.out
-    assert enerf("fleet", manifest(scenes, **kinds), "--out", fleet, "--json").objects[-1]["totals"]["quarantined"] == 3
+    told = enerf("fleet", "status", fleet)
+    assert (told.code, "first line" in told.out) == (0, True)
+    assert enerf("fleet", "status", fleet, "--json").object["totals"]["quarantined"] == 2
+    again = enerf("fleet", manifest(scenes, **kinds), "--out", fleet, "--json")
+    assert [(each["scene"], each["stage"]) for each in again.objects if each["event"] == "stage_started"] == [("s3", "train")]
+    tried = enerf("fleet", "retry", fleet, "s2", "--json")
+    assert tried.code == 3
+    assert "s2" in {each.get("scene") for each in tried.objects if each["event"] == "stage_failed"} <= {"s2", "s3"}
+    assert enerf("fleet", "retry", fleet, "nobody").code == 2
     # Once it is put right, a scene is another, and is run.
     assert enerf("fleet", manifest(scenes), "--out", fleet).code == 0
     assert set(states(fleet).values()) == {"done"}
-
-
-def test_a_full_disk_is_no_fault_of_the_scene(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet"
-    assert enerf("fleet", manifest(scenes, s1="disk"), "--out", fleet).code == 3
-    assert states(fleet)["s1"] == "failed"
-    again = enerf("fleet", manifest(scenes, s1="disk"), "--out", fleet, "--json")
-    assert [each["stage"] for each in again.objects if each["event"] == "stage_started"] == ["train"]
+    assert enerf("fleet", "status", tmp_path / "nowhere").code == 2
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits on addresses are Linux's")
@@ -120,49 +115,26 @@ def test_what_runs_out_of_memory_is_done_in_half_by_a_new_process(enerf: Enerf, 
     result = enerf("fleet", manifest(scenes, s0="greedy", s2="ended"), "--out", fleet, "--memory", "1g", "--json")
     assert result.code == 0, fleet_json(fleet)
     told = {each["scene"]: each["text"] for each in result.objects if each["event"] == "retry"}
-    assert told["s0"].startswith("train: memory ran out in 1.0 GiB")
+    assert "1.0 GiB" in told["s0"]
     assert "SIGKILL" in told["s2"]
-    assert "It is tried once more, in half of that." in told["s0"]
-    started = [(each["scene"], each["text"]) for each in result.objects if each["event"] == "message" and each["stage"] == "train"]
-    assert [text.split()[0] for scene, text in started if scene == "s0"] == ["1073741824", "536870912"]
-    processes = [text.split()[1] for scene, text in started if scene == "s0"]
-    assert len(set(processes)) == 2
+    started = [each["text"].split() for each in result.objects if each["event"] == "message" and (each["scene"], each["stage"]) == ("s0", "train")]
+    assert [limit for limit, _ in started] == ["1073741824", "536870912"]
+    assert started[0][1] != started[1][1], "another process"
     assert (fleet / "s0" / "points" / "points.ply").is_file()
 
 
-def test_retry_tries_what_was_given_up(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet"
-    assert enerf("fleet", manifest(scenes, s1="bad", s2="error"), "--out", fleet).code == 3
-    result = enerf("fleet", "retry", fleet, "s2", "--json")
-    assert result.code == 3
-    assert {each.get("scene") for each in result.objects if each["event"] == "stage_failed"} == {"s2"}
-    assert enerf("fleet", "retry", fleet, "nobody").code == 2
-
-
-def test_a_source_that_has_gone_is_named(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet"
-    path = manifest(scenes)
-    (scenes / "s2" / "a.txt").unlink()
-    result = enerf("fleet", path, "--out", fleet)
-    assert result.code in (2, 3)  # by the manifest, or by the scene
-    assert str(scenes / "s2") in result.err + json.dumps(fleet_json(fleet) if fleet.exists() else "")
-
-
 def test_a_second_fleet_says_who_holds_it(enerf: Enerf, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline.fleet import requests
-    from workflows.fleet.running import held
-
     monkeypatch.setattr(requests, "ANSWER_SECONDS", 0.0)
     fleet = tmp_path / "fleet"
-    assert enerf("fleet", scenes, "--out", fleet, "--preset", "tiny").code == 0
+    command = ["fleet", scenes / "s1", scenes / "s2", "--out", fleet, "--preset", "tiny"]
+    assert enerf(*command).code == 0
     with held(fleet):
-        result = enerf("fleet", scenes, "--out", fleet, "--preset", "tiny")
-        assert result.code == 5
-        assert f"process {os.getpid()} on" in result.err
-        assert "once the process that runs it answers" in enerf("fleet", "cancel", fleet, "s1").out
+        result = enerf(*command)
+        assert (result.code, f"process {os.getpid()} on" in result.err) == (5, True)
+        assert enerf("fleet", "cancel", fleet, "s1").code == 0
         assert len(list((fleet / ".requests").iterdir())) == 1
     assert enerf("fleet", "cancel", fleet).code == 2
-    assert enerf("fleet", scenes, "--out", fleet, "--preset", "tiny").code == 0  # requests to a process that has ended are not heeded
+    assert enerf(*command).code == 0  # requests to a process that has ended are not heeded
 
 
 def test_of_two_fleets_at_once_the_second_says_who_holds_it(toys: Path, scenes: Path, tmp_path: Path) -> None:
@@ -186,17 +158,6 @@ def test_of_two_fleets_at_once_the_second_says_who_holds_it(toys: Path, scenes: 
     assert set(states(fleet).values()) == {"done"}
 
 
-def test_status_tells_of_each_scene(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet"
-    enerf("fleet", manifest(scenes, s1="bad"), "--out", fleet)
-    shown = enerf("fleet", "status", fleet)
-    assert shown.code == 0
-    assert "3 done, 1 quarantined" in shown.out
-    assert "found nothing, expected something" in shown.out
-    assert enerf("fleet", "status", fleet, "--json").object["totals"]["done"] == 3
-    assert enerf("fleet", "status", tmp_path / "nowhere").code == 2
-
-
 @pytest.mark.parametrize("bad", [["--jobs", "0"], ["--cluster", "cloud"], ["--cluster-options", "x.toml"], ["--preset", "no"], ["--set", "train.no=1"]])
 def test_mistakes_are_found_before_anything_runs(enerf: Enerf, scenes: Path, tmp_path: Path, bad: list[str]) -> None:
     assert enerf("fleet", scenes, "--out", tmp_path / "fleet", *bad).code == 2
@@ -218,22 +179,11 @@ def test_a_folder_of_something_else_is_left_alone(enerf: Enerf, scenes: Path, tm
 
 def test_pages_are_not_written_through_links(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
     fleet = tmp_path / "fleet"
-    assert enerf("fleet", scenes / "s1", scenes / "s2", "--out", fleet, "--preset", "tiny").code == 0
+    command = ["fleet", scenes / "s1", scenes / "s2", "--out", fleet, "--preset", "tiny"]
+    assert enerf(*command).code == 0
     (tmp_path / "pictures").mkdir()
     shutil.rmtree(fleet / "thumbnails")
     (fleet / "thumbnails").symlink_to(tmp_path / "pictures")
-    told = enerf("fleet", scenes / "s1", scenes / "s2", "--out", fleet, "--preset", "tiny")
-    assert (told.code, "thumbnails is a link" in told.err) == (4, True)
+    told = enerf(*command)
+    assert (told.code, "thumbnails" in told.err) == (4, True)
     assert list((tmp_path / "pictures").iterdir()) == []
-
-
-def test_a_sweep_computes_shared_stages_once(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet"
-    result = enerf("fleet", scenes / "s0", scenes / "s1", "--out", fleet, "--preset", "tiny", "--sweep", "train.rate=1.0,2.0", "--jobs", 2, "--json")
-    assert result.code == 0, result.err
-    assert len(fleet_json(fleet)["scenes"]) == 4
-    ran = [each for each in result.objects if each["event"] == "stage_done"]
-    assert sum(each["stage"] == "poses" for each in ran) == 2
-    assert sum(each["stage"] == "train" for each in ran) == 4
-    for scene in fleet_json(fleet)["scenes"]:
-        assert enerf("verify", fleet / scene["name"]).code == 0

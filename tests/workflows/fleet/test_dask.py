@@ -67,28 +67,6 @@ def test_scenes_on_dask_are_as_one_by_one(enerf: Enerf, scenes: Callable[..., Pa
     assert digests(fleet / "s0") == digests(alone)
 
 
-def test_a_cluster_that_is_started_here_looks_less_at_itself_and_as_the_user_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    import copy
-
-    import dask
-    from distributed import LocalCluster
-
-    from pipeline.executors.dask import DaskWorkers
-
-    config, defaults = copy.deepcopy(dask.config.global_config), list(dask.config.defaults)
-    dask.config.set({"distributed.admin.tick.interval": "123ms"})
-    try:
-        workers = DaskWorkers("none", options={"n_workers": 1, "processes": False})
-        assert isinstance(workers._cluster, LocalCluster)
-        workers.close()
-        found = {key: dask.config.get(f"distributed.{key}") for key in ("worker.profile.enabled", "admin.system-monitor.interval", "admin.tick.interval")}
-        assert found == {"worker.profile.enabled": False, "admin.system-monitor.interval": "5s", "admin.tick.interval": "123ms"}
-    finally:
-        dask.config.defaults[:] = defaults
-        dask.config.global_config.clear()
-        dask.config.global_config.update(config)
-
-
 def test_what_ssh_needs_is_named(enerf: Enerf, scenes: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "asyncssh", None)
     (tmp_path / "ssh.toml").write_text('hosts = ["localhost", "localhost"]\n', encoding="utf-8")

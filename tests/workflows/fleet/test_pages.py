@@ -7,9 +7,11 @@ import csv
 import hashlib
 import io
 import os
+import random
 import re
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -32,14 +34,11 @@ def test_the_page_has_what_the_state_has() -> None:
     found = facts(index_page(state, title="t", pictures={"scene-000": 7}, reports={"scene-000"}))
     assert found["note"] == printable(state.note)
     assert [scene["name"] for scene in found["scenes"]] == [scene.name for scene in state.scenes]
-    first, broken = found["scenes"][0], found["scenes"][3]
-    assert (first["psnr"], first["ssim"], first["seconds"], first["bytes"], first["grade"]) == (20, 0.9, 10, 1_000_000, "good")
-    assert (first["result"], first["result_summary"]) == ("poor", printable(f"All is fog {NASTY}."))
-    assert (broken["result"], broken["result_summary"]) == (None, None)
-    assert first["report"] == "scene-000/report.html"
-    assert first["picture"] == "thumbnails/scene-000.webp?7"
-    assert first["video"] == "scene-000/turntable/turntable.mp4"
-    assert (broken["state"], broken["report"], broken["picture"], broken["video"]) == ("quarantined", None, None, None)
+    expected = {"psnr": 20, "ssim": 0.9, "seconds": 10, "bytes": 1_000_000, "grade": "good", "result": "poor", "state": "done"}
+    expected |= {"report": "scene-000/report.html", "picture": "thumbnails/scene-000.webp?7", "video": "scene-000/turntable/turntable.mp4"}
+    assert found["scenes"][0].items() >= (expected | {"result_summary": printable(f"All is fog {NASTY}.")}).items()
+    broken = dict.fromkeys(("result", "result_summary", "report", "picture", "video"))
+    assert found["scenes"][3].items() >= (broken | {"state": "quarantined"}).items()
     assert found["bytes"] == sum(scene.bytes for scene in state.scenes)
     assert sum(found["totals"].values()) == 24
 
@@ -90,52 +89,52 @@ def test_csv_reads_back() -> None:
     state.scenes[1].reason = "=1+1"
     rows = list(csv.DictReader(io.StringIO(fleet_csv(state), newline="")))
     assert [row["name"] for row in rows] == [scene.name for scene in state.scenes]
-    assert float(rows[0]["psnr"]) == 20.0
-    assert rows[0]["train.iterations"] == "2000"
-    assert rows[1]["train.iterations"] == ""
+    assert (float(rows[0]["psnr"]), rows[0]["train.iterations"], rows[1]["train.iterations"]) == (20.0, "2000", "")
     assert rows[1]["reason"] == "'=1+1", "no spreadsheet takes it for a formula"
     assert rows[3]["reason"].startswith("</script>")
     assert "\x1b" not in fleet_csv(state)
 
 
-def test_pages_are_written_with_thumbnails_and_at_the_end(tmp_path: Path) -> None:
-    state = mixed()
+def shown(fleet: Path, name: str) -> list[Any]:
+    """This of each scene of the page."""
+    return [scene[name] for scene in facts((fleet / "index.html").read_text("utf-8"))["scenes"]]
+
+
+def test_pages_are_written_once_it_is_time_and_at_the_end(tmp_path: Path) -> None:
+    state, page = mixed(), tmp_path / "index.html"
     with_pictures(tmp_path, state)
     pages = Pages(tmp_path)
     pages(state)
     assert pages.trouble is None
-    first = (tmp_path / "index.html").stat().st_mtime_ns
-    pages(state)
-    assert (tmp_path / "index.html").stat().st_mtime_ns == first, "not so soon"
-    state.state = "done"
-    pages(state)
-    assert facts((tmp_path / "index.html").read_text("utf-8"))["state"] == "done"
-    made = {path.stem for path in (tmp_path / "thumbnails").iterdir()}
-    assert made == {scene.name for scene in state.scenes if scene.state == "done"}
-    assert {path.name for path in tmp_path.iterdir() if path.is_file()} == {"index.html", "fleet.csv"}
-
-
-def test_what_came_too_soon_is_written_once_it_is_time(tmp_path: Path) -> None:
-    state = mixed()
-    pages = Pages(tmp_path)
-    pages(state)
     state.scenes[0].stage = "bake"
     pages(state)
     pages.catch_up()
-    assert facts((tmp_path / "index.html").read_text("utf-8"))["scenes"][0]["stage"] is None
+    assert shown(tmp_path, "stage")[0] is None, "not so soon"
     pages._next = 0.0
     pages.catch_up()
-    written = (tmp_path / "index.html").stat().st_mtime_ns
-    assert facts((tmp_path / "index.html").read_text("utf-8"))["scenes"][0]["stage"] == "bake"
+    written = page.stat().st_mtime_ns
+    assert shown(tmp_path, "stage")[0] == "bake"
     pages._next = 0.0
     pages.catch_up()
-    assert (tmp_path / "index.html").stat().st_mtime_ns == written, "nothing has changed"
+    assert page.stat().st_mtime_ns == written, "nothing has changed"
+    state.state = "done"
+    pages(state)
+    assert facts(page.read_text("utf-8"))["state"] == "done"
+    assert {path.stem for path in (tmp_path / "thumbnails").iterdir()} == {scene.name for scene in state.scenes if scene.state == "done"}
+    assert {path.name for path in tmp_path.iterdir() if path.is_file()} == {"index.html", "fleet.csv"}
+    pages = Pages(tmp_path / "nowhere")
+    pages(state)
+    assert "nowhere" in (pages.trouble or ""), "it is told, not raised"
 
 
-def test_a_thumbnail_is_made_again_of_another_picture_only(tmp_path: Path) -> None:
-    state = fleet(done("a"), state="done")
+def test_thumbnails_and_links_are_of_what_is_there(tmp_path: Path) -> None:
+    """A scene that failed may have a report of an earlier call; one that is done may have lost it."""
+    state = fleet(done("a"), done("b"), done("c"))
     with_pictures(tmp_path, state)
+    (tmp_path / "b" / "report.html").unlink()
+    state.scenes[2].state, state.scenes[2].stages["turntable"].state = "failed", "failed"
     Pages(tmp_path)(state)
+    assert shown(tmp_path, "report") == ["a/report.html", None, "c/report.html"]
     thumbnail = tmp_path / "thumbnails" / "a.webp"
     with Image.open(thumbnail) as image:
         assert image.size == (WIDTH, HEIGHT)
@@ -145,7 +144,7 @@ def test_a_thumbnail_is_made_again_of_another_picture_only(tmp_path: Path) -> No
     assert thumbnail.stat().st_ino == before
     os.utime(thumbnail, ns=(1, 1))
     Pages(tmp_path)(state)
-    assert thumbnail.stat().st_ino != before
+    assert thumbnail.stat().st_ino != before, "it is made again of another picture only"
 
 
 def test_pictures_that_are_none_end_nothing(tmp_path: Path) -> None:
@@ -157,22 +156,7 @@ def test_pictures_that_are_none_end_nothing(tmp_path: Path) -> None:
         write_thumbnail(tmp_path / "a" / "turntable" / "frame_0000.png", tmp_path / "x.webp")
     pages = Pages(tmp_path)
     pages(state)
-    assert pages.trouble is None
-    assert [scene["picture"] for scene in facts((tmp_path / "index.html").read_text("utf-8"))["scenes"]] == [None, None]
-
-
-def test_a_report_is_linked_wherever_it_is(tmp_path: Path) -> None:
-    """A scene that failed may have one of an earlier call; one that is done may have lost it."""
-    state = fleet(done("a"), done("b"), done("c"))
-    with_pictures(tmp_path, state)
-    (tmp_path / "b" / "report.html").unlink()
-    state.scenes[2].state, state.scenes[2].stages["turntable"].state = "failed", "failed"
-    Pages(tmp_path)(state)
-    assert linked(tmp_path) == ["a/report.html", None, "c/report.html"]
-
-
-def linked(fleet: Path) -> list[str | None]:
-    return [scene["report"] for scene in facts((fleet / "index.html").read_text("utf-8"))["scenes"]]
+    assert (pages.trouble, shown(tmp_path, "picture")) == (None, [None, None])
 
 
 def test_a_page_that_another_wrote_is_not_linked(tmp_path: Path) -> None:
@@ -181,15 +165,8 @@ def test_a_page_that_another_wrote_is_not_linked(tmp_path: Path) -> None:
     name = state.scenes[0].name
     (tmp_path / name / "report.html").write_text("<script>alert(1)</script>", "utf-8")
     Pages(tmp_path)(state)
-    assert [link is None for link in linked(tmp_path)] == [True] + [False] * 7
+    assert [link is None for link in shown(tmp_path, "report")] == [True] + [False] * 7
     assert f"{name}/report.html" not in (tmp_path / "comparison.html").read_text("utf-8")
-
-
-def test_a_folder_that_cannot_be_written_is_told_not_raised(tmp_path: Path) -> None:
-    pages = Pages(tmp_path / "nowhere")
-    pages(mixed())
-    assert pages.trouble is not None
-    assert "nowhere" in pages.trouble
 
 
 def test_whoever_reads_the_page_finds_a_whole_one(tmp_path: Path) -> None:
@@ -229,54 +206,36 @@ def sweep() -> FleetState:
 def test_a_comparison_counts_what_was_shared_as_if_it_had_been_made() -> None:
     state = sweep()
     found = results(state, settings_of(state))
-    assert [each.seconds for each in found] == [40.0] * 8
-    assert [each.scene for each in found] == ["a"] * 4 + ["b"] * 4
+    assert [(each.scene, each.seconds) for each in found] == [("a", 40.0)] * 4 + [("b", 40.0)] * 4
     means = mean_results(found)
     assert [each.values for each in means] == [(1, 8), (1, 24), (2, 8), (2, 24)]
     assert [each.psnr for each in means] == [22.5, 24.5, 23.5, 25.5]
-    assert best(means, "seconds") == {3}
-    assert best(means, "megabytes") == {2, 3}
-
-
-def test_means_are_over_scenes_that_are_whole() -> None:
-    state = sweep()
+    assert (best(means, "seconds"), best(means, "megabytes")) == ({3}, {2, 3})
     state.scenes[0].state = "quarantined"
     found = results(state, settings_of(state))
-    assert found[0].psnr is None
-    assert mean_results(found) == [], "one scene is no mean"
-    assert best(found, "seconds") == {7}
+    assert (found[0].psnr, mean_results(found), best(found, "seconds")) == (None, [], {7}), "one scene is no mean"
 
 
 def test_a_page_of_a_sweep(tmp_path: Path) -> None:
     state = sweep()
     assert write_comparison(tmp_path, state, {scene.name for scene in state.scenes})
     page = (tmp_path / "comparison.html").read_text("utf-8")
-    assert "train.iterations, bake.max_mib. 8 of 8 runs are done." in page
-    assert page.count('<a href="a--iterations-1--max_mib-8/report.html">report</a>') == 1
+    assert page.count('href="a--iterations-1--max_mib-8/report.html"') == 1
     for name in ("comparison/psnr_over_seconds.png", "comparison/psnr_over_megabytes.png"):
         assert f'<img src="{name}"' in page
-        with Image.open(tmp_path / name) as image:
-            assert image.width > 600
     before = {path.name: path.read_bytes() for path in (tmp_path / "comparison").iterdir()}
     write_comparison(tmp_path, state)
     assert {path.name: path.read_bytes() for path in (tmp_path / "comparison").iterdir()} == before
     assert not write_comparison(tmp_path, mixed())
-
-
-def test_a_sweep_that_has_nothing_yet_has_a_page(tmp_path: Path) -> None:
-    state = sweep()
     for scene in state.scenes:
         scene.state, scene.metrics = "waiting", {}
     assert write_comparison(tmp_path, state)
-    assert "0 of 8 runs are done" in (tmp_path / "comparison.html").read_text("utf-8")
 
 
-def test_the_front_is_what_no_other_beats() -> None:
+def test_the_front_is_what_no_other_beats(tmp_path: Path) -> None:
     """Against the definition."""
-    import random
-
     drawn = random.Random(5)
-    for _ in range(200):
+    for _ in range(100):
         points = [(drawn.randrange(6), drawn.randrange(6)) for _ in range(drawn.randrange(12))]
 
         def beats(one: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -286,9 +245,5 @@ def test_the_front_is_what_no_other_beats() -> None:
         front = pareto_front(points)
         assert set(front) == expected
         assert [points[place][0] for place in front] == sorted(points[place][0] for place in front)
-
-
-def test_a_plot_of_nothing_and_of_wide_costs(tmp_path: Path) -> None:
-    pareto_plot(tmp_path / "a.png", {}, x_label="x", y_label="y")
-    pareto_plot(tmp_path / "b.png", {"a": [(1, 20, r"$\frac{$"), (100, 30, "two")], "b": [(0.0, 1, "")]}, x_label="x", y_label="y")
-    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+    pareto_plot(tmp_path / "a.png", {"a": [(1, 20, r"$\frac{$"), (100, 30, "two")], "b": [(0.0, 1, "")]}, x_label="x", y_label="y")
+    assert (tmp_path / "a.png").stat().st_size > 1000

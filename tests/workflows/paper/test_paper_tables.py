@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import types
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from efficientnerf.asset import format
-from pipeline.errors import BadInput
-from stages.io.scene import load, save
 from tests.efficientnerf.balls import cameras, picture
 from tests.stages.captures import write_picture
 from workflows.cli.main import main
 from workflows.paper import document as paper
 from workflows.paper import tables
 from workflows.paper.document import PAPER, Request
-from workflows.paper.runs import Figures, Row, _pace, scenes, settings_of
+from workflows.paper.runs import Figures, Row, _pace, settings_of
 
 
 def ball(folder: Path) -> Path:
@@ -40,17 +34,14 @@ def ball(folder: Path) -> Path:
 
 def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
     whole, small = (settings_of(Row("n4"), scale) for scale in (1.0, 0.001))
-    assert whole["train"]["iterations"] == 1_000_000
-    assert (whole["train"]["hidden_dim"], whole["train"]["occupancy_resolution"], whole["poses"]["max_image_size"]) == (256, 384, 800)
-    assert small["train"]["iterations"] == 1000
-    for name in ("max_rays_per_batch", "hidden_dim", "coarse_hidden_dim", "num_layers", "occupancy_resolution"):
-        assert small["train"][name] < whole["train"][name], name
+    assert (whole["train"]["iterations"], whole["train"]["hidden_dim"], whole["poses"]["max_image_size"]) == (1_000_000, 256, 800)
+    smaller = ("iterations", "max_rays_per_batch", "hidden_dim", "coarse_hidden_dim", "num_layers", "occupancy_resolution")
+    assert all(small["train"][name] < whole["train"][name] for name in smaller)
     assert small["poses"]["max_image_size"] < 800
     assert small["bake"]["resolution"] < whole["bake"]["resolution"]
-    kept = ("num_coarse_samples", "samples_per_pivot", "near_plane", "far_plane", "sh_degree", "pivotal_threshold", "occupancy_beta")
-    for name in (*kept, "occupancy_initial_density", "sampling", "max_pivots"):
-        assert small["train"][name] == whole["train"][name], name
-    light, standard = settings_of(Row("n4"), 0.001)["train"], settings_of(Row("nerf", tables.NERF), 0.001)["train"]
+    kept = ("num_coarse_samples", "samples_per_pivot", "near_plane", "far_plane", "sh_degree", "pivotal_threshold", "occupancy_beta", "sampling", "max_pivots")
+    assert all(small["train"][name] == whole["train"][name] for name in kept)
+    light, standard = small["train"], settings_of(Row("nerf", tables.NERF), 0.001)["train"]
     assert light["coarse_hidden_dim"] < standard["coarse_hidden_dim"] == standard["hidden_dim"]
     differ = {name for name in light if light[name] != standard[name]}
     assert differ == {"field", "sampling", "num_coarse_samples", "coarse_hidden_dim", "coarse_num_layers"}  # so the rest is shared
@@ -76,31 +67,22 @@ def made_up(steady: float, psnr: float) -> Figures:
 
 @pytest.mark.parametrize("number", ["1", "2", "3", "4", "5", "6"])
 def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
     def measured(request: Request, scene: Path, row: Row) -> Figures:
         settings_of(row, request.scale)  # its settings exist
-        asked.append(row.name)
         return made_up(0.184 if row.name == "nerf" else 0.021, 21.0 if row.name == "valid" else 30.0)
 
     monkeypatch.setattr(tables, "measured", measured)
-    request = Request(ball(tmp_path / "chair"), tmp_path / "out", 0.001)
-    paper.make(number, request)
+    ball(tmp_path / "scenes" / "chair")
+    paper.make(number, Request(tmp_path / "scenes", tmp_path / "out", 0.001))
     document = json.loads((tmp_path / "out" / f"table_{number}.json").read_text())
-    assert document["rows"]
     assert any(column.endswith(PAPER) for column in document["columns"])
-    for row in document["rows"]:
-        assert set(row) <= set(document["columns"])
+    assert all(set(row) <= set(document["columns"]) for row in document["rows"])
     assert (tmp_path / "out" / f"table_{number}.png").exists()
-    notes = " ".join(document["notes"])
     if number == "5":
         assert document["rows"][0]["method"] == "NeRF"
-        assert "8.8 times as fast as NeRF per iteration" in notes
-        assert document["rows"][-1]["less time %"] == pytest.approx(88.6, abs=0.1)
-        assert document["rows"][-1]["less time %" + PAPER] == pytest.approx(88.6, abs=0.1)
-        assert "do not count: valid on chair" in notes
-    else:
-        assert "All rows have converged" in notes
+        for column in ("less time %", "less time %" + PAPER):
+            assert document["rows"][-1][column] == pytest.approx(88.6, abs=0.1)
+        assert "valid on chair" in " ".join(document["notes"]), "what has not converged does not count"
     if number == "1":
         assert document["rows"][0]["valid %" + PAPER] == 9.58
 
@@ -113,58 +95,13 @@ def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path, capsys: p
     assert events[-1]["event"] == "summary"
     assert sum(event["event"] == "stage_done" and event["stage"] == "train" for event in events) == 2
     assert any(event["event"] == "progress" and event["stage"] == "train" for event in events)  # hours go by without a word otherwise
-    assert any("training 60 steps" in event.get("text", "") for event in events if event["event"] == "message")
     nerf, ours = json.loads((out / "table_1.json").read_text())["rows"]
     assert 0 < ours["pivotal %"] <= ours["valid %"] < 100
     assert 0 < nerf["pivotal %"] < 100
-    assert 0 <= nerf["valid %"] < 100
     assert min(nerf["PSNR"], ours["PSNR"]) > 10
     field = out / "runs/ball/n4/train/field.safetensors"
     made = field.stat().st_mtime_ns
     assert main(command) == 0
     assert field.stat().st_mtime_ns == made
-
-
-def test_a_tree_is_measured_on_as_many_views_as_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the requested device, without the copy back to the host."""
-    import numpy as np
-
-    from efficientnerf.asset.tree import NerfTree
-    from tests.efficientnerf.trees import random_tree
-    from tests.stages.balls import poses
-    from workflows.paper import runs
-
-    folder = poses(tmp_path / "poses")
-    s = load(folder)
-    save(dataclasses.replace(s, views=tuple(dataclasses.replace(view, split="test" if n < 3 else "train") for n, view in enumerate(s.views))), folder)
-    (tmp_path / "bake").mkdir()
-    format.save(dataclasses.replace(random_tree(2, brick=4, degree=1, share=0.6), bounds_min=np.array([-0.6] * 3)), tmp_path / "bake" / "asset.nerftree")
-    run: Any = types.SimpleNamespace(path=tmp_path, folder=lambda name: tmp_path / name)
-    sent: list[str] = []
-    monkeypatch.setattr(NerfTree, "to", lambda self, device: sent.append(device) or self)
-    drawn: list[str] = []
-    seconds = runs._frame_seconds
-    monkeypatch.setattr(runs, "_frame_seconds", lambda tree, camera, background: drawn.append(camera.name) or seconds(tree, camera, background))
-    for wanted, count in ((2, 2), (None, 3)):
-        drawn.clear()
-        figures = runs._tree_figures(run, wanted, "cuda")
-        assert len(drawn) == 1 + count  # the first, which compiles, is not counted
-        assert 3 < figures["psnr"] < 40
-        assert figures["fps"] > 0
-        assert figures["frame"] == "16x16"
-    assert sent == ["cuda", "cuda"]
-
-
-def test_scenes_are_found_and_their_absence_is_told(tmp_path: Path) -> None:
-    one = ball(tmp_path / "all" / "one")
-    assert scenes(one) == [one]
-    assert scenes(tmp_path / "all") == [one]
     (tmp_path / "none").mkdir()
-    with pytest.raises(BadInput, match="holds no data set"):
-        scenes(tmp_path / "none")
-
-
-def test_figures_say_whether_they_have_converged() -> None:
-    some: Any = made_up(0.1, 21.9)
-    assert not some.converged
-    assert dataclasses.replace(some, psnr=22.0).converged
+    assert main([*command, "--data", str(tmp_path / "none")]) == 2

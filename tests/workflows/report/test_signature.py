@@ -41,9 +41,16 @@ def written_by_another(path: Path, page: bytes = HOSTILE) -> None:
     os.utime(path, (2**31, 2**31))  # newer than all that it shows
 
 
-def test_a_page_that_was_written_here_is_known(page: Path) -> None:
+def test_a_page_that_was_written_here_is_known(page: Path, tmp_path: Path) -> None:
     assert is_own(page)
     assert is_as_written(page)
+    link, pipe = tmp_path / "link", tmp_path / "pipe"
+    link.symlink_to(page)
+    os.mkfifo(pipe)
+    assert not any(is_as_written(path) for path in (link, pipe, tmp_path, tmp_path / "none"))
+    written_by_another(page)
+    assert is_as_written(page)
+    assert not is_own(page)
     write_page(page, b"")
     assert is_own(page)
 
@@ -58,19 +65,6 @@ def test_every_other_byte_makes_it_another(page: Path) -> None:
     for more in (data + b"\n", b"\n" + data, data + HOSTILE, HOSTILE, b""):
         page.write_bytes(more)
         assert not is_as_written(page)
-
-
-def test_what_is_no_plain_file_is_no_page(page: Path, tmp_path: Path) -> None:
-    link, pipe = tmp_path / "link", tmp_path / "pipe"
-    link.symlink_to(page)
-    os.mkfifo(pipe)
-    assert not any(is_as_written(path) for path in (link, pipe, tmp_path, tmp_path / "none"))
-
-
-def test_who_has_another_key_writes_pages_that_are_whole_and_not_ours(page: Path) -> None:
-    written_by_another(page)
-    assert is_as_written(page)
-    assert not is_own(page)
 
 
 def test_the_key_is_the_users_alone_and_the_same_in_every_process(page: Path, key: Path) -> None:

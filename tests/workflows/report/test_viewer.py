@@ -12,12 +12,9 @@ import pytest
 from efficientnerf.asset.format import save
 from pipeline.run import Run
 from stages.io.pictures import opened
-from stages.viewer import page as viewer_page
 from stages.viewer.captured import PHOTOGRAPHS, SIDE, captured_views, photograph
 from tests.efficientnerf.trees import random_tree
 from tests.stages.balls import poses
-from workflows.report.pages import has_pages
-from workflows.report.signature import write_page
 from workflows.report.viewer import write_run_viewer
 
 
@@ -36,6 +33,10 @@ def test_a_run_gets_a_page_with_its_cameras_and_photographs(run: Run) -> None:
     text = path.read_text(encoding="utf-8")
     assert text.count("data:image/jpeg;base64,") == 8
     assert "<title>run</title>" in text
+    (run.path / "poses/scene.json").write_text("{")
+    path = write_run_viewer(run, anew=True)
+    assert path is not None
+    assert "data:image/jpeg" not in path.read_text(encoding="utf-8"), "without cameras, too"
 
 
 def test_a_page_is_made_again_when_the_asset_is_another(run: Run) -> None:
@@ -60,7 +61,7 @@ def test_there_is_no_page_of_no_asset_a_damaged_one_or_one_too_large(run: Run, m
     asset = run.path / "bake/asset.nerftree"
     assert write_run_viewer(run) is not None
     with monkeypatch.context() as patch:
-        patch.setattr(viewer_page, "LARGEST", 100)
+        patch.setattr("workflows.report.viewer.LARGEST", 100)
         assert write_run_viewer(run, anew=True) is None
     assert not (run.path / "viewer.html").exists()
     assert write_run_viewer(run) is not None
@@ -72,28 +73,6 @@ def test_there_is_no_page_of_no_asset_a_damaged_one_or_one_too_large(run: Run, m
     asset.unlink()
     assert write_run_viewer(run) is None
     assert not (run.path / "viewer.html").exists()
-
-
-def test_a_page_that_could_not_be_made_is_missing_until_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where the asset could not be read for a moment: the next run makes up for it."""
-    write_page(run.path / "report.html", b"<html></html>")
-    assert not has_pages(run, ())
-    assert write_run_viewer(run) is not None
-    assert has_pages(run, ())
-    (run.path / "viewer.html").unlink()
-    assert not has_pages(run, ())
-    with monkeypatch.context() as patch:
-        patch.setattr(viewer_page, "LARGEST", 100)
-        assert has_pages(run, ())  # it gets none
-    (run.path / "bake/asset.nerftree").unlink()
-    assert has_pages(run, ())
-
-
-def test_a_run_without_cameras_gets_its_page(run: Run) -> None:
-    (run.path / "poses/scene.json").write_text("{")
-    path = write_run_viewer(run)
-    assert path is not None
-    assert "data:image/jpeg" not in path.read_text(encoding="utf-8")
 
 
 def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Path) -> None:

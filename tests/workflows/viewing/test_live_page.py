@@ -67,33 +67,30 @@ def test_it_follows_a_run(browser: Any, run: Run, server: Server, picture: bytes
     with opened(browser, server.url, viewport={"width": 900, "height": 700}) as live:
         page = live.page
         until(live, "document.querySelectorAll('#stages li').length === 1")
-        assert page.inner_text("#stages li") == "train\nmissing"
+        assert page.get_attribute("#stages li", "class") == "missing"
         assert page.inner_text("#name") == "a <b>run", "names are text"
-        assert page.inner_text("#facts") == "from /photographs"
         assert page.query_selector("section.training") is None
         assert not page.is_visible("#asset")
-
         put(scratch(run), 7, [3, 5], picture)
         until(live, "document.querySelector('svg polyline.first')")
         assert page.get_attribute("#stages li", "class") == "partial"
-        assert page.inner_text("section.training h2") == "Training of the field"
-        assert page.inner_text(".now").split(" · ") == ["now", "step 6", "0.6 s", "training 10.06 dB", "preview 9.50 dB"]
+        assert all(figure in page.inner_text(".now") for figure in ("step 6", "0.6 s", "10.06 dB", "9.50 dB"))
         assert (points(live, "first"), points(live, "second"), page.locator("svg circle").count()) == (7, 2, 2)
         until(live, "document.querySelector('.preview img').naturalWidth === 12")
-        assert page.inner_text(".preview label span") == "step 5"
-
         put(scratch(run), 12, [3, 5, 9], picture)
         until(live, "document.querySelector('.preview label span').textContent === 'step 9'")
         assert (points(live, "first"), points(live, "second")) == (12, 3)
         page.locator(".preview input").fill("0")
-        assert page.inner_text(".preview label span") == "step 3"
         put(scratch(run), 20, [3, 5, 9, 15], picture)
         until(live, "document.querySelector('svg polyline.first').getAttribute('points').split(' ').length === 20")
         assert page.inner_text(".preview label span") == "step 3", "who looks at an earlier one is left there"
         assert live.console == []
-        assert {url.removeprefix(server.url).partition("?")[0] for url in live.requests if url != "data:,"} == {
-            "", "live.css", "live.js", "status.json", *(f"previews/train/preview_{step:06d}.png" for step in (3, 5, 9)),
-        }  # fmt: skip
+        expected = {"", "live.css", "live.js", "status.json", *(f"previews/train/preview_{step:06d}.png" for step in (3, 5, 9))}
+        assert {url.removeprefix(server.url).partition("?")[0] for url in live.requests if url != "data:,"} == expected
+        server.shutdown()
+        server.server_close()
+        page.wait_for_selector("#trouble", state="visible", timeout=60_000)
+        assert page.locator("#stages li").count() == 1, "what was seen last stays when nobody answers any more"
 
 
 def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(browser: Any, run: Run, server: Server) -> None:
@@ -148,24 +145,11 @@ def test_a_page_that_another_put_in_its_place_runs_nothing(browser: Any, tmp_pat
         made.shutdown()
 
 
-def test_it_says_so_when_nobody_answers_any_more(browser: Any, run: Run, server: Server) -> None:
-    with opened(browser, server.url) as live:
-        until(live, "document.querySelectorAll('#stages li').length === 1")
-        assert not live.page.is_visible("#trouble")
-        server.shutdown()
-        server.server_close()
-        live.page.wait_for_selector("#trouble", state="visible", timeout=60_000)
-        assert "does not answer" in live.page.inner_text("#trouble")
-        assert live.page.locator("#stages li").count() == 1, "what was seen last stays"
-
-
-def test_nothing_runs_over_a_narrow_page(browser: Any, run: Run, server: Server, picture: bytes) -> None:
+@pytest.mark.parametrize(("width", "scheme"), [(340, "light"), (700, "dark")])
+def test_nothing_runs_over_a_narrow_page(browser: Any, run: Run, server: Server, picture: bytes, width: int, scheme: str) -> None:
     put(scratch(run), 7, [3, 5], picture)
-    for width in (340, 700, 1200):
-        for scheme in ("light", "dark"):
-            with opened(browser, server.url, viewport={"width": width, "height": 700}, color_scheme=scheme) as live:
-                until(live, "document.querySelector('.preview img')?.naturalWidth === 12")
-                assert live.page.evaluate("document.documentElement.scrollWidth") <= width
-                paper = live.page.evaluate("getComputedStyle(document.body).backgroundColor")
-                assert (int(paper[4:-1].split(",")[0]) > 200) == (scheme == "light")
-                assert live.console == []
+    with opened(browser, server.url, viewport={"width": width, "height": 700}, color_scheme=scheme) as live:
+        until(live, "document.querySelector('.preview img')?.naturalWidth === 12")
+        assert live.page.evaluate("document.documentElement.scrollWidth") <= width
+        paper = live.page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (int(paper[4:-1].split(",")[0]) > 200) == (scheme == "light")

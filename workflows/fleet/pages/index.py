@@ -10,17 +10,17 @@ import functools
 import json
 from collections.abc import Container, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
+
+import jinja2
+from markupsafe import Markup
 
 from pipeline.fleet.state import FleetState, SceneState
 from pipeline.text import printable
 from stages.artifacts import TurntableOutputs
-from stages.viewer.page import json_for_html, policy_hash
+from stages.viewer.html import json_for_html, policy_hash
 from workflows.report.page import NAME as REPORT
-
-if TYPE_CHECKING:
-    import jinja2
 
 NAME = "index.html"
 FOLDER = Path(__file__).parent
@@ -60,8 +60,6 @@ def index_page(
 
 def filled(template: str, script: str | None = None, *, title: str, facts: Any = None, **more: Any) -> str:
     """A page of a template with the style of all of them and, where it has any, a script and the facts that it shows."""
-    from markupsafe import Markup
-
     style = (FOLDER / "page.css").read_text(encoding="utf-8")
     if script is not None:
         code = (FOLDER / script).read_text(encoding="utf-8")
@@ -72,8 +70,6 @@ def filled(template: str, script: str | None = None, *, title: str, facts: Any =
 @functools.cache
 def _environment() -> jinja2.Environment:
     """One: it keeps compiled templates, and pages are written again and again."""
-    import jinja2
-
     return jinja2.Environment(loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 from pipeline.files import write_atomically
 from pipeline.fleet.state import FleetState, SceneState
 from stages.artifacts import PosesOutputs, TurntableOutputs
+from stages.figures.thumbnails import write_thumbnail
+from stages.io.pictures import UnreadableImage
 from workflows.fleet.pages import comparison, index, spreadsheet
 from workflows.report.page import NAME as REPORT
 from workflows.report.signature import is_own
@@ -85,9 +87,6 @@ class Pages:
 
     def _make_thumbnails(self, state: FleetState) -> None:
         """Of scenes whose turntable, or whose photographs before that, have come since; as many as there is time for."""
-        from stages.figures.thumbnails import write_thumbnail
-        from stages.io.pictures import UnreadableImage
-
         began, running = time.monotonic(), state.state == "running"
         folder = self.fleet / index.THUMBNAILS
         folder.mkdir(exist_ok=True)

@@ -5,16 +5,14 @@ N stored voxels, L cascades, C coarse cells of all cascades.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.leaps import leaps
 from efficientnerf.backends.numba.vector.memory import pointer
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 
 class Cells(NamedTuple):

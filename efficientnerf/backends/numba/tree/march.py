@@ -141,4 +141,4 @@ def march_with(visit: Callable[..., Any]) -> Callable[..., Any]:
         copy.__module__, copy.__qualname__ = __name__, name
         return numba.njit(cache=True, error_model="numpy")(copy)
 
-    return bound(_march, _through_cascade=bound(_through_cascade, _visit=visit))  # type: ignore[no-any-return]
+    return bound(_march, _through_cascade=bound(_through_cascade, _visit=visit))

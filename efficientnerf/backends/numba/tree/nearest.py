@@ -5,20 +5,17 @@ R rays, K harmonics.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.cells import cells_of, stored_voxel, tree_pointers
 from efficientnerf.backends.numba.tree.march import march_with
 from efficientnerf.backends.numba.tree.queries import normal_at
 from efficientnerf.backends.numba.vector.memory import advanced, pointer
+from efficientnerf.backends.pieces import pieces
 from efficientnerf.rendering.harmonics import basis_numpy
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 BLOCK = 64  # rays per task
 
@@ -79,8 +76,6 @@ def render_rays(
     tree: NerfTree, origins: np.ndarray, directions: np.ndarray, sh_directions: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Colour (R, 3) premultiplied, opacity (R,), distance (R,), normal (R, 3) of rays, float32; see `backends.numba.tree.rendering.render_rays`."""
-    from efficientnerf.backends.pieces import pieces
-
     origins, directions = np.asarray(origins, np.float64), np.ascontiguousarray(directions, np.float64)
     starts = np.ascontiguousarray((origins - tree.bounds_min) / tree.voxel)
     bases = np.ascontiguousarray(basis_numpy(np.asarray(directions if sh_directions is None else sh_directions, np.float32), tree.degree))

@@ -9,16 +9,18 @@ L cascades, C coarse cells of all of them, B bricks, N stored voxels, K harmonic
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from efficientnerf.asset import cascades
+from efficientnerf.asset.cascades import cascades_of
+from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.tree import NerfTree, leaps
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packets.rows import MOST_SIDE, fill_rows, order_voxels
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.harmonics import squared_slopes
 
 SLOPE_VOXELS = 2**16  # voxels that `colour_slope` is estimated from
 FEWEST_PAIRS = 64  # of neighbours, for what they share to be estimated
@@ -136,8 +138,6 @@ def brick_ranges(first: int, end: int, brick: int) -> Iterator[tuple[int, int]]:
 
 def _slope(coefficients: np.ndarray, degree: int) -> float:
     """Mean over voxels (N, K, 3) of the change of colour before the sigmoid per radian, see `Packed.colour_slope`."""
-    from efficientnerf.rendering.harmonics import squared_slopes
-
     return float(np.sqrt(np.einsum("nkc,nkc,k->nc", coefficients, coefficients, squared_slopes(degree))).max(axis=1).mean())
 
 
@@ -172,15 +172,11 @@ def packed_of(tree: NerfTree) -> Packed:
 
 def bricks_of(tree: NerfTree) -> list[tuple[int, int]]:
     """First brick and end of each cascade."""
-    from efficientnerf.asset import cascades
-
     return cascades.brick_ranges(tree) if tree.outer else [(0, len(tree.voxel_index))]
 
 
 def _places(tree: NerfTree) -> tuple[np.ndarray, np.ndarray]:
     """`Packed.grids` and `Packed.places`."""
-    from efficientnerf.asset.cascades import cascades_of
-
     cascades = cascades_of(tree)
     count = [int(np.prod(cascade.shape)) for cascade in cascades]
     grids = [[*cascade.shape, sum(count[:n])] for n, cascade in enumerate(cascades)]
@@ -190,8 +186,6 @@ def _places(tree: NerfTree) -> tuple[np.ndarray, np.ndarray]:
 
 def _pack_cascade(tree: NerfTree, number: int, cells: np.ndarray, has_density: np.ndarray) -> np.ndarray:
     """Fills in a cascade's rows of `Packed.cells` and `Packed.has_density`, the latter zero before; returns which of its cells are not empty, (X, Y, Z)."""
-    from efficientnerf.asset.cascades import cascades_of
-
     cascades, (first, end) = cascades_of(tree), bricks_of(tree)[number]
     cascade = cascades[number]
     occupied = np.flatnonzero(cascade.brick_index.reshape(-1) >= 0)
@@ -208,8 +202,6 @@ def _pack_cascade(tree: NerfTree, number: int, cells: np.ndarray, has_density: n
 
 def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """`Packed.rows`, `Packed.voxel_of`, `Packed.coordinates` and `Packed.first_voxel`."""
-    from efficientnerf.asset.cascades import cascades_of
-
     if tree.brick + 2 > MOST_SIDE:
         raise ValueError(f"bricks of {tree.brick} voxels along a side; at most {MOST_SIDE - 2} are rendered")
     bricks, count = len(tree.voxel_index), len(tree.density_values)
@@ -233,10 +225,6 @@ def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 def pack(tree: NerfTree) -> Packed:
     """The packed form of a tree; ValueError for nearest lookup, since the kernel that reads it interpolates."""
-    from efficientnerf.asset.cascades import cascades_of
-    from efficientnerf.asset.palettes import PaletteHarmonics
-    from efficientnerf.asset.tree import leaps
-
     if tree.lookup != "trilinear":
         raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; render it by `backends.numba.tree.nearest`")
 

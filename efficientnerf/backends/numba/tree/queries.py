@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascades_of, point_cascades
+from efficientnerf.asset.tree import Cascade, NerfTree
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, tree_pointers
 from efficientnerf.rendering.harmonics import basis_numpy
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.cascades import Cascade
-    from efficientnerf.asset.tree import NerfTree
 
 BLOCK = 1024  # points per task
 STEP_BACK = 0.5  # voxels
@@ -150,8 +147,6 @@ def _voxel_coordinates(tree: NerfTree, cascade: Cascade, points: np.ndarray) -> 
 def _grids(tree: NerfTree, points: np.ndarray) -> Iterator[tuple[np.ndarray | slice, np.ndarray, Cells]]:
     """Which points belong to a cascade, their voxel coordinates in it, and it without its leaps, which points do not need; those beyond all boxes are of the
     first."""
-    from efficientnerf.asset.cascades import cascades_of, point_cascades
-
     points, cascades = np.asarray(points, np.float64), cascades_of(tree)
     owner = point_cascades(tree, points).clip(0) if tree.outer else None
     for n, cascade in enumerate(cascades):

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import functools
 import itertools
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascades_of
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.rays import ndc_numbers
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.image import TILE, WORK, beginning, downsample, render_batch
@@ -21,9 +23,6 @@ from efficientnerf.backends.numba.tree.ray_batch import RayBatch
 from efficientnerf.backends.numba.tree.surroundings import add_environment
 from efficientnerf.backends.numba.tree.view_colours import Views, compute_view_colours
 from efficientnerf.geometry.cameras import Camera, rays
-
-if TYPE_CHECKING:
-    from efficientnerf.asset.tree import NerfTree
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 # Distance, in voxels per unit of `Packed.colour_slope`, from which a voxel's colour is summed once for a view: docs/experiments/renderer.md
@@ -91,8 +90,6 @@ def _keep_buffer(tree: NerfTree, colours: ViewColours) -> None:
 
 def _views(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray) -> Views:
     """The view of each cascade, from the direction of cascade 0."""
-    from efficientnerf.asset.cascades import cascades_of
-
     ratio, shift = packed_of(tree).places[:, 0], packed_of(tree).places[:, 1:]
     matrix = np.broadcast_to(view_direction[:, :3], (len(ratio), 3, 3))  # directions may have any length: per voxel of each cascade
     at_zero = view_direction[:, 3] / ratio[:, None] - np.einsum("ij,lj->li", view_direction[:, :3], shift)

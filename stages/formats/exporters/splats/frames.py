@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.splats.gaussians import Gaussians, quaternions_from
 from pipeline.errors import BadInput
 from stages.formats.exporters.glb import gltf_from_capture
@@ -61,8 +62,6 @@ def _products(then: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 def turned_harmonics(harmonics: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Coefficients (N, K, 3) of the function that has at R d the value that the given ones have at d: each degree turns into itself."""
-    from efficientnerf.rendering.harmonics import basis_numpy
-
     degree = round(harmonics.shape[1] ** 0.5) - 1
     k = np.arange(DIRECTIONS) + 0.5
     height, longitude = 1 - 2 * k / DIRECTIONS, np.pi * (1 + 5**0.5) * k

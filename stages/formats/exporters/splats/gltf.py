@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.rendering.colour import linear_from_srgb
+from efficientnerf.rendering.harmonics import C0
 from efficientnerf.splats.gaussians import Gaussians
 from stages.formats.exporters.glb import VERTICES, Buffer, source_extras, write_document
 from stages.formats.exporters.splats.frames import check_gaussians, with_y_up
@@ -48,8 +49,6 @@ def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_
 
 def _attributes(gaussians: Gaussians, buffer: Buffer) -> dict[str, Any]:
     """The attributes of the primitive, put into the buffer."""
-    from efficientnerf.rendering.harmonics import C0
-
     def put(values: np.ndarray, **more: Any) -> int:
         return buffer.accessor(np.asarray(values, "<f4"), VERTICES, **more)
 

@@ -7,7 +7,9 @@ are undistorted; the two kinds share no frame and are not mixed. depth/ holds th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +18,13 @@ from efficientnerf.geometry.cameras import Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.depth import DepthFile, depth_file, with_depth
-from stages.formats.importers.source import ImportSettings, Source, images_in
-from stages.io.capture import Capture
+from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.source import Source, images_in
 from stages.io.json_file import finite, read_json, shown
 
 KEYFRAMES = "keyframes"
+EXPECTED = f"{KEYFRAMES}/images with {KEYFRAMES}/cameras, or their corrected versions"
 LARGEST_CAMERA = 1 << 20  # bytes
 MILLIMETRE = 0.001  # metres
 HIGH = 255  # confidence; 127 is medium
@@ -30,43 +33,25 @@ _KINDS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _AGAIN = "Export the raw data again."
 
 
-def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    source = Source(folder, allow_outside)
-    return any(_cameras(source, cameras) for _, cameras in _KINDS)
+def _signs(source: Source) -> Sequence[Path]:
+    return next((found for _, cameras in _KINDS if (found := _cameras(source, cameras))), [])
 
 
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The camera files, their images and masks."""
-    source = Source(folder, settings.allow_outside)
+def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     images, cameras = _kind(source)
-    found = frames.files_of(source, _frames(source, images, cameras))
-    maps = [_depth(source, path.stem) for path in found]
-    beside = [path for one in maps if one is not None for path in (one.file, one.confidence) if path is not None]
-    return [*_cameras(source, cameras), *found, *beside]
-
-
-def read(folder: Path, settings: ImportSettings) -> Capture:
-    """The capture that the keyframes describe. Raises BadInput."""
-    source = Source(folder, settings.allow_outside)
-    images, cameras = _kind(source)
-    warnings = []
-    if cameras == "cameras":
-        warnings.append("keyframes/corrected_cameras is not there: the phone's own poses and images with some distortion are used. Process with loop closure.")
-    posed = {path.stem for path in _cameras(source, cameras)}
-    unposed = [source.name_of(path) for path in images_in(source.root / KEYFRAMES / images) if path.stem not in posed]
-    capture = frames.capture_of(
-        source,
-        _frames(source, images, cameras),
-        settings,
-        kind="polycam",
-        where=f"{KEYFRAMES}/{cameras}",
-        rejected=[(name, "without a camera file") for name in unposed],
-        warnings=warnings,
-        up=np.array([0.0, 1.0, 0.0]),
-        metric=True,
-        facts={"cameras": cameras},
-    )
-    return with_depth(capture, lambda photo: _depth(source, photo.image.stem))
+    where, found = f"{KEYFRAMES}/{cameras}", _cameras(source, cameras)
+    raw = "keyframes/corrected_cameras is not there: the phone's own poses and images with some distortion are used. Process with loop closure."
+    posed, place = {path.stem for path in found}, source.root / KEYFRAMES / images
+    frames.check_count(len(found), where)
+    more = {
+        "rejected": [(source.name_of(path), "without a camera file") for path in images_in(place) if path.stem not in posed],
+        "warnings": [raw] if cameras == "cameras" else [],
+        "up": np.array([0.0, 1.0, 0.0]),
+        "metric": True,
+        "facts": {"cameras": cameras},
+    }
+    listed = [frames.Frame(path.stem, place, source.name_of(path), frames.stated(_camera(source, path)), bare=True) for path in found]
+    return Listed(where, listed, found, partial(_depth, source), more)
 
 
 def _depth(source: Source, stem: str) -> DepthFile | None:
@@ -84,18 +69,7 @@ def _kind(source: Source) -> tuple[str, str]:
     for images, cameras in _KINDS:
         if _cameras(source, cameras) and images_in(source.root / KEYFRAMES / images):
             return images, cameras
-    raise BadInput(
-        f"{source.root}: no raw data of Polycam: expected {KEYFRAMES}/images with {KEYFRAMES}/cameras, or their corrected versions. Choose a format with --as."
-    )
-
-
-def _frames(source: Source, images: str, cameras: str) -> list[frames.Frame]:
-    listed = []
-    found = _cameras(source, cameras)
-    frames.check_count(len(found), f"{KEYFRAMES}/{cameras}")
-    for path in found:
-        listed.append(frames.Frame(path.stem, source.root / KEYFRAMES / images, source.name_of(path), frames.stated(_camera(source, path)), bare=True))
-    return listed
+    raise BadInput(f"{source.root}: no raw data of Polycam: expected {EXPECTED}. Choose another format with --as.")
 
 
 def _camera(source: Source, path: Path) -> Camera:
@@ -117,3 +91,6 @@ def _camera(source: Source, path: Path) -> Camera:
     pose = pose_from_opengl(lenses.rigid([*rows, [0, 0, 0, 1]], where))
     lens = brown_camera("", (int(width), int(height)), (value("fx"), value("fy")), (value("cx"), value("cy")), (), (0, 0), where)
     return replace(lens, world_from_camera=pose)
+
+
+FORMAT = ListFormat("polycam", EXPECTED, _signs, _listed)

@@ -7,7 +7,9 @@ ARKit's: y up, metres. depth/<number>.exr holds metres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +18,9 @@ from efficientnerf.geometry.cameras import pose_from_colmap, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.formats.importers import frames
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.depth import DepthFile, depth_file, with_depth
-from stages.formats.importers.source import ImportSettings, Source, images_in
-from stages.io.capture import Capture
+from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.source import Source, images_in
 from stages.io.json_file import numbers, read_json, shown
 
 PLACES = (".", "EXR_RGBD")
@@ -27,50 +29,22 @@ METADATA, IMAGES = "metadata.json", "rgb"
 _AGAIN = "Export from Record3D again, as EXR + JPG."
 
 
-def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return _place(Source(folder, allow_outside)) is not None
-
-
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The metadata, the images and their masks."""
-    source = Source(folder, settings.allow_outside)
-    place, listed, _ = _read(source)
-    found = frames.files_of(source, listed)
-    maps = [_depth(source, place, path.stem) for path in found]
-    return [place / METADATA, *found, *(one.file for one in maps if one is not None)]
-
-
-def read(folder: Path, settings: ImportSettings) -> Capture:
-    """The capture that the metadata describe. Raises BadInput."""
-    source = Source(folder, settings.allow_outside)
-    place, listed, unposed = _read(source)
-    where = source.name_of(place / METADATA)
-    rejected = [(name, "without a pose") for name in unposed]
-    up = np.array([0.0, 1.0, 0.0])
-    capture = frames.capture_of(source, listed, settings, kind="record3d", where=where, rejected=rejected, up=up, metric=True)
-    return with_depth(capture, lambda photo: _depth(source, place, photo.image.stem))
-
-
 def _depth(source: Source, place: Path, stem: str) -> DepthFile | None:
     return depth_file(source, place / f"depth/{stem}.exr", 1.0, farthest=FARTHEST)
 
 
-def _place(source: Source) -> Path | None:
+def _signs(source: Source) -> Sequence[Path]:
     for name in PLACES:
         place = source.root / name
         if (place / METADATA).is_file() and images_in(place / IMAGES):
             document = read_json(source.real(place / METADATA), _AGAIN)
             if isinstance(document, dict) and "poses" in document and ("K" in document or "perFrameIntrinsicCoeffs" in document):
-                return place
-    return None
+                return [place / METADATA]
+    return []
 
 
-def _read(source: Source) -> tuple[Path, list[frames.Frame], list[str]]:
-    """The folder of the export, its frames, and the images without a pose."""
-    place = _place(source)
-    if place is None:
-        raise BadInput(f"{source.root}: no export of Record3D: expected {METADATA} with poses and K, and {IMAGES}/0.jpg and so on. Choose a format with --as.")
-    where = source.name_of(place / METADATA)
+def _listed(source: Source, signs: Sequence[Path]) -> Listed:
+    place, where = signs[0].parent, source.name_of(signs[0])
     document = read_json(source.real(place / METADATA), _AGAIN)
     poses, coefficients = document["poses"], document.get("perFrameIntrinsicCoeffs") or []
     if not isinstance(poses, list) or not isinstance(coefficients, list) or (coefficients and len(coefficients) != len(poses)):
@@ -88,14 +62,15 @@ def _read(source: Source) -> tuple[Path, list[frames.Frame], list[str]]:
     for image in sorted(images, key=lambda path: (len(path.stem), path.stem)):
         index = int(image.stem) if image.stem.isascii() and image.stem.isdecimal() and len(image.stem) < 10 else len(poses)
         if index >= len(poses):
-            unposed.append(source.name_of(image))
+            unposed.append((source.name_of(image), "without a pose"))
             continue
         what = f"{where}: frame {index}"
         fx, fy, cx, cy = common or numbers(coefficients[index], 4, f"{what}: perFrameIntrinsicCoeffs", _AGAIN)
         lens = brown_camera("", (int(width), int(height)), (fx, fy), (cx, cy), (), (0, 0), what)
         camera = replace(lens, world_from_camera=_pose(numbers(poses[index], 7, f"{what}: pose", _AGAIN), what))
         listed.append(frames.Frame(image.name, image.parent, what, frames.stated(camera)))
-    return place, listed, unposed
+    more = {"rejected": unposed, "up": np.array([0.0, 1.0, 0.0]), "metric": True}
+    return Listed(where, listed, signs, partial(_depth, source, place), more)
 
 
 def _pose(values: list[float], where: str) -> np.ndarray:
@@ -105,3 +80,6 @@ def _pose(values: list[float], where: str) -> np.ndarray:
     pose = np.linalg.inv(pose_from_colmap(np.array([w, x, y, z]), np.zeros(3)))  # which takes world to camera
     pose[:3, 3] = place
     return pose_from_opengl(pose)
+
+
+FORMAT = ListFormat("record3d", f"{METADATA} with poses and K, and {IMAGES}/0.jpg and so on", _signs, _listed)

@@ -8,9 +8,10 @@ The app writes more poses than pictures. Scans in low resolution have depth_0000
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,9 @@ from efficientnerf.geometry.cameras import Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.depth import DepthFile, depth_file, with_depth
-from stages.formats.importers.source import ImportSettings, Source, images_in
-from stages.io.capture import Capture
+from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.source import Source, images_in
 from stages.io.json_file import numbers, read_json, shown
 
 POSE, INTRINSICS = "cameraPoseARFrame", "intrinsics"
@@ -37,10 +38,13 @@ _TRIED = 10  # frames that are read to recognise the format, for some may be dam
 _AGAIN = "Export from 3D Scanner App again, as All Data."
 
 
-def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    source = Source(folder, allow_outside)
-    for image in [path for path in _pictures(_place(source)) if _is_posed(path)][:_TRIED]:
-        path = source.check_inside(image.with_suffix(".json"))
+def _signs(source: Source) -> Sequence[Path]:
+    """The JSON files of the pictures that have one."""
+    return [source.check_inside(path.with_suffix(".json")) for path in _pictures(_place(source)) if _is_posed(path)]
+
+
+def _recognised(source: Source, signs: Sequence[Path]) -> bool:
+    for path in signs[:_TRIED]:
         with suppress(BadInput):  # said where it is read
             document = read_json(source.real(path), _AGAIN, limit=LARGEST_FRAME)
             if isinstance(document, dict) and POSE in document:
@@ -48,35 +52,20 @@ def recognises(folder: Path, allow_outside: bool = False) -> bool:
     return False
 
 
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The frames, their pictures, masks and depth."""
-    source = Source(folder, settings.allow_outside)
+def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     place = _place(source)
-    found = frames.files_of(source, _frames(source, place))
-    maps = [_depth(source, place, path.stem) for path in found]
-    beside = [path for one in maps if one is not None for path in (one.file, one.confidence) if path is not None]
-    return [*(source.check_inside(path.with_suffix(".json")) for path in _pictures(place) if _is_posed(path)), *found, *beside]
-
-
-def read(folder: Path, settings: ImportSettings) -> Capture:
-    """The capture that the frames describe. Raises BadInput."""
-    source = Source(folder, settings.allow_outside)
-    place = _place(source)
-    pictures = _pictures(place)
+    pictures, where = _pictures(place), source.name_of(place / "frame_*.json")
+    posed = [path for path in pictures if _is_posed(path)]
+    frames.check_count(len(posed), where)
     poses = sum(1 for path in place.glob("frame_*.json") if _FRAME.fullmatch(path.stem))
-    posed = sum(map(_is_posed, pictures))
-    capture = frames.capture_of(
-        source,
-        _frames(source, place),
-        settings,
-        kind="3d-scanner-app",
-        where=source.name_of(place / "frame_*.json"),
-        rejected=[(source.name_of(path), "without a pose") for path in pictures if not _is_posed(path)],
-        up=np.array([0.0, 1.0, 0.0]),
-        metric=True,
-        facts={"poses_without_picture": poses - posed},
-    )
-    return with_depth(capture, lambda photo: _depth(source, place, photo.image.stem))
+    more = {
+        "rejected": [(source.name_of(path), "without a pose") for path in pictures if path not in posed],
+        "up": np.array([0.0, 1.0, 0.0]),
+        "metric": True,
+        "facts": {"poses_without_picture": poses - len(posed)},
+    }
+    listed = [frames.Frame(path.name, place, source.name_of(path.with_suffix(".json")), _camera(source, path.with_suffix(".json"))) for path in posed]
+    return Listed(where, listed, signs, partial(_depth, source, place), more)
 
 
 def _depth(source: Source, place: Path, stem: str) -> DepthFile | None:
@@ -96,14 +85,6 @@ def _pictures(place: Path) -> list[Path]:
 
 def _is_posed(picture: Path) -> bool:
     return picture.with_suffix(".json").is_file()
-
-
-def _frames(source: Source, place: Path) -> list[frames.Frame]:
-    pictures = [path for path in _pictures(place) if _is_posed(path)]
-    if not pictures:
-        raise BadInput(f"{source.root}: no export of 3D Scanner App: expected frame_00000.jpg beside frame_00000.json and so on. Choose a format with --as.")
-    frames.check_count(len(pictures), source.name_of(place / "frame_*.json"))
-    return [frames.Frame(path.name, place, source.name_of(path.with_suffix(".json")), _camera(source, path.with_suffix(".json"))) for path in pictures]
 
 
 def _camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Camera]:
@@ -127,3 +108,6 @@ def _camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Came
         )
 
     return at
+
+
+FORMAT = ListFormat("3d-scanner-app", "frame_00000.jpg beside frame_00000.json and so on", _signs, _listed, _recognised)

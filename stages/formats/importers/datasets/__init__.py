@@ -1,1 +1,1 @@
-"""Layouts of published data sets."""
+"""Published data sets."""

@@ -11,8 +11,8 @@ of the component) leads on to the frame of the project, in metres. A geocentric 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -23,29 +23,14 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.brown import brown_camera, without_skew
+from stages.formats.importers.listed import Listed, ListFormat
 from stages.formats.importers.photogrammetry.xml import read_xml
-from stages.formats.importers.source import ImportSettings, Source
+from stages.formats.importers.source import Source
 from stages.formats.importers.texts import head, number, numbers
-from stages.io.capture import Capture
 
 FARTHEST = 1e5  # metres from the origin: beyond it coordinates are geocentric or projected, and the shift is left out
 PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 _ALIGN = "Align the photographs in Metashape and export the cameras again."
-
-
-@dataclass(frozen=True)
-class _Project:
-    file: Path
-    frames: list[frames.Frame]
-    rejected: list[tuple[str, str]]
-    warnings: list[str]
-    metric: bool
-    up: np.ndarray | None
-    facts: dict[str, object]
-
-
-def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return bool(_camera_files(Source(folder, allow_outside)))
 
 
 def _camera_files(source: Source) -> list[Path]:
@@ -58,36 +43,9 @@ def _camera_files(source: Source) -> list[Path]:
     return found
 
 
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The XML file, the photographs and their masks."""
-    source = Source(folder, settings.allow_outside)
-    project = _read(source)
-    return [project.file, *frames.files_of(source, project.frames)]
-
-
-def read(folder: Path, settings: ImportSettings) -> Capture:
-    """The capture that the exported cameras describe. Raises BadInput."""
-    source = Source(folder, settings.allow_outside)
-    project = _read(source)
-    return frames.capture_of(
-        source,
-        project.frames,
-        settings,
-        kind="metashape",
-        where=source.name_of(project.file),
-        rejected=project.rejected,
-        warnings=project.warnings,
-        metric=project.metric,
-        up=project.up,
-        facts=project.facts,
-    )
-
-
-def _read(source: Source) -> _Project:
-    found = _camera_files(source)
-    if len(found) != 1:
-        what = "no XML file with the cameras of Metashape" if not found else f"{len(found)} files with cameras of Metashape"
-        raise BadInput(f"{source.root}: {what}; one is expected beside the photographs. Choose another format with --as, or take the others out.")
+def _listed(source: Source, found: Sequence[Path]) -> Listed:
+    if len(found) > 1:
+        raise BadInput(f"{source.root}: {len(found)} files with cameras of Metashape; one is expected. Take the others out.")
     where = source.name_of(found[0])
     root = read_xml(source.real(found[0]))
     chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
@@ -104,7 +62,7 @@ def _cameras(chunk: Element) -> Iterator[Element]:
         yield from cameras.iter("camera")  # within groups, too
 
 
-def _project(source: Source, file: Path, where: str, chunk: Element, warnings: list[str]) -> _Project:
+def _project(source: Source, file: Path, where: str, chunk: Element, warnings: list[str]) -> Listed:
     cameras = list(_cameras(chunk))
     frames.check_count(len(cameras), where)
     components = {one.get("id"): one for one in chunk.iterfind("components/component")}
@@ -135,7 +93,8 @@ def _project(source: Source, file: Path, where: str, chunk: Element, warnings: l
             listed.append(frames.Frame(label, source.root, place, frames.stated(camera), bare=True))
     warnings += sensors.remarks
     facts = {"label": printable(chunk.get("label") or "", frames.MAX_NAME), "sensors": len(sensors.elements)}
-    return _Project(file, listed, rejected, warnings, metric, up, facts)
+    more = {"rejected": rejected, "warnings": warnings, "metric": metric, "up": up, "facts": facts}
+    return Listed(where, listed, [file], more=more)
 
 
 class _Sensors:
@@ -208,3 +167,6 @@ def _world(transform: Element | None, where: str) -> tuple[Similarity, bool, np.
     said = f"{where}: the project lies {distance:.3g} m from the origin of its coordinates; positions are from the chunk's own origin."
     up = shift / distance if 6.2e6 < distance < 6.5e6 else None  # geocentric: away from the middle of the earth
     return Similarity(scale, turn, np.zeros(3)), metric, up, said
+
+
+FORMAT = ListFormat("metashape", "an XML file with the cameras of Metashape beside the photographs", _camera_files, _listed)

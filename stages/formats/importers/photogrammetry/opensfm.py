@@ -7,7 +7,7 @@ is in metres where the photographs have GPS (`reference_lla`). Points that track
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.source import ImportSettings, Source
+from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.source import Source
 from stages.formats.importers.texts import read_text
-from stages.io.capture import Capture, SparsePoints
+from stages.io.capture import SparsePoints
 from stages.io.json_file import finite, read_json, shown
 
 PLACES = ("opensfm/reconstruction.json", "reconstruction.json")
@@ -36,55 +37,31 @@ _BROWN = {
 _FISHEYE = {"fisheye": ("k1", "k2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
 
 
-def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return Source(folder, allow_outside).first_of(PLACES) is not None
-
-
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The reconstruction, its tracks, the photographs and their masks."""
-    source = Source(folder, settings.allow_outside)
-    file, reconstructions = _read(source)
-    tracks = file.with_name("tracks.csv")
-    return [file, *([tracks] if tracks.is_file() else []), *frames.files_of(source, _frames(source, file, reconstructions[0]))]
-
-
-def read(folder: Path, settings: ImportSettings) -> Capture:
-    """The capture that the largest reconstruction describes. Raises BadInput."""
-    source = Source(folder, settings.allow_outside)
-    file, reconstructions = _read(source)
-    where, best = source.name_of(file), reconstructions[0]
-    warnings = []
-    if len(reconstructions) > 1:
-        others = ", ".join(str(len(one["shots"])) for one in reconstructions[1:6])
-        warnings.append(f"{where}: the reconstruction with {len(best['shots'])} images is used; there are others with {others}, which share no frame with it.")
-    origin = best.get("reference_lla")
-    metric = isinstance(origin, dict) and any(finite(value) for value in origin.values())
-    return frames.capture_of(
-        source,
-        _frames(source, file, best),
-        settings,
-        kind="opensfm",
-        where=where,
-        warnings=warnings,
-        points=lambda places: _points(source, file, best, places),
-        up=np.array([0.0, 0.0, 1.0]),
-        metric=metric,
-        facts={"reconstruction": where, "registered": len(best["shots"]), "cameras": len(best["cameras"])},
-    )
-
-
-
-def _read(source: Source) -> tuple[Path, list[dict[str, Any]]]:
-    """The file, and its reconstructions, that with most shots first."""
+def _signs(source: Source) -> Sequence[Path]:
     file = source.first_of(PLACES)
-    if file is None:
-        raise BadInput(f"{source.root}: no reconstruction of OpenSfM: expected {' or '.join(PLACES)}. Choose another format with --as.")
+    return [] if file is None else [file]
+
+
+def _listed(source: Source, signs: Sequence[Path]) -> Listed:
+    """The reconstruction with most shots."""
+    file, where, tracks = signs[0], source.name_of(signs[0]), signs[0].with_name("tracks.csv")
     document = read_json(source.real(file), _AGAIN)
     found = [one for one in document if isinstance(one, dict)] if isinstance(document, list) else []
     found = [one for one in found if isinstance(one.get("shots"), dict) and isinstance(one.get("cameras"), dict)]
     if not found:
-        raise BadInput(f"{source.name_of(file)}: no reconstruction: expected a list of objects with `cameras` and `shots`. {_AGAIN}")
-    return file, sorted(found, key=lambda one: len(one["shots"]), reverse=True)
+        raise BadInput(f"{where}: no reconstruction: expected a list of objects with `cameras` and `shots`. {_AGAIN}")
+    best, *others = sorted(found, key=lambda one: len(one["shots"]), reverse=True)
+    counts = ", ".join(str(len(one["shots"])) for one in others[:5])
+    warning = f"{where}: the reconstruction with {len(best['shots'])} images is used; there are others with {counts}, which share no frame with it."
+    origin = best.get("reference_lla")
+    more = {
+        "warnings": [warning] if others else [],
+        "points": lambda places: _points(source, file, best, places),
+        "up": np.array([0.0, 0.0, 1.0]),
+        "metric": isinstance(origin, dict) and any(finite(value) for value in origin.values()),
+        "facts": {"reconstruction": where, "registered": len(best["shots"]), "cameras": len(best["cameras"])},
+    }
+    return Listed(where, _frames(source, file, best), [file, *([tracks] if tracks.is_file() else [])], more=more)
 
 
 def _vector(value: Any, where: str) -> np.ndarray:
@@ -184,3 +161,6 @@ def _tracks(source: Source, file: Path, points: dict[str, int], places: dict[str
         if len(words) == 3 and words[1] in points and words[0] in places:
             tracks[points[words[1]]].add(places[words[0]])
     return [tuple(sorted(track)) for track in tracks]
+
+
+FORMAT = ListFormat("opensfm", " or ".join(PLACES), _signs, _listed)

@@ -14,9 +14,10 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -26,10 +27,10 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.brown import brown_camera
+from stages.formats.importers.listed import Listed, ListFormat
 from stages.formats.importers.photogrammetry.xml import read_xml
-from stages.formats.importers.source import ImportSettings, Source
+from stages.formats.importers.source import Source
 from stages.formats.importers.texts import head, number, numbers, read_text
-from stages.io.capture import Capture
 
 REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 FILM = 36.0  # millimetres, the longer side of a frame of 35 mm film
@@ -41,58 +42,19 @@ _AGAIN = "Export the registration again."
 _BROWN = {"perspective": 0, "none": 0, "brown3": 3, "brown3t2": 5, "brown4": 4, "brown4t2": 6}
 
 
-@dataclass(frozen=True)
-class _Export:
-    files: list[Path]
-    where: str
-    frames: list[frames.Frame]
-    rejected: list[tuple[str, str]]
-    warnings: list[str]
+def _signs(source: Source) -> Sequence[Path]:
+    return _tables(source) or _sidecars(source, first=True)
 
 
-def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    source = Source(folder, allow_outside)
-    return bool(_tables(source) or _sidecars(source, first=True))
-
-
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The table or the XMP files, the photographs and their masks."""
-    source = Source(folder, settings.allow_outside)
-    export = _read(source)
-    return [*export.files, *frames.files_of(source, export.frames)]
-
-
-def read(folder: Path, settings: ImportSettings) -> Capture:
-    """The capture that the exported registration describes. Raises BadInput."""
-    source = Source(folder, settings.allow_outside)
-    export = _read(source)
-    return frames.capture_of(
-        source,
-        export.frames,
-        settings,
-        kind="realitycapture",
-        where=export.where,
-        rejected=export.rejected,
-        warnings=export.warnings,
-        up=np.array([0.0, 0.0, 1.0]),
-        facts={"registration": export.where},
-    )
-
-
-def _read(source: Source) -> _Export:
+def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     tables, sidecars = _tables(source), _sidecars(source)
     if len(tables) > 1:
         names = ", ".join(source.name_of(path) for path in tables)
         raise BadInput(f"{source.root}: several tables of cameras ({names}); one is expected. Take the others out.")
-    if tables:
-        warnings = [f"{source.name_of(tables[0])} is read; the XMP files beside the photographs are not."] if sidecars else []
-        return _from_table(source, tables[0], warnings)
-    if sidecars:
+    if not tables:
         return _from_sidecars(source, sidecars)
-    raise BadInput(
-        f"{source.root}: no registration of RealityCapture: expected a CSV file with the columns {', '.join(REQUIRED)}, or XMP files beside the photographs. "
-        "Choose another format with --as."
-    )
+    warnings = [f"{source.name_of(tables[0])} is read; the XMP files beside the photographs are not."] if sidecars else []
+    return _from_table(source, tables[0], warnings)
 
 
 # --- CSV
@@ -116,7 +78,7 @@ def _tables(source: Source) -> list[Path]:
     return [path for path in sorted(source.root.glob("*.csv")) if path.is_file() and _title(head(source.real(path))) is not None]
 
 
-def _from_table(source: Source, file: Path, warnings: list[str]) -> _Export:
+def _from_table(source: Source, file: Path, warnings: list[str]) -> Listed:
     where = source.name_of(file)
     text = read_text(source.real(file))
     title = _title(text)
@@ -135,7 +97,7 @@ def _from_table(source: Source, file: Path, warnings: list[str]) -> _Export:
             frames.check_count(len(listed), where)
     except csv.Error as error:
         raise BadInput(f"{where}: {printable(error, 100)}. {_AGAIN}") from None
-    return _Export([file], where, listed, [], warnings)
+    return Listed(where, listed, [file], more=_more(where, warnings))
 
 
 def _row(source: Source, where: str, cells: dict[str, str]) -> frames.Frame:
@@ -195,7 +157,7 @@ def _sidecars(source: Source, first: bool = False) -> list[Path]:
     return []
 
 
-def _from_sidecars(source: Source, found: list[Path]) -> _Export:
+def _from_sidecars(source: Source, found: list[Path]) -> Listed:
     listed: list[frames.Frame] = []
     frames.check_count(len(found), source.name_of(found[0].parent))
     for path in found:
@@ -206,7 +168,11 @@ def _from_sidecars(source: Source, found: list[Path]) -> _Export:
             continue  # that of another program
         listed.append(frames.Frame(path.stem, path.parent, where, _sidecar(partial(_stated, described[0]), where), bare=True))
     where = f"{len(listed)} XMP files"
-    return _Export(found, where, listed, [], [])
+    return Listed(where, listed, found, more=_more(where, []))
+
+
+def _more(where: str, warnings: list[str]) -> dict[str, Any]:
+    return {"warnings": warnings, "up": np.array([0.0, 0.0, 1.0]), "facts": {"registration": where}}
 
 
 def _stated(description: Element, key: str) -> str | None:
@@ -237,3 +203,6 @@ def _sidecar(stated: Callable[[str], str | None], where: str) -> Callable[[str, 
     if abs(aspect - 1) > 1e-6 or abs(skew) > 1e-6:
         raise BadInput(f"{where}: AspectRatio {aspect:g} and Skew {skew:g}; only square pixels are read from XMP files. Align again without.")
     return _lens(value("FocalLength35mm", "0"), (value("PrincipalPointU", "0"), value("PrincipalPointV", "0")), radial, tangential, pose, where)
+
+
+FORMAT = ListFormat("realitycapture", f"a CSV file with the columns {', '.join(REQUIRED)}, or XMP files beside the photographs", _signs, _listed)

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import trimesh
 
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface.mesh import vertex_normals
-from efficientnerf.surface.rasteriser import mesh_image, shown_points
+from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 from efficientnerf.surface.texturing.atlas import Atlas, atlas_of
 from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, survey
 
@@ -47,6 +47,13 @@ def cameras(count: int = 8, size: int = 96, distance: float = 3.2) -> list[Camer
         pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
         out.append(Camera(f"{number}", size, size, "SIMPLE_RADIAL", (1.1 * size, size / 2, size / 2, -0.03), pose))
     return out
+
+
+def shown_points(image: MeshImage, camera: Camera) -> np.ndarray:
+    """(M, 3) world points of the pixels that show a face, row by row."""
+    y, x = np.nonzero(image.covered)
+    origins, directions = rays(camera, np.stack([x, y], -1) + 0.5)
+    return np.asarray(origins + (image.depth[image.covered] / (directions @ camera.forward))[:, None] * directions)
 
 
 def photographed(vertices: np.ndarray, faces: np.ndarray, camera: Camera, colours: Colours = pattern, behind: float = 1.0) -> Photograph:

@@ -105,25 +105,6 @@ def test_texels_know_their_place_on_the_surface() -> None:
     assert np.linalg.norm(texels.values(vertices, faces), axis=1).min() > 0.9
 
 
-def test_charts_smaller_than_a_texel_have_one() -> None:
-    """Loose faces of a tenth of a texel beside a large one: each is looked up in a colour of its own."""
-    rng = np.random.default_rng(0)
-    places = rng.normal(size=(40, 3))
-    vertices = np.concatenate([[[-9.0, -9, 0], [9, -9, 0], [0, 9, 0]], (places[:, None] + 0.01 * rng.normal(size=(40, 3, 3))).reshape(-1, 3)])
-    faces = np.arange(len(vertices)).reshape(-1, 3)
-    atlas = atlas_of(vertices, faces, np.inf, 128)
-    middle = np.floor(atlas.corners.mean(1)).astype(int)
-    texture = texture_from(atlas, np.repeat(atlas.texels.face[:, None], 3, axis=1).astype(np.uint8))
-    np.testing.assert_array_equal(texture[middle[:, 1], middle[:, 0], 0], np.arange(len(faces)))
-
-
-def test_the_size_follows_from_the_texels_that_are_wanted() -> None:
-    vertices, faces = ball(3)
-    sizes = [atlas_of(vertices, faces, scale, 512) for scale in (8.0, 30.0, 60.0, 1e6)]
-    assert [each.size for each in sizes] == [64, 128, 256, 512]
-    assert all(each.scale >= 0.8 * scale for each, scale in zip(sizes[:3], (8.0, 30.0, 60.0)))
-
-
 @pytest.mark.parametrize("case", ["one", "none", "flat", "needle", "doubled"])
 def test_hostile_meshes(case: str) -> None:
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [2, 0, 0], [0, 1e-12, 0]])
@@ -163,8 +144,3 @@ def test_empty_texels_have_the_colour_of_the_nearest() -> None:
 
 def mirrored(atlas: Atlas) -> np.ndarray:
     return np.asarray(atlas.coordinates * [atlas.size, -atlas.size] + [0, atlas.size])
-
-
-def test_coordinates_count_up_from_the_lower_edge() -> None:
-    atlas = atlas_of(*ball(1), np.inf, 64)
-    np.testing.assert_allclose(mirrored(atlas), atlas.corners, atol=1e-9)

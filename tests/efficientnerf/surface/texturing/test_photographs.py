@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numba import get_num_threads, set_num_threads
 
-from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.cameras import project
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.filling import carried_on
-from efficientnerf.surface.texturing.photographs import REACH, Photograph, PhotographTexture, edge_distance, halved, photograph, survey, texels_wanted
+from efficientnerf.surface.texturing.photographs import REACH, PhotographTexture, edge_distance, photograph, survey
 
 from .shapes import ball, box, cameras, pattern, photographed, textured
 
@@ -106,23 +106,6 @@ def test_where_nothing_is_seen_the_colours_beside_it_are_carried_on() -> None:
     np.testing.assert_array_equal(carried_on(mesh, atlas, colours, nothing, colours), mesh.colours)
 
 
-def test_the_back_of_a_wall_has_the_colours_of_its_front() -> None:
-    """Two sides of a wall that share no edge, red to the left and blue to the right; photographs show the front."""
-    y, z = (part.ravel() for part in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij"))
-    corner = (21 * np.arange(20)[:, None] + np.arange(20)).ravel()
-    side = np.concatenate([np.stack([corner, corner + 21, corner + 22], -1), np.stack([corner, corner + 22, corner + 1], -1)])
-    vertices, faces = np.concatenate([np.stack([x + 0 * y, y, z], 1) for x in (0.05, -0.05)]), np.concatenate([side, side[:, ::-1] + 441])
-    atlas = atlas_of(vertices, faces, np.inf, 128)
-    points = atlas.texels.values(vertices, faces)
-    colours = np.where(points[:, 1:2] < 0, np.uint8([200, 0, 0]), np.uint8([0, 0, 200]))
-    known = (points[:, 0] > 0).astype(np.float32)
-    mesh = Mesh(vertices, faces, vertex_normals(vertices, faces), np.ones((882, 3), np.float32))
-    found = 255 * carried_on(mesh, atlas, colours, known, np.full_like(colours, 255))
-    back = found[441:]
-    np.testing.assert_allclose(back[y < -0.3], np.tile([200, 0, 0], ((y < -0.3).sum(), 1)), atol=2)
-    np.testing.assert_allclose(back[y > 0.3], np.tile([0, 0, 200], ((y > 0.3).sum(), 1)), atol=2)
-
-
 def test_masks_and_alpha_are_kept_to() -> None:
     vertices, faces = ball(3)
     camera = cameras(1)[0]
@@ -136,61 +119,17 @@ def test_masks_and_alpha_are_kept_to() -> None:
         assert known[pixels[:, 0] < 40].max() > 0.9
 
 
-def away(camera: Camera) -> Camera:
-    """The camera turned round."""
-    pose = camera.world_from_camera.copy()
-    pose[:3, [0, 2]] *= -1
-    return replace(camera, world_from_camera=pose)
-
-
-def test_photographs_of_nothing_leave_what_is_expected() -> None:
-    vertices, faces = ball(2)
-    white = np.full((96, 96, 3), 255, np.uint8)
-    for photos in (
-        [Photograph(away(camera), white, np.ones((96, 96), bool)) for camera in cameras(3)],
-        [Photograph(camera, white, np.zeros((96, 96), bool)) for camera in cameras(3)],
-    ):
-        _, colours, known = textured(vertices, faces, photos, expected=(10, 20, 30))
-        assert (known == 0).all()
-        np.testing.assert_array_equal(np.unique(np.round(colours * 255), axis=0), [[10, 20, 30]])
-
-
-def test_a_blurred_photograph_counts_less() -> None:
-    vertices, faces = ball(3)
-    normals = vertex_normals(vertices, faces)
-    fine = lambda points: 0.5 + 0.4 * np.sign(np.sin(25 * points))  # noqa: E731
-    photo = photographed(vertices, faces, cameras(1)[0], fine)
-    kernel = np.ones(5) / 5
-    blurred = np.apply_along_axis(np.convolve, 0, np.apply_along_axis(np.convolve, 1, photo.colours.astype(float), kernel, "same"), kernel, "same")
-    soft = replace(photo, colours=blurred.astype(np.uint8))
-    sharp_one, soft_one = (survey(vertices, faces, normals, pattern(vertices), each).sharpness for each in (photo, soft))
-    assert soft_one < 0.5 * sharp_one
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_same_bytes_on_any_number_of_threads(threads: int) -> None:
+def test_the_same_bytes_on_any_number_of_threads() -> None:
     vertices, faces = ball(3)
     photos = [photographed(vertices, faces, camera) for camera in cameras(5)]
     before = get_num_threads()
     first = textured(vertices, faces, photos)[1]
     try:
-        set_num_threads(min(threads, before))
+        set_num_threads(1)
         again = textured(vertices, faces, photos)[1]
     finally:
         set_num_threads(before)
     np.testing.assert_array_equal(first, again)
-
-
-def test_halved_photographs_show_the_same_places() -> None:
-    camera = replace(cameras(1, size=97)[0], height=95)
-    ramp = np.linspace(0, 255, 97) * np.ones((95, 1))
-    photo = Photograph(camera, np.repeat(ramp[..., None], 3, 2).astype(np.uint8), np.ones((95, 97), bool))
-    half = halved(photo)
-    assert half.colours.shape == (47, 48, 3)
-    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.3
-    np.testing.assert_allclose(project(half.camera, points)[0], project(camera, points)[0] / 2, atol=1e-6)
-    row, column = 20, 30
-    assert abs(int(half.colours[row, column, 0]) - float(photo.colours[2 * row : 2 * row + 2, 2 * column : 2 * column + 2, 0].mean())) <= 1
 
 
 def test_a_texel_sees_all_pixels_that_lie_in_it() -> None:
@@ -203,31 +142,6 @@ def test_a_texel_sees_all_pixels_that_lie_in_it() -> None:
         photos.append(replace(photo, colours=np.repeat(np.where((x + y) % 2, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)))
     _, colours, known = textured(vertices, faces, photos, size=64)
     assert np.abs(colours[known > 0.95] - 0.5).max() < 0.06
-
-
-def test_a_texel_is_as_large_as_a_pixel() -> None:
-    vertices, faces = ball(4)
-    camera = cameras(1)[0]
-    found = survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), photographed(vertices, faces, camera))
-    nearest = 1.1 * 96 / (3.2 - 1)  # pixels for each unit of the surface that faces the camera
-    assert 0.5 * nearest < texels_wanted(vertices, faces, found.density) / 1.25 < nearest
-    assert np.isinf(texels_wanted(vertices, faces, np.zeros(len(faces))))
-
-
-def test_many_photographs_keep_the_best() -> None:
-    """A texel keeps no more than so many: those of the highest grades, whatever the order they come in."""
-    vertices, faces = ball(2)
-    photos = [photographed(vertices, faces, camera) for camera in cameras(12)]
-    normals, found = vertex_normals(vertices, faces), []
-    for order in (1, -1):
-        surveys = [survey(vertices, faces, normals, pattern(vertices), photo) for photo in photos]
-        atlas = textured(vertices, faces, photos[:1])[0]
-        texels = PhotographTexture(vertices, faces, normals, atlas, np.max([each.density for each in surveys], axis=0), 1.0, kept=3)
-        for photo, each in list(zip(photos, surveys))[::order]:
-            texels.look(photo, each)
-        assert (np.diff(texels.grades, axis=1) <= 0).all()
-        found.append(texels.grades)
-    np.testing.assert_array_equal(*found)
 
 
 @pytest.mark.parametrize(("tilt", "gap"), [(0.0, 0.005), (0.9, 0.03)])
@@ -269,7 +183,7 @@ def test_distances_are_those_of_a_chamfer_from_what_may_not_be_used() -> None:
     assert (edge_distance(usable, np.where(x < 16, 0.5, 0.4).astype(np.float32))[:, 15:17] == 0).all()
 
 
-@pytest.mark.parametrize("after", [0, 2, 5, 8])
+@pytest.mark.parametrize("after", [0, 5])
 def test_a_signal_stops_it_within_a_photograph(after: int) -> None:
     """In the survey of one, in what texels see of one, and when all have been seen."""
     vertices, faces = ball(2)

@@ -1,0 +1,67 @@
+"""How much is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
+
+from efficientnerf.settings import Auto, Off, PositiveInt, given, setting
+from pipeline.stage import ByName, Stage
+from stages.artifacts import EvaluateInputs, needs_of
+from stages.evaluate.lpips_weights import find_weights
+
+MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
+MAX_FIELD_RAYS = 400_000  # of all of them together, then
+NETWORKS = ("alex", "vgg")  # of LPIPS
+
+
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """How much is measured."""
+
+    field_views: PositiveInt | Literal["all"] = setting(16, "Number of test views that the field is rendered for, spread evenly.", advanced=True)
+    field_image_scale: Annotated[float, Meta(ge=0.01, le=1.0)] | Auto = setting(
+        "auto",
+        f"Scale of the pixel grid on which the field is rendered; auto: at most {MAX_FIELD_IMAGE_SIZE} along the longest side, and about "
+        f"{MAX_FIELD_RAYS} pixels in all.",
+        advanced=True,
+    )
+    field_background_rays: PositiveInt = setting(
+        500_000,
+        "Total number of rays through the field for the surroundings of the other views, in unbounded scenes whose asset holds none.",
+        advanced=True,
+    )
+    strips: Literal["on", "off"] = setting(
+        "on", "Whether photograph, network, asset and mesh are shown side by side at full size, for the worst, the median and the best view."
+    )
+    captured_path_frames: Annotated[int, Meta(ge=1, le=9999)] | Off = setting(90, "Number of frames of the video along the captured cameras; off: none.")
+    lpips: Literal["off", "alex", "vgg", "both"] = setting("off", "Network of LPIPS, where that is measured too; its weights are files of their own.")
+    lpips_weights: str = setting(
+        "auto", "Folder with the weights of LPIPS; auto: torch's cache and the package torchmetrics, which are searched in any case.", advanced=True
+    )
+
+
+def networks_of(settings: EvaluateSettings) -> tuple[str, ...]:
+    """Of LPIPS, those that are asked for."""
+    return {"off": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where weights of LPIPS are missing."""
+    own: EvaluateSettings = settings["evaluate"]
+    for network in networks_of(own):
+        find_weights(network, given(own.lpips_weights))
+
+
+STAGE = Stage(
+    name="evaluate",
+    version=9,
+    settings=EvaluateSettings,
+    needs=needs_of(EvaluateInputs),
+    run=ByName("stages.evaluate.run:run"),
+    uses_device=True,
+    check=check,
+)

@@ -1,0 +1,1 @@
+"""Formats that captures come in, and that assets are written to."""

@@ -1,0 +1,67 @@
+"""How the surface is meshed and textured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from efficientnerf.settings import Auto, Density, Fraction, setting
+from pipeline.errors import UsageError
+from pipeline.stage import ByName, Stage
+from stages.artifacts import MeshInputs, MeshOutputs, needs_of
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """How the surface is meshed."""
+
+    region: Literal["foreground", "all"] = setting(
+        "foreground",
+        "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
+        advanced=True,
+    )
+    max_faces: Annotated[int, Meta(ge=100, le=10**8)] | Literal["20k", "100k", "500k"] = setting(
+        200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
+    )
+    density_threshold: Density | Auto = setting(
+        "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
+    )
+    min_component: Fraction = setting(
+        0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
+    )
+    smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
+        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, of normals follow, which keep edges.", advanced=True
+    )
+    texture: Literal["auto", "photographs", "asset", "off"] = setting(
+        "auto",
+        "Where the texture's colours are from: the training photographs, blended (photographs), or the asset (asset); auto: photographs where they show the"
+        " mesh; off: colours at vertices alone.",
+    )
+    texture_size: Annotated[int, Meta(ge=256, le=8192)] = setting(
+        2048, "Most texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.", advanced=True
+    )
+    normal_map: bool = setting(
+        False,
+        "A normal map beside the texture, of the surface before it was decimated; materials are lit then, so that lamps show its relief over the light of the"
+        " capture.",
+        advanced=True,
+    )
+
+
+def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
+    """Raise UsageError for a normal map on a mesh without texture coordinates."""
+    if settings.normal_map and settings.texture == "off":
+        raise UsageError("mesh.normal_map lies on the coordinates of a texture, and mesh.texture is off. Set one of them otherwise.")
+
+
+STAGE = Stage(
+    name="mesh",
+    version=15,
+    settings=MeshSettings,
+    needs=needs_of(MeshInputs),
+    run=ByName("stages.mesh.run:run"),
+    check=lambda settings: refuse_normal_map_without_texture(settings["mesh"]),
+    volatile=(MeshOutputs.timings,),
+)

@@ -1,0 +1,43 @@
+"""How the field is trained (`efficientnerf.training.settings`), and what is refused before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from efficientnerf.settings import given
+from efficientnerf.training.settings import TrainSettings
+from pipeline.errors import UsageError
+from pipeline.stage import ByName, Stage
+from stages.artifacts import TrainInputs, TrainOutputs, needs_of
+
+
+def refuse_planes_out_of_order(settings: TrainSettings) -> None:
+    """UsageError where one of train.near_plane and train.far_plane is stated without the other, for N_c samples lie between both; or where they are not in
+    order."""
+    near, far = given(settings.near_plane), given(settings.far_plane)
+    if near is None and far is None:
+        return
+    if near is None or far is None or near >= far:
+        found = f"train.near_plane={settings.near_plane}, train.far_plane={settings.far_plane}"
+        raise UsageError(f"{found}: expected two numbers, the second one greater, or auto for both.")
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """UsageError where near and far planes are stated that cannot be used."""
+    own, poses = settings["train"], settings.get("poses")
+    refuse_planes_out_of_order(own)
+    if own.far_plane != "auto" and poses is not None and poses.space == "contracted":
+        raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
+
+
+STAGE = Stage(
+    name="train",
+    version=10,
+    settings=TrainSettings,
+    needs=needs_of(TrainInputs),
+    run=ByName("stages.train.run:run"),
+    uses_device=True,
+    check=check,
+    volatile=(TrainOutputs.log, TrainOutputs.curve, f"{TrainOutputs.previews}/*", TrainOutputs.report),
+)

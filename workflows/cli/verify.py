@@ -1,0 +1,60 @@
+"""`enerf verify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from pipeline.errors import CorruptArtifact
+from pipeline.runner import verify as verify_run
+from workflows.cli.failures import Reported
+from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
+from workflows.cli.output import closing, write_json
+from workflows.cli.progress import display, size
+from workflows.cli.target import open_run
+from workflows.report.signature import altered_pages
+
+
+@click.command()
+@click.argument("what", metavar="RUN|ASSET", type=folder_type)
+@json_option
+@quiet_option
+@common_options
+def verify(what: Path, as_json: bool, quiet: bool) -> None:
+    """Hash every file of RUN, its pages too, and compare it with the recorded hashes; or read ASSET, which carries its own hashes, and check every rule of its
+    format. Exit code 4 if anything was altered.
+    """
+    if what.is_file():
+        _verify_asset(what, as_json, quiet)
+    else:
+        _verify_run(what, as_json, quiet)
+
+
+def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
+    from workflows.loading import describe_asset, load_asset  # a run is verified without reading its asset
+
+    try:
+        load_asset(path)
+    except CorruptArtifact as error:
+        raise Reported(error, {"asset": str(path), "damaged": list(error.files)}) from error
+    about = describe_asset(path)
+    if as_json:
+        facts = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
+        write_json({"event": "summary", "ok": True, "asset": str(path), **facts, "damaged": [], "exit_code": 0})
+    elif not quiet:
+        closing(f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(path.stat().st_size)}, all as written")
+
+
+def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
+    run = open_run(run_folder)
+    try:
+        with display(as_json=as_json, quiet=quiet) as show:
+            outcomes = verify_run(run, workflow().stages, show, altered=altered_pages(run.path))
+    except CorruptArtifact as error:
+        raise Reported(error, {"run": str(run.path), "damaged": list(error.files)}) from error
+    if as_json:
+        write_json({"event": "summary", "ok": True, "run": str(run.path), "stages": [each.stage for each in outcomes], "damaged": [], "exit_code": 0})
+    elif not quiet:
+        total = sum(each.size for each in outcomes)
+        closing(f"{run.path}: {len(outcomes)} stages, {size(total)}, all as written")

@@ -1,0 +1,30 @@
+"""`enerf report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from workflows.cli.options import common_options, folder_type, json_option, workflow
+from workflows.cli.output import closing, write_json
+from workflows.cli.target import open_run
+from workflows.report.page import write_report
+from workflows.report.viewer import write_run_viewer
+
+
+@click.command()
+@click.argument("run_folder", metavar="RUN", type=folder_type)
+@json_option
+@common_options
+def report(run_folder: Path, as_json: bool) -> None:
+    """Write RUN/report.html: files, renders, metrics and settings of RUN; and RUN/viewer.html, which shows its asset in a browser. 'enerf run' writes
+    both when it is done."""
+    run = open_run(run_folder)
+    viewer = write_run_viewer(run, anew=True)
+    path = write_report(run, workflow().stages)
+    if as_json:
+        shown = {} if viewer is None else {"viewer": str(viewer)}
+        write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), **shown, "exit_code": 0})
+    else:
+        closing(str(path), *([] if viewer is None else [str(viewer)]))

@@ -1,0 +1,28 @@
+"""What a command line works on: stages in order, presets, and forecasts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.stage import Stage
+
+
+@dataclass(frozen=True)
+class Workflow:
+    """Stages and presets of a command line.
+
+    stages   in order
+    presets  the folder of its presets, TOML files
+    child    the module that runs its stages in processes of their own; see `pipeline.executors.serving`
+    space    (stage, run, its sources, settings by stage, bytes of memory or None) -> bytes that the stage writes
+    memory   (stage, run, its sources, settings by stage, device) -> bytes that the stage takes; None: not known, it has a share of its worker's
+    """
+
+    stages: tuple[Stage, ...]
+    presets: Path
+    child: str = "workflows.fleet.child"
+    space: Callable[[str, Path, Sequence[Path], Mapping[str, Any], int | None], int] = lambda *_: 0
+    memory: Callable[[str, Path, Sequence[Path], Mapping[str, Any], str], int | None] = lambda *_: None
