@@ -16,7 +16,6 @@ from efficientnerf.backends.layout import MAX_THICKNESS, MAX_VISITS, MIN_THICKNE
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, fixed_point_scale
 
-LEAST, MOST, MOST_VISITS = tl.constexpr(MIN_THICKNESS), tl.constexpr(MAX_THICKNESS), tl.constexpr(MAX_VISITS)
 VOXELS_PER_PROGRAM = 256 if INTERPRETED else 32
 
 
@@ -32,7 +31,8 @@ class Neighbours(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """voxel: side of cascade 0's voxels; the numbers of Hyperparameters, logarithms of two of them, and `total_variation` the share of the differences."""
+    """voxel: side of cascade 0's voxels; the numbers of Hyperparameters, logarithms of two of them, and `total_variation` the share of the differences;
+    limits of `efficientnerf.backends.layout`."""
 
     voxel: Any
     density_rate: Any
@@ -46,15 +46,18 @@ class Rule(NamedTuple):
     total_variation: Any
     sparsity: Any
     entropy: Any
+    min_thickness: Any
+    max_thickness: Any
+    max_visits: Any
 
 
 @triton.jit
-def _total_variation(v, met, thickness, side, weight, before, beside):  # type: ignore[no-untyped-def]
+def _total_variation(v, met, thickness, side, weight, before, beside, least):  # type: ignore[no-untyped-def]
     """Share `weight` of the differences of the logarithm of the optical thickness to those of the neighbours."""
     here, slope = tl.log(thickness), tl.zeros_like(thickness)
     for face in tl.static_range(6):
         other = tl.load(beside + 6 * v + face, met, other=-1)
-        beyond = tl.maximum(tl.load(before + other, other >= 0, other=0.0) * side, LEAST)
+        beyond = tl.maximum(tl.load(before + other, other >= 0, other=0.0) * side, least)
         slope += tl.where(other >= 0, here - tl.log(beyond), 0.0)
     return weight * slope
 
@@ -82,7 +85,7 @@ def _step(  # type: ignore[no-untyped-def]
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     met = tl.load(stamp + v, v < voxels, other=-1) == number
     if tl.max(met.to(tl.int32), 0) > 0:
-        visited = tl.minimum(tl.load(moments.visits + v, met, other=0) + 1, MOST_VISITS)
+        visited = tl.minimum(tl.load(moments.visits + v, met, other=0) + 1, h.max_visits)
         tl.store(moments.visits + v, visited, met)
         correction = 1 / (1 - tl.exp(visited.to(tl.float32) * h.log_decay))
         ahead = 1.0
@@ -92,7 +95,7 @@ def _step(  # type: ignore[no-untyped-def]
         if CASCADES > 1:
             side = h.voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
         # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
-        depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, LEAST)
+        depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, h.min_thickness)
         g = tl.load(sums[0] + v, met, other=0).to(tl.float32) * unit * depth
         g += _of_opacity(depth, h.sparsity, h.entropy)
         square = h.decay * tl.load(moments.square_density + v, met, other=0.0) + (1 - h.decay) * g * g
@@ -101,8 +104,8 @@ def _step(  # type: ignore[no-untyped-def]
             tl.store(moments.density + v, g, met)
         change = h.density_rate * ahead * g / (tl.sqrt(square * correction) + h.epsilon)
         if SMOOTH:
-            change += _total_variation(v, met, depth, side, h.total_variation, neighbours.density, neighbours.beside)
-        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), LEAST), MOST) / side, met)
+            change += _total_variation(v, met, depth, side, h.total_variation, neighbours.density, neighbours.beside, h.min_thickness)
+        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), h.min_thickness), h.max_thickness) / side, met)
         tl.store(moments.square_density + v, square, met)
         tl.store(sums[0] + v, tl.zeros_like(v), met)
         column = tl.arange(0, ROW)
@@ -132,7 +135,8 @@ def step(
     if h.total_variation > 0:
         neighbours.density.copy_(values[0])
     numbers = (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))
-    rule = Rule(*map(float, (*numbers, min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy)))
+    numbers = (*numbers, min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy, MIN_THICKNESS, MAX_THICKNESS)
+    rule = Rule(*map(float, numbers), MAX_VISITS)
     _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
         values, sums, moments, neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, min(h.terms, g.terms), 1 / fixed_point_scale(rays), rule,
         CASCADES=len(g.cascades.first), MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,

@@ -4,7 +4,8 @@ Samples lie as FORMAT.md says, section 6; in nested trees as `efficientnerf.asse
 
 `march_with` takes a visitor, as `efficientnerf.backends.triton.tree_march` does: rendering of nearest lookup (`tree.nearest`), the greatest weights of voxels
 (`tree.contributions`) and the gradients of training (`tree_training.packets`). Interpolated trees are rendered by a march of their own, `packets.march`: there
-a sample of thirty-two rays is taken at once, which a visitor that is called ray by ray cannot be. docs/experiments/renderer.md
+a sample of thirty-two rays is taken at once. Through a made tree of 80 voxels a side a ray of this march, without any colour, takes 1.3 times as long as
+one of a packet with colours (6.1 and 4.6 us on one core). docs/experiments/renderer.md
 """
 
 from __future__ import annotations
