@@ -24,7 +24,7 @@ from efficientnerf.settings import resolved
 from efficientnerf.training.settings import TrainSettings
 
 SKY_DEGREE = 2
-UNSEEN = 0.5  # grey: what is drawn behind a space that reaches to infinity, where nothing can lie
+UNSEEN = 0.5  # grey: drawn behind a space that reaches to infinity, where nothing can lie
 
 
 class Sky(nn.Module):
@@ -92,7 +92,7 @@ class Model:
         return [(f"{part}.{name}", p) for part, module in parts for name, p in module.named_parameters()]
 
     def gradient_buffers(self) -> dict[str, GradientBuffer]:
-        """Of the fields' tables, by the parameter's name."""
+        """Those of the fields' tables, by the parameter's name."""
         parts = (("coarse", self.coarse), ("fine", self.fine))
         return {f"{part}.{name}": buffer for part, field in parts for name, buffer in field.gradient_buffers.items()}
 

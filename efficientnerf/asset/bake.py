@@ -1,10 +1,10 @@
 """From a trained model to a NerfTree (EfficientNeRF, section 3.5; the choice and averaging of voxels after PlenOctree).
 
-1. `visible_voxels`: the greatest fine weight of each voxel over training pixels, both stages run as in training. Of unbounded scenes the field's samples
-   are kept instead, and voxels of nested grids weighed by them (`efficientnerf.asset.field_samples`).
+1. `visible_voxels`: the greatest fine weight of each voxel over training pixels, both stages run as in training. In unbounded scenes the field's samples
+   are kept instead, and weigh the voxels of nested grids (`efficientnerf.asset.field_samples`).
 2. `chosen_voxels`: those above a threshold, dilated by one voxel so that linear interpolation has all its corners.
 3. `voxel_values`: density and harmonics averaged over several jittered points of each voxel, in blocks.
-4. `efficientnerf.asset.refinement` fits the tree of these to the training images; voxels that do not show are dropped.
+4. `efficientnerf.asset.refinement` fits this tree to the training images; voxels that do not show are dropped.
 
 B coarse cells, N voxels.
 """
@@ -169,7 +169,7 @@ def voxel_values(
         density = density * _has_pivots(m, space.grid((block + 0.5) * voxel + low))[:, None]
         heavy = density
         if space.contracted:
-            # Of a whole scene a voxel may be given density where there seems to be none, if rays end there: its colour is that of what was hidden.
+            # In an unbounded scene a voxel where rays end may get density although the coarse field is empty there: it has the colour of what was hidden.
             heavy = torch.where(density.sum(dim=1, keepdim=True) > 0, density, every.reshape(len(block), points))
             density = density / space.unit(world).abs().amax(dim=-1).clamp(min=1).square().to(density)
         share = heavy / heavy.sum(dim=1, keepdim=True).clamp(min=1e-12)
@@ -180,8 +180,8 @@ def voxel_values(
 def _has_pivots(m: Model, grid: torch.Tensor) -> torch.Tensor:
     """(n,) bool on the model's device: whether the coarse field at grid coordinates (n, 3) absorbs as much over an interval as a valid density voxel.
 
-    Where it absorbs less, a sample is among the lightest of its ray: it is no pivot on rays that meet the subject, and the field hides what it has
-    there. The asset, without a coarse stage, could not.
+    Where it absorbs less, a sample is among the lightest of its ray: it is no pivot on rays that meet the subject, and the fine field is hidden
+    there. The asset, without a coarse stage, would show it.
     """
     if m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
         return torch.ones(len(grid), dtype=torch.bool, device=m.device)

@@ -1,8 +1,8 @@
-"""The nested grids of a tree that holds a whole scene (instant-ngp's cascades).
+"""The nested grids of a tree that holds an unbounded scene (instant-ngp's cascades).
 
 Cascade 0 is the tree's own grid. Each one after it has voxels twice as large and encloses the one before, which is cut out of it: a point belongs to the
-first cascade whose box holds it. Rays are straight throughout. The faces of each box lie on faces of the next cascade's coarse cells. What lies beyond the
-last box is the tree's environment map.
+first cascade whose box holds it. Rays are straight throughout. The faces of each box lie on faces of the next cascade's coarse cells. The tree's
+environment map shows what lies beyond the last box.
 
 Voxels of a cascade may be stored inside of the box before: values just outside of that box are interpolated from them.
 
@@ -24,7 +24,7 @@ ALIGNED_CELLS = 4  # coarse cells of cascade 0 along an axis are a multiple of t
 
 
 def cascade_grids(bounds: np.ndarray, voxel: float, brick: int, count: int) -> list[tuple[tuple[int, int, int], float, np.ndarray]]:
-    """Shape, voxel side and corner (3,) of `count` cascades of which the innermost covers `bounds` (2, 3), with some room where that does not fit its cells;
+    """Shape, voxel side and corner (3,) of `count` cascades of which the innermost covers `bounds` (2, 3), with a margin where that does not fit its cells;
     each box has twice the sides of the one before, about the same centre."""
     bounds = np.asarray(bounds, np.float64)
     if count == 1:

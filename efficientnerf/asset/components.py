@@ -1,4 +1,4 @@
-"""Small connected components of a tree: what the box cuts off from the rest of the scene, and floaters. N voxels."""
+"""Small connected components of a tree: parts that the box cuts off from the scene, and floaters. N voxels."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ MIN_THICKNESS = 0.05  # optical thickness of a voxel from which it joins its nei
 
 
 def foreground_bricks(tree: NerfTree) -> np.ndarray:
-    """Which bricks belong to the foreground, (B,) bool, for `Region.bricks`: in the innermost cascade those of its components, of what is thick enough to show
-    in the region, that are not small, and the bricks around them; of the other cascades all."""
+    """The foreground's bricks, (B,) bool, for `Region.bricks`: in the innermost cascade those of its large components of voxels thick enough to show
+    in the region, and the bricks around them; all bricks of the other cascades."""
     if tree.region is None:
         return np.ones(len(tree.voxel_index), bool)
     keep = (inside_share(tree.region, voxel_centres(tree)) > 0) & (tree.density_values * voxel_sides(tree) > MIN_THICKNESS)
     out = np.ones(len(tree.voxel_index), bool)
     labels, voxels, cells = _label(tree, tree.brick_index, keep)
-    if len(cells):  # else nothing shows there, and all of it is as good as any
+    if len(cells):  # else nothing shows there, and all bricks stay
         large = voxels >= FOREGROUND_SHARE * voxels.max()
         large[0] = False
         near = ndimage.binary_dilation(large[labels], structure=np.ones((3, 3, 3), bool))
@@ -67,12 +67,12 @@ def foreground_bricks(tree: NerfTree) -> np.ndarray:
     return out
 
 
-MIN_SUPPORT = 3  # views whose rays end in a component, or all where there are fewer: what so many photographs show is never dropped
+MIN_SUPPORT = 3  # views whose rays end in a component, or all where there are fewer: a component that so many show is never dropped
 SUPPORT_WEIGHT = 0.1  # of a sample that counts as its ray's end
 
 
 def unsupported_components(tree: NerfTree, keep: np.ndarray, share: float, samples: FieldSamples) -> np.ndarray:
-    """Which of the voxels `keep`, (N,) bool, of a whole scene belong to small components that fewer than MIN_SUPPORT views show: (N,) bool.
+    """Which of the voxels `keep`, (N,) bool, of an unbounded scene belong to small components that fewer than MIN_SUPPORT views show: (N,) bool.
 
     Components are those of `small_components`, of each cascade by itself. Small is one in the innermost cascade, next to the cameras, with less than `share`
     of the voxels of the largest one, and in the others with less than INTERIOR_RATIO of that.
@@ -92,7 +92,7 @@ def unsupported_components(tree: NerfTree, keep: np.ndarray, share: float, sampl
 
 
 def _label(tree: NerfTree, brick_index: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of a cascade the component of each coarse cell, 0 where it holds no voxel that is kept; the number of voxels of each component; and the cells of any."""
+    """The component of each coarse cell of a cascade, 0 where it holds no voxel that is kept; the voxels of each component; and the cells of any."""
     brick = brick_index.reshape(-1)
     cells = np.flatnonzero(brick >= 0)
     rows = tree.voxel_index[brick[cells]]

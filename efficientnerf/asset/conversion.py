@@ -105,7 +105,7 @@ def _merged(tree: NerfTree, indices: np.ndarray, ratio: float, count: int) -> tu
     side = tree.voxel * ratio
     transmittance = [np.exp(-density.mean(axis=axis) * side).mean(axis=(1, 2)) for axis in (1, 2, 3)]
     merged = -np.log(np.maximum(np.mean(transmittance, axis=0), 1e-30)) / side
-    # Where nothing absorbs, what is stored has an equal say.
+    # Where nothing absorbs, all stored voxels weigh the same.
     share = np.where(known, -np.expm1(-density * tree.voxel) + 1e-6, 0).reshape(len(indices), count**3)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-12)
     sh = np.zeros((len(indices), tree.harmonics_count, 3), np.float32)

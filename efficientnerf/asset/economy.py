@@ -1,7 +1,7 @@
 """Codes for the layout `packed`, chosen for what they cost: rate-distortion optimisation against the contexts that the file is coded with.
 
 A voxel's code minimises bits + errors squared x worth / `rate`: most repeat the code of a neighbour, which costs less than a bit (docs/experiments/packed.md).
-What an error is worth follows from the voxel's greatest weight in a photograph. Every pass is sequential and its tables come from the pass before: the
+The worth of an error follows from the voxel's greatest weight in a photograph. Every pass is sequential and its tables come from the pass before: the
 same tree gives the same codes.
 
 N voxels, K harmonics, P entries of a palette.
@@ -55,7 +55,7 @@ class _Voxels:
 
 @dataclass(frozen=True, eq=False)
 class Economy:
-    """A tree with what its codes are chosen from at any rate: the nearest codes and the palettes that the passes begin with.
+    """A tree with the candidates for its codes at any rate: the nearest codes and the palettes that the passes begin with.
 
     order     (N,) voxels in the order of the file
     clusters  (codes (N,) uint8, palette (P, 3)) of each harmonic above the base
@@ -80,7 +80,7 @@ class Economy:
 
 
 def economy_of(tree: NerfTree, weight: np.ndarray | None = None, entries: int = ENTRIES) -> Economy:
-    """What codes are chosen from, of a tree with voxels.
+    """The candidates for the codes of a tree with voxels.
 
     weight   (N,) greatest weight of each voxel in a photograph, as `refinement.fit.max_weights` finds it; by default its opacity
     entries  of the palette, at most 256
@@ -131,7 +131,7 @@ def _densities(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
     table, codes = np.unique(quantised_density(voxels.density, voxels.side), return_inverse=True)
     codes = codes.reshape(-1).astype(np.uint8)
     side = float(np.max(voxels.side))
-    # In front of what it hides a voxel's weight is that over its opacity.
+    # The light that reaches a voxel is its weight over its opacity.
     weight = (CONTRAST / rate) * voxels.worth / np.maximum(voxels.opacity, 0.05)
     shown = -np.expm1(-table * np.float32(side)).astype(np.float32)
 
@@ -203,7 +203,7 @@ def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, c
 
 
 def _code_bits(codes: np.ndarray, voxels: _Voxels, beside: np.ndarray, entries: int) -> tuple[np.ndarray, np.ndarray]:
-    """What it costs to repeat a neighbour or not (112, 4), and to name an entry (160, P), in the contexts of one group's codes (N,)."""
+    """Bits to repeat a neighbour or not (112, 4), and to name an entry (160, P), in the contexts of one group's codes (N,)."""
     split, situation = walks.REPEAT_CONTEXTS, beside.copy()
     counts = np.zeros((split + walks.CODE_CONTEXTS, 256), np.int64)
     for begin in range(0, len(codes), streams.PIECE):

@@ -1,5 +1,5 @@
-"""What a trained field shows along training rays, kept as its samples: from them follow the foreground region, which voxels of which grids are visible, what
-lies beyond all of these, and which rays should be opaque. The field is rendered once; the rest are passes over some tens of megabytes.
+"""The samples of a trained field along training rays. They give the foreground region, the visible voxels of each grid, the environment map
+beyond all grids, and which rays should be opaque. The field is rendered once; the rest are passes over some tens of megabytes.
 
 P rays, M samples, C views, L cascades.
 """
@@ -177,8 +177,8 @@ LEAST_SHARE, MOST_SHARE, MAX_OPACITY = 0.7, 3.0, 0.9999  # of the weights seen; 
 def density_as_seen(density: np.ndarray, seen: np.ndarray, voxel: float) -> np.ndarray:
     """Densities (N,) of voxels within what rays saw of them, `seen` (N, 2) of `seen_weights`.
 
-    What the field holds is not all that it shows: its coarse stage hides some. Where a ray lost light in a voxel the voxel absorbs about as much; and what is
-    in full view absorbs no more than was seen to be lost there or next to it.
+    The coarse stage hides some of the field's density. A voxel absorbs about as much light as rays lost in it; a voxel in full view
+    absorbs no more than rays lost in it or next to it.
     """
     least, most = (-np.log1p(-np.minimum(share * seen[:, k], MAX_OPACITY)) / np.float32(voxel) for k, share in enumerate((LEAST_SHARE, MOST_SHARE)))
     most = np.where(MOST_SHARE * seen[:, 1] >= MAX_OPACITY, np.inf, most)
@@ -186,9 +186,9 @@ def density_as_seen(density: np.ndarray, seen: np.ndarray, voxel: float) -> np.n
 
 
 def environment_beyond(samples: FieldSamples, boxes: Sequence[np.ndarray], height: int, mean: np.ndarray) -> np.ndarray:
-    """An environment map (H, 2 H, 3) of what the field shows beyond the last of nested boxes (2, 3).
+    """An environment map (H, 2 H, 3) of the field beyond the last of nested boxes (2, 3).
 
-    mean  (3,) colour where nothing is known of any direction
+    mean  (3,) colour if no direction is known
     """
     total, weight = np.zeros((height * 2 * height, 3)), np.zeros(height * 2 * height)
     for rays, box, share in _boxes_of(samples, boxes):

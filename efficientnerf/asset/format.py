@@ -1,4 +1,4 @@
-"""The asset file: format 1, specified in FORMAT.md beside this module.
+"""The asset file: format 1, specified in FORMAT.md next to this module.
 
 A safetensors container (`container.py`) of a few tensors (`layouts.py`) and one metadata entry (`metadata.py`). Everything that an untrusted
 file states is checked against the file's size and against the other tensors before memory for it is allocated.
@@ -88,7 +88,7 @@ def _check_whole(tree: NerfTree) -> None:
 
 
 def _whole_scene(tree: NerfTree) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Metadata and tensors of what a tree has beside one grid."""
+    """Metadata and tensors of what a tree has besides one grid."""
     meta: dict[str, Any] = {}
     tensors: dict[str, np.ndarray] = {}
     if tree.outer or tree.environment is not None:
@@ -234,7 +234,7 @@ def _cascades(name: str, meta: dict[str, Any], raw: dict[str, np.ndarray]) -> li
 
 
 def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Metadata but for the digests, and type, shape and digest of each tensor of the layout; from the header alone, so that they are what it claims."""
+    """Metadata but for the digests, and type, shape and digest of each tensor of the layout; from the header alone, not verified."""
     header = _open(path)
     digests = header.meta.get("sha256")
     digests = digests if isinstance(digests, dict) else {}
@@ -245,7 +245,7 @@ def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]
 
 
 def outline(path: str | Path) -> NerfTree:
-    """The tree of a file with arrays that have their sizes and no values, from the header alone: for what it will take of memory."""
+    """The tree of a file with arrays that have their sizes and no values, from the header alone: to predict its memory."""
     header = _open(path)
     name, meta = header.name, header.meta
     shapes, kinds = _held(header)
@@ -316,7 +316,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def _whole_scene_facts(meta: dict[str, Any]) -> dict[str, Any]:
-    """What `describe` says beside one grid: all cascades, where there are more than one or an environment map; rows and columns of the map; the region."""
+    """What `describe` reports besides one grid: all cascades, where there are more than one or an environment map; rows and columns of the map; the region."""
     facts: dict[str, Any] = {}
     if whole_scene.is_nested(meta):
         cascades = [Cascade(grid.shape, grid.voxel, np.asarray(grid.bounds_min), np.empty(0)) for grid in whole_scene.grids_of(meta)]

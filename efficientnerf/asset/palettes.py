@@ -1,4 +1,4 @@
-"""Harmonics of voxels as codes into palettes: about a tenth of the memory of floats, and what a renderer reads per voxel fits a few cache lines.
+"""Harmonics of voxels as codes into palettes: about a tenth of the memory of floats, and a renderer's reads per voxel fit a few cache lines.
 
 The base colour (degree 0) has a table of values per channel; the K - 1 harmonics above it are cut into G groups that follow one another, and
 each group of a voxel is one entry of that group's palette. One group per harmonic is what the layout `compact` writes (8 bits each, product

@@ -2,7 +2,7 @@
 
 Palettes are found by k-means over a sample of the voxels, drawn in proportion to their opacity, starting from k-means++
 (Arthur & Vassilvitskii 2007). Every draw is from a seeded generator and every sum has one order: the same tree gives the same codes.
-Vectors that are few enough to have an entry each keep their values, but for the rounding of the palette to halves.
+Vectors few enough for an entry each keep their values, apart from the palette's rounding to halves.
 
 N voxels, K harmonics, G groups, P entries.
 """

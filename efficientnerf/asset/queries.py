@@ -1,4 +1,4 @@
-"""What a NerfTree holds at points: density, normal, colour, of the cascade that each belongs to.
+"""Density, normal and colour of a NerfTree at points, of the cascade that each belongs to.
 
 N points.
 """

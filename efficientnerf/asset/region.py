@@ -1,4 +1,4 @@
-"""The foreground region of a tree: what of a whole scene is its subject, chosen when it is rendered or exported.
+"""The foreground region of a tree: the subject of an unbounded scene, chosen when it is rendered or exported.
 
 `foreground`, `surroundings` and `cropped` return a tree with less in it, which everything downstream takes as any other.
 
@@ -51,13 +51,13 @@ def voxel_centres(tree: NerfTree) -> np.ndarray:
 
 
 def foreground(tree: NerfTree) -> NerfTree:
-    """The tree with what lies in its region alone: no other voxels, opacity faded in the region's band, no environment, no outer cascades that would be
+    """The part of the tree in its region: no other voxels, opacity faded in the region's band, no environment, no outer cascades that would be
     empty. The result has no region: all of it is foreground. A tree without a region is returned as it is."""
     return tree if tree.region is None else _restricted(tree, _foreground_share(tree, tree.region))
 
 
 def surroundings(tree: NerfTree, all_is_foreground: bool = False) -> NerfTree:
-    """The tree with what does not lie in its region: the rest of the opacity in the region's band, and the environment. Of a tree without a region, or if all
+    """The part of the tree outside of its region: the rest of the opacity in the region's band, and the environment. Of a tree without a region, or if all
     is foreground, its environment alone."""
     share = np.zeros(len(tree.density_values)) if tree.region is None or all_is_foreground else 1 - _foreground_share(tree, tree.region)
     return replace(_restricted(tree, share), environment=tree.environment)

@@ -50,7 +50,7 @@ def render(
 ) -> Rendering:  # fmt: skip
     """The image that a camera in the training frame takes.
 
-    background     sRGB colour to composite over; None: the tree's environment, or nothing where it has none: then the colour is premultiplied
+    background     sRGB colour to composite over; None: the tree's environment; without one the colour is premultiplied
     supersample    rays along each side of a pixel
     normals        whether they are wanted; else they are (0, 0, 3), and most images take less time
     rays_per_band  of supersampled images at once; changes memory alone
@@ -73,7 +73,7 @@ def render(
 
 
 def _background(background: tuple[float, float, float] | None) -> np.ndarray | None:
-    """As (3,) float32."""
+    """A background as (3,) float32."""
     if background is None:
         return None
     behind = np.asarray(background, np.float32)
@@ -101,7 +101,7 @@ def render_rays(
 ) -> Rendering:  # fmt: skip
     """The same along rays: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray. `background` is as in `render`.
 
-    What is known of all rays makes them faster on the CPU, and changes colours by less than 1e-3 (2e-3 in normalised device coordinates):
+    Hints on all rays make them faster on the CPU, and change colours by less than 1e-3 (2e-3 in normalised device coordinates):
 
     eye      (3,) the point that all come from
     columns  how many make a row, where they are the rows of an image
@@ -205,7 +205,7 @@ def tree_density(tree: NerfTree, points: Tensor, values: Tensor) -> tuple[Tensor
 
 
 def ray_parts(tree: NerfTree, origins: Tensor, directions: Tensor) -> list[tuple[int, Tensor, Tensor]]:
-    """What of rays (R, 3) of the tree's frame lies in which cascade, from front to back: the cascade, and the distances (R,) at which a part of each ray begins
+    """The parts of rays (R, 3) of the tree's frame in each cascade, from front to back: the cascade, and the distances (R,) at which a part of each ray begins
     and ends, units of the frame; a part that ends before it begins is none. The box of the cascade before is cut out of each, so that a ray may have two parts
     in one."""
     bounds = [torch.as_tensor(cascade.bounds(tree.brick), device=origins.device, dtype=origins.dtype) for cascade in cascades_of(tree)]

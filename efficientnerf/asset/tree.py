@@ -85,11 +85,11 @@ class NerfTree:
     lookup       value of a point: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
                  where that one is not stored (EfficientNeRF, section 4.1, has the field trained on such coordinates)
     step_size    distance between the samples of a ray, voxels: 0.25 to 1
-    outer        the cascades around this grid, which is cascade 0, where the tree holds a whole scene (`efficientnerf.asset.cascades`). The arrays of bricks
+    outer        the cascades around this grid, which is cascade 0, where the scene is unbounded (`efficientnerf.asset.cascades`). The arrays of bricks
                  and voxels are those of all cascades, one after the other
     environment  (H, 2 H, 3) float32 sRGB colours by direction of what lies beyond all cascades (`efficientnerf.rendering.environment`), or None
     region       the foreground region, or None: all is foreground (`efficientnerf.asset.region`)
-    derived      what renderers made of the arrays, by name; made when first rendered, so that arrays changed in place later are not seen
+    derived      renderers' caches of the arrays, by name; made when first rendered, so that arrays changed in place later are not seen
 
     `sh` has the harmonics as plain floats; decoding a palette takes 12 K bytes a voxel and is cached. Renderers read `harmonics` instead.
     """
@@ -150,7 +150,7 @@ class NerfTree:
 
     @cached_property
     def leap(self) -> np.ndarray:
-        """How many coarse cells a ray in an empty cell may leap: shape uint8, 0 in occupied cells.
+        """Coarse cells that a ray in an empty cell may leap: shape uint8, 0 in occupied cells.
 
         The chessboard distance to the nearest occupied cell: a cube of that radius minus one around the cell is empty.
         """

@@ -77,7 +77,7 @@ def fitting(backend: Backend) -> Any:
 
 @functools.cache
 def triton_usable() -> bool:
-    """Whether Triton's kernels can be built and launched here; warns once, with the remedy, where there is CUDA and they cannot.
+    """Whether Triton's kernels can be built and launched here; warns once, with the remedy, if CUDA is there and they cannot.
 
     Triton's launcher is compiled by the system's C compiler.
     """
@@ -91,7 +91,7 @@ def triton_usable() -> bool:
     try:
         one = torch.ones(1, device="cuda")
         probe(one, one.clone(), one.clone(), one.clone(), 0.0, 0.9, 0.99, 1.0, 1.0, 1e-8, skip_zeros=False)
-    except Exception as error:  # whatever the compiler, the driver or the launcher may say
+    except Exception as error:  # whatever the compiler, the driver or the launcher may raise
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         warnings.warn(
             f"The CUDA kernels cannot be built here ({reason[0][:200]}); plain torch is used, many times slower. Usually a C compiler is missing: install gcc.",

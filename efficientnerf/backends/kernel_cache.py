@@ -88,7 +88,7 @@ def are_compiled() -> bool:
 
 
 def first_private(roots: Iterable[Path], key: str) -> tuple[Path | None, list[str]]:
-    """(the folder of a key under the first root that the user alone can write to, what spoke against those before). Removes what was long out of use."""
+    """(the folder of a key under the first root that the user alone can write to, why those before were refused). Removes folders long out of use."""
     refusals = []
     for root in roots:
         place = root / key
@@ -154,7 +154,7 @@ def _prune(root: Path, own: str) -> None:
 
 @dataclass
 class Compilation:
-    """What was compiled since somebody asked."""
+    """Kernels compiled since `compilation` was entered."""
 
     started: Callable[[], None]
     functions: int = 0

@@ -11,7 +11,7 @@ SECONDS = 0.15  # that a piece should take
 def pieces(count: int, first: int = 256, most: int = 2**20) -> Iterator[slice]:
     """Slices that cover 0 to `count` in order: `first` items, then as many as were done in about SECONDS before, and no more than `most`.
 
-    How long an item takes is up to the file that is rendered: a ray may end at its first sample or pass a million.
+    The time of an item depends on the file that is rendered: a ray may end at its first sample or pass a million.
     """
     begin, size = 0, first
     while begin < count:

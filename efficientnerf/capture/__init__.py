@@ -1,1 +1,1 @@
-"""Photographs and cameras as arrays: what is found out of them before anything is trained. No files."""
+"""Photographs and cameras as arrays: their analysis before training. No files."""

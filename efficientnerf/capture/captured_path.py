@@ -1,6 +1,6 @@
 """The camera path that follows the photographs: a smooth curve through the captured cameras, in the order in which they were taken.
 
-The order is that of the files. Where that leaps about (nothing says that files are in order), it is that of nearest neighbours, and the shorter for it.
+The order is that of the files. They may be out of order: where their path leaps about, the shorter one of nearest neighbours is taken.
 Centres and rotations are smoothed a little, thinned, and joined by a centripetal Catmull-Rom spline (Yuksel et al. 2011), travelled at constant speed.
 
 C cameras, K key poses of the spline, F frames. Speed and distances count turning as well as moving: see `_rows`.
@@ -102,7 +102,7 @@ def _poses(rows: np.ndarray, given: np.ndarray) -> list[np.ndarray]:
 
 
 def _sign(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """What to multiply a row `b` by for the quaternion on the side of that of `a`."""
+    """Factors of a row `b` that put its quaternion on the side of that of `a`."""
     return np.concatenate([np.ones(3), np.full(4, 1.0 if a[3:] @ b[3:] >= 0 else -1.0)])
 
 

@@ -1,4 +1,4 @@
-"""Cells of a coarse grid in which the rays of photographs end, and what the photographs say about each.
+"""Cells of a coarse grid in which the rays of photographs end, with statistics of each.
 
 P points, M cells.
 """
@@ -101,7 +101,7 @@ def weight_in_middle(pixels: np.ndarray) -> np.ndarray:
 
 
 def connected_parts(places: np.ndarray, apart: float) -> tuple[int, np.ndarray]:
-    """How many parts places (N, D) form that are connected by steps up to `apart`, and the part (N,) of each."""
+    """The number of parts of places (N, D) that are connected by steps up to `apart`, and the part (N,) of each."""
     pairs = cKDTree(places).query_pairs(apart, output_type="ndarray")
     count, part = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places),) * 2), directed=False)
     return int(count), part

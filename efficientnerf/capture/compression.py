@@ -1,5 +1,5 @@
-"""How strongly a picture was compressed: by what its JPEG says of itself, and by the steps that JPEG leaves between its blocks, whatever file the pixels
-came to lie in. docs/experiments/sfm.md
+"""How strongly a picture was compressed: by the quality of its JPEG file, and by the steps that JPEG leaves between its blocks, in any file format.
+docs/experiments/sfm.md
 """
 
 from __future__ import annotations
@@ -7,13 +7,13 @@ from __future__ import annotations
 import numpy as np
 
 BLOCK = 8  # px, side of JPEG's blocks
-LEAST = 8 * BLOCK  # px of a side, below which nothing is told
+LEAST = 8 * BLOCK  # px of a side, below which nothing is reported
 STRONG = 20  # quality of a JPEG by libjpeg's count, below which it is compressed strongly
 STEP, SHARE = 2.0, 0.8  # levels, and of the mean difference of neighbouring pixels, from which steps between blocks show
 
 
 def is_strong(quality: int | None, step: float, share: float) -> bool:
-    """Whether a picture is compressed so strongly that features and colours suffer: by its file's own word, or by its blocks, as of one that was saved again.
+    """Whether a picture is compressed so strongly that features and colours suffer: by its file's quality, or by its blocks, if it was saved again.
 
     quality      of its JPEG, None of other files
     step, share  by `block_steps`
@@ -25,7 +25,7 @@ def block_steps(grey: np.ndarray) -> tuple[float, float]:
     """(levels, share of the mean difference between neighbours) by which the difference of two pixels exceeds the mean of the differences on either side, at
     the places of one phase of BLOCK; less what it does at others. The lesser of both axes: of a picture without blocks about 0.
 
-    grey  (H, W) uint8, at the size at which it was compressed; reduced to a half by the decoder its blocks are told, too
+    grey  (H, W) uint8, at the size at which it was compressed; the blocks are found at half of that size, too
     """
     if min(grey.shape) < LEAST:
         return 0.0, 0.0
@@ -33,7 +33,7 @@ def block_steps(grey: np.ndarray) -> tuple[float, float]:
 
 
 def _steps_across(grey: np.ndarray) -> tuple[float, float]:
-    """Of the columns."""
+    """Those of the columns."""
     differences = np.abs(np.diff(grey.astype(np.int16), axis=1)).astype(np.float32)
     mean = float(differences.mean(dtype=np.float64))
     if mean == 0:

@@ -1,8 +1,8 @@
 """The foreground region of a trained scene: where its subject is, found from the points at which the rays of its photographs end.
 
-Sparse points are not enough: what is plain, thin or close has none. The trained field's depths cover every pixel. They are counted in the cells of a coarse
-grid; a cell is *trusted* where several views end in it and few see through it, which floaters fail. Where the view axes meet, the subject is what stands
-before the planes that support it (floor, table, wall), connected with what the middles of the photographs show; it may reach out of most pictures. The
+Sparse points are not enough: plain, thin or close surfaces have none. The trained field's depths cover every pixel. They are counted in the cells of a coarse
+grid; a cell is *trusted* where several views end in it and few see through it, which floaters fail. Where the view axes meet, the subject stands
+before the planes that support it (floor, table, wall), connected with the middles of the photographs; it may reach out of most pictures. The
 planes are clipped around it. Without such a subject (a street, a facade) the region is what is well observed.
 
 P points, M cells, C cameras.
@@ -109,7 +109,7 @@ def find_subject(
     level = any(normal[2] > 0.8 for normal, _ in planes)
     candidates = close & ~support & ~hidden & (share >= REACHED)
     subject = _subject(cells, candidates, observed)
-    if not planes:  # nothing tells the subject from what is beside it but where the pictures are centred; if that leaves little out, it is the subject's own
+    if not planes:  # only where the pictures are centred tells the subject from what is next to it; if that leaves little out, it is the subject's own
         central = _subject(cells, candidates & (cells.middling >= MIN_MIDDLING), observed)
         central |= _ending_in_view(cells, subject & ~central, central, cells.trusted & ~candidates)
         subject = central if _volume(cells.centres[subject]) > MAX_BESIDE * _volume(cells.centres[central]) else subject
@@ -124,7 +124,7 @@ def find_subject(
 
 
 def find_focus(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, float, bool]:
-    """What the middles of the photographs show: a point (3,), the usual distance from the cameras, and whether it is one place for all of them.
+    """The target of the middles of the photographs: a point (3,), the usual distance from the cameras, and whether it is one place for all of them.
 
     points that are not finite belong to rays that end nowhere.
     """
@@ -141,7 +141,7 @@ def find_focus(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, camera
         finite = np.isfinite(distance)
         return np.median(points[finite], axis=0), float(np.median(distance[finite])), False
     reach = float(np.median(reaches))
-    # The points that are seen lie on the surface, towards their cameras. Where they go with the cameras there is no subject.
+    # The points that are seen lie on the surface, towards their cameras. If they move with the cameras there is no subject.
     centres = np.array([camera.centre for camera in cameras])
     focus, converging = meeting_point(cameras)
     off = np.median(np.linalg.norm(np.array(seen) - np.median(seen, axis=0), axis=1))
@@ -170,7 +170,7 @@ def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.n
 
 
 def _ending_in_view(cells: Cells, beside: np.ndarray, subject: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(M,) bool: connected parts of the cells beside a subject that end within the pictures, as horns do, and neither go on out of them nor in other cells."""
+    """(M,) bool: connected parts of the cells next to a subject that end within the pictures, as horns do, and neither go on out of them nor in other cells."""
     at, out = np.flatnonzero(beside), np.zeros(len(beside), bool)
     if not len(at) or not subject.any():
         return out
@@ -192,12 +192,12 @@ def _ending_in_view(cells: Cells, beside: np.ndarray, subject: np.ndarray, other
 
 
 def _volume(points: np.ndarray) -> float:
-    """Of the box of points (N, 3)."""
+    """The volume of the box of points (N, 3)."""
     return float(np.ptp(points, axis=0).prod()) if len(points) else 0.0
 
 
 def _region_of(found: np.ndarray, side: float, beside: np.ndarray | None = None, *, level: bool = False, margin: float = MARGIN) -> Region:
-    """A region round the subject's points (N, 3) and the support's points beside them; `level`: it may be round in plan."""
+    """A region round the subject's points (N, 3) and the support's points near them; `level`: it may be round in plan."""
     low, high = found.min(axis=0) - side, found.max(axis=0) + side
     size = float((high - low).max())
     room = SUPPORT_MARGIN * size

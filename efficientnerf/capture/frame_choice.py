@@ -10,7 +10,7 @@ import numpy as np
 ALIKE = 0.004  # of the picture's diagonal: frames between which less has moved are alike
 APART = 0.4  # of a window: motion between two that are chosen, at least where
 AS_SHARP = 0.9  # a frame so far from the one before has this share of the sharpness of one that is nearer
-DISCOUNT = 4  # power of a frame's sharpness over the median round it, by which its motion counts less: a hand that shakes moves much, and for nothing
+DISCOUNT = 4  # power of a frame's sharpness over the median round it, by which its motion counts less: a shaking hand moves much, without a new view
 AROUND = 15  # frames on each side that this median is of
 BLURRED = 0.7  # of the median sharpness of the chosen round it
 NEIGHBOURS = 8  # chosen frames on each side that this median is of
@@ -18,7 +18,7 @@ CHOSEN, LESS_SHARP, SAME, BLUR = "chosen", "less sharp than a frame near it", "l
 
 
 def choose(motion: np.ndarray, sharpness: np.ndarray, count: int) -> list[str]:
-    """What becomes of each frame: `CHOSEN`, or why not.
+    """The verdict on each frame: `CHOSEN`, or why not.
 
     motion     (F,) how far the picture has moved up to each frame, in shares of its diagonal, never falling
     sharpness  (F,) as `efficientnerf.capture.frame_motion.sharpness`
@@ -67,7 +67,7 @@ def _sharpest(motion: np.ndarray, useful: np.ndarray, sharpness: np.ndarray, win
 
 
 def _blurred(sharpness: np.ndarray, chosen: Sequence[int]) -> set[int]:
-    """Those of the chosen that are blurred beside their neighbours; never two that follow each other, so that the next still overlaps."""
+    """Those of the chosen that are blurred compared with neighbours; never two that follow each other, so that the next still overlaps."""
     found: set[int] = set()
     values = sharpness[list(chosen)]
     for place, frame in enumerate(chosen):

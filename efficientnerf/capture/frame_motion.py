@@ -1,4 +1,4 @@
-"""How sharp a frame is, and how far the picture has moved since the first: what frames are chosen by. docs/experiments/video.md"""
+"""How sharp a frame is, and how far the picture has moved since the first; frames are chosen by both. docs/experiments/video.md"""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOVED = 75  # percentile of the corners' motions: the subject may fill a part of
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """How much of a picture's contrast from pixel to pixel a blur would take away, in the direction in which that is least: motion blur has one direction.
+    """The share of a picture's contrast from pixel to pixel that a blur would remove, in the direction in which that is least: motion blur has one direction.
 
     grey     (h, w) uint8, longest side `DETAIL`
     returns  0 for a flat picture, toward 1 the sharper; about the same for pictures that are equally sharp, whatever they show
@@ -50,8 +50,8 @@ def _energies(picture: np.ndarray, n: int) -> np.ndarray:
 class Motion:
     """How far the picture has moved along a video, in shares of its diagonal.
 
-    Corners are tracked from an anchor; a new one is taken once they have moved by `ANCHOR`. So a hand that trembles in one place adds nothing, and
-    a pan, a walk and a turn add what they move.
+    Corners are tracked from an anchor; a new one is taken once they have moved by `ANCHOR`. So a hand that trembles in one place adds nothing;
+    a pan, a walk and a turn add their motion.
     """
 
     def __init__(self) -> None:

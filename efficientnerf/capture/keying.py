@@ -1,4 +1,4 @@
-"""Colour keys: what of a photograph is a screen of one colour.
+"""Colour keys: the screen of one colour in a photograph.
 
 The screen's colour is followed across the photograph by a polynomial, for no lamp lights it evenly; a pixel's distance from it, in CIELAB, says how much of the
 pixel is object. Shadows on a coloured screen change its lightness more than its hue, so lightness counts little there. (h, w) of a photograph.
@@ -75,7 +75,7 @@ def _distance(lab: np.ndarray, screen: np.ndarray, key: Key) -> np.ndarray:
 
 
 def _mixed(distance: np.ndarray, low: float) -> np.ndarray:
-    """(h, w) from 0 to 1: how much of each pixel is object. Beside the screen, a pixel as far from it as the object nearby is object alone; mixed ones lie
+    """(h, w) from 0 to 1: how much of each pixel is object. Next to the screen, a pixel as far from it as the object nearby is object alone; mixed ones lie
     between. Elsewhere whatever differs is object."""
     near = cv2.dilate((distance < low).astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8)) > 0
     whole = np.where(near, np.maximum(cv2.dilate(distance, np.ones((2 * EDGE + 1,) * 2, np.uint8)) - low, RAMP), RAMP)
@@ -130,7 +130,7 @@ def _touching_border(region: np.ndarray) -> np.ndarray:
 
 
 def without_specks(mask: np.ndarray) -> np.ndarray:
-    """A mask (h, w) uint8 without parts that are small beside the largest, and without pinholes."""
+    """A mask (h, w) uint8 without parts much smaller than the largest, and without pinholes."""
     mask = mask.copy()
     inside = mask > 127
     for number, area, part in _parts(inside):

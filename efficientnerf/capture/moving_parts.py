@@ -1,10 +1,10 @@
-"""What moves between photographs while most of the scene stands still: people, cars, a pet, a shadow.
+"""Parts that move between photographs while most of the scene stands still: people, cars, a pet, a shadow.
 
 Three kinds of matches contradict the cameras. Wrong ones lie anywhere. Repeated texture joins a place to its twin, which in a third photograph is joined to
-itself again. What moves is found again by one motion of its own: a similarity takes a patch of features to the other photograph, and on to a third one, and
-hardly any match of these features agrees with the cameras. Only the last is named. docs/experiments/sfm.md
+itself again. Moving parts are found again by one motion of their own: a similarity takes a patch of features to the other photograph, and on to a third one,
+and hardly any match of these features agrees with the cameras. Only the last is reported. docs/experiments/sfm.md
 
-What stands in some photographs and is gone in others has no matches, and what moves along epipolar lines alone contradicts nothing: neither is seen.
+Two kinds are not seen: parts that are gone in other photographs have no matches, and motion along epipolar lines alone contradicts nothing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Planes that support a subject: the floor or table that it stands on, the wall behind it.
 
-A support hides what is behind it, the subject stands before it, not beside it, and it goes on round the subject. Ears, fins or a chest in one plane do not:
-rays pass between and beside them, and the head lies beside the plane of the chest.
+A support hides what is behind it, the subject stands before it, not next to it, and it goes on round the subject. Ears, fins or a chest in one plane do not:
+rays pass between and past them, and the head lies next to the plane of the chest.
 
 M cells, R rays, C cameras.
 """
@@ -62,7 +62,7 @@ def find_supports(
 ) -> tuple[list[Plane], np.ndarray, np.ndarray]:
     """The planes that support the subject, unit normals towards the cameras and offsets, the cells (M,) on them, and the cells behind one.
 
-    A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of what the photographs' middles show beside it.
+    A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of the rest that the photographs' middles show.
     """
     tolerance = max(1.5 * cells.side, 0.03 * reach)
     support, hidden = np.zeros(len(observed), bool), np.zeros(len(observed), bool)
@@ -176,7 +176,7 @@ def _plane(points: np.ndarray, tolerance: float) -> Plane | None:
 
 
 def with_feet(subject: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
-    """Points (N, 3) of a subject and where those near a support would stand on it: what touches a plane counts as plane."""
+    """Points (N, 3) of a subject, and the feet of those near a support on it: points that touch a plane count as plane."""
     size = float(np.ptp(subject, axis=0).max())
     feet = [subject]
     for normal, offset in planes:

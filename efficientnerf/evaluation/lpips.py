@@ -5,7 +5,7 @@ of deep features as a perceptual metric").
 
 with f_l the activations of AlexNet or VGG-16 after five of their ReLUs, and h_l >= 0 the heads that Zhang et al. fitted to people's judgement. The networks
 are torchvision's and the heads LPIPS 0.1's; both come as files (`stages.evaluate`), for neither is part of this package. Only the convolutions are stated
-here, so that torchvision itself, which cannot be imported beside every build of torch, is not needed.
+here, so that torchvision itself, which does not work with every build of torch, is not needed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Lpips:
     """`Lpips(network, features, heads)(image, truth)`.
 
     network   "alex" or "vgg"
-    features  torchvision's state of the whole network, of which `features.*` is used
+    features  torchvision's state of the full network, of which `features.*` is used
     heads     LPIPS 0.1's state: `lin0.model.1.weight` (1, C, 1, 1) to `lin4.model.1.weight`
     Raises ValueError where a tensor is missing or of another shape.
     """

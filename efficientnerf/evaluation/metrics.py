@@ -34,7 +34,7 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
 
 def colour_fitted(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """The image with the affine change of its colours, c -> A c + b with A (3, 3), that brings it nearest to the ground truth by least squares over the pixels
-    that count: what photographs differ by in exposure and white balance is taken out of a figure. Clipped to 0-1.
+    that count: differences in exposure and white balance are taken out of a figure. Clipped to 0-1.
 
     Arguments as for mean_squared_error, with three channels. Returns (H, W, 3) float64.
     """

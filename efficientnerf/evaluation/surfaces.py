@@ -1,7 +1,7 @@
 """How much of an asset's density lies away from the surfaces of its network: floaters.
 
 The surface of the network on a ray is where half of the light is absorbed. The limit lies before it by a margin: MARGIN_DEPTH of its distance, or MARGIN_VOXELS
-of the cascade that holds the surface, whichever is more. What absorbs light nearer than the limit is a floater; so is whatever there is on a ray on which the
+of the cascade that holds the surface, whichever is more. Density before the limit is a floater; so is all density on a ray on which the
 network absorbs less than half.
 
 R rays.
@@ -47,7 +47,7 @@ def surface_limits(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, 
 
 
 def opacity_nearer(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Opacity (R,) of what of a tree lies nearer than the limits (R,), distances of the world, on rays (R, 3); by sums over steps of a voxel at most."""
+    """Opacity (R,) of the parts of a tree nearer than the limits (R,), distances of the world, on rays (R, 3); by sums over steps of a voxel at most."""
     warped = tree.frame.rays(np.asarray(origins, np.float64), np.asarray(directions, np.float64))
     ends = ndc_distance(np.where(np.isfinite(limits), limits, 1e9), warped.begin, warped.ds_dt, warped.dlogz_dt)
     thickness = np.zeros(len(ends))

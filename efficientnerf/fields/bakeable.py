@@ -1,4 +1,4 @@
-"""What fields share whose values depend on the position alone, so that they can be baked."""
+"""The base of fields whose values depend on the position alone, so that they can be baked."""
 
 from __future__ import annotations
 

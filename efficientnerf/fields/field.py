@@ -17,7 +17,7 @@ from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 
 class Field(Protocol):
-    """What a field offers. N points in grid coordinates, R rays, K spherical harmonics.
+    """The interface of a field. N points in grid coordinates, R rays, K spherical harmonics.
 
     activation         "exp" or "softplus": from a raw density to a density >= 0 (`efficientnerf.rendering.compositing.activate`)
     degree             of the spherical harmonics

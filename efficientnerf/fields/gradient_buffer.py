@@ -9,7 +9,7 @@ from torch import Tensor
 class GradientBuffer:
     """The gradient of a table, summed over the backward passes of a step.
 
-    A step encodes points several times, and autograd would allocate a gradient of the whole table for each time and add them up, which costs as much as
+    A step encodes points several times. Autograd would allocate a gradient of the full table each time and add them up, which costs as much as
     the encoding. Backward passes add to this buffer instead, and autograd gets no gradient of the table. The optimiser reads the buffer, and clears it
     for the next step.
 

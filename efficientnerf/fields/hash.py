@@ -1,7 +1,7 @@
 """A multiresolution hash grid (Mueller et al. 2022, "Instant neural graphics primitives") with spherical-harmonics output.
 
 L levels of lattices between `coarsest` and `finest` points a side, two features a lattice point, in tables of 2^log2_table entries (a level that
-fits is stored whole, one that does not is hashed); then a small ReLU network. The outputs do not see the direction, so the field bakes.
+fits is dense, one that does not is hashed); then a small ReLU network. The outputs do not see the direction, so the field bakes.
 """
 
 from __future__ import annotations

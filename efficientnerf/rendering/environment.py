@@ -1,4 +1,4 @@
-"""Environment maps: the colour of what has no parallax, by direction; equirectangular, z up.
+"""Environment maps: colours without parallax, by direction; equirectangular, z up.
 
     azimuth = atan2(y, x) in -pi to pi      column coordinate = (azimuth / (2 pi) + 1/2) W
     polar   = acos(z)     in 0 to pi        row coordinate    = polar / pi H
@@ -64,8 +64,8 @@ HALF_WEIGHT = 4.0  # weight of a texel at which half of its colour is its own
 
 
 def filled(total: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """A map (H, 2 H, 3) float32 of weighted sums of colours (H, 2 H, 3): where the weight (H, 2 H) is small, what is known around it fades in, from near and
-    far, and where nothing is known at all `mean` (3,)."""
+    """A map (H, 2 H, 3) float32 of weighted sums of colours (H, 2 H, 3): where the weight (H, 2 H) is small, the known colours around it fade in, from near and
+    far; without any, `mean` (3,)."""
     known = weight.sum()
     out = np.broadcast_to(np.asarray(mean if known < 1e-6 else total.reshape(-1, 3).sum(axis=0) / known, np.float64), total.shape)
     sigma = len(total) / 4

@@ -111,7 +111,7 @@ class FieldRenderer:
         m = self.model
         count = camera.width * camera.height
         parts, counts = [], SampleCounts()
-        # Where nothing is pruned a ray has as many samples as there are.
+        # Without pruning a ray has all samples.
         block = self.rays_per_block if m.prunes else min(self.rays_per_block, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
         for begin in range(0, count, block):
             index = np.arange(begin, min(count, begin + block))
@@ -165,7 +165,7 @@ def split_by_box(
     middle = outputs.fine.start + outputs.fine.extent / 2
     origins, directions = outputs.rays.origins, outputs.rays.directions
     enter, leave = (m.space if box is None else Box(box)).intersect(origins, directions)
-    misses = leave <= torch.clamp(enter, min=0)  # such a ray sees nothing but what lies beyond
+    misses = leave <= torch.clamp(enter, min=0)  # such a ray sees only what lies beyond
     enter = torch.where(misses, -torch.inf, enter)
     leave = torch.where(misses, -torch.inf, leave)
 
@@ -181,7 +181,7 @@ def split_by_box(
     reaching_box = (1 - before_opacity).clamp(min=0)
     passing_box = (reaching_box - inside_opacity).clamp(min=0)
     rest = (passing_box - after_opacity).clamp(min=0)
-    # Where next to no light passes the box nothing is known of what lies beyond it, and nothing depends on it.
+    # The colour beyond the box is unknown, and does not matter, where hardly any light passes the box.
     beyond_colour = torch.where((passing_box > 1e-4)[:, None], (after + rest[:, None] * behind) / passing_box.clamp(min=1e-4)[:, None], behind)
     inside = torch.where(reaching_box > 1e-4, inside_opacity / reaching_box.clamp(min=1e-4), torch.zeros_like(inside_opacity))
     # Depth: the first sample at which half of the light is gone.

@@ -12,7 +12,7 @@ from efficientnerf.splats.refit import View, refitted
 
 __all__ = ["Budget", "NothingToShow", "View", "gaussians_of_asset"]
 
-START = 0.8  # of the Gaussians that there may be, that voxels are merged into: the rest is added where the error is; docs/experiments/splats.md
+START = 0.8  # share of the Gaussians allowed that voxels are merged into: the rest is added where the error is; docs/experiments/splats.md
 
 Progress = Callable[[int, int, str], None]
 
@@ -43,7 +43,7 @@ def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, pr
     """Gaussians that show what the tree shows.
 
     views     what they are fitted to, and whose cameras say which voxels show
-    progress  called with what is done, of how much, and what is being done
+    progress  called with the work done, the total, and a text
 
     Raises NothingToShow, and ValueError without views.
     """

@@ -1,4 +1,4 @@
-"""3D Gaussians, as 3DGS (Kerbl et al. 2023) renders them: a surface or a whole scene as ellipsoids that programs of others show.
+"""3D Gaussians, as 3DGS (Kerbl et al. 2023) renders them: a surface or a scene as ellipsoids that other programs show.
 
 A Gaussian hides at most its opacity, at its mean, and the less the farther away: alpha = opacity exp(-q / 2), q the squared distance in standard deviations.
 Its colour along a unit view direction d is max(0, 1/2 + sum_k harmonics_k Y_k(d)), sRGB; the basis is that of `efficientnerf.rendering.harmonics`.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAX_DEGREE = 3  # what the formats and programs of 3DGS know
+MAX_DEGREE = 3  # the most in formats and programs of 3DGS
 
 
 @dataclass(frozen=True, eq=False)

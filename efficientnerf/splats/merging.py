@@ -1,8 +1,8 @@
 """Voxels that show, merged into Gaussians.
 
-Voxels lie in cells of 1, 2, 4, ... voxels a side. What is lost when the voxels of a cell become one is the sum, over the pixels that show them, of the squared
-differences of their colours and places from the mean. It never falls from a cell to the one around it: so the cells that lose at most some bound, each the
-largest of its place, are a partition, and the bound follows from how many Gaussians there may be.
+Voxels lie in cells of 1, 2, 4, ... voxels a side. The loss of a cell whose voxels become one is the sum, over the pixels that show them, of the squared
+differences of their colours and places from the mean. It never falls from a cell to its parent: so the cells that lose at most some bound, each the
+largest of its place, are a partition, and the bound follows from the number of Gaussians allowed.
 
 A Gaussian has the mean of its voxels, weighted by the pixels that show them, their covariance across the density's normal, and little depth along it. Its
 opacity follows from the optical thickness of the voxels, which it keeps. Colours are their mean, converted: an asset's are the sigmoid of a sum of harmonics,
@@ -152,7 +152,7 @@ def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
         begins.append(begin)
 
     def chosen(bound: float) -> list[np.ndarray]:
-        """Which cells of each level lose at most `bound`, where the one around them loses more."""
+        """The cells of each level that lose at most `bound`, while their parent loses more."""
         alone = [around[parent] > bound for around, parent in zip(losses[1:], parents, strict=True)]
         return [(lost <= bound) & most_of_all for lost, most_of_all in zip(losses, [*alone, np.ones(1, bool)], strict=True)]
 
@@ -169,7 +169,7 @@ def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
 
 
 def merged(tree: NerfTree, cameras: Sequence[Camera], most: int, degree: int) -> Gaussians:
-    """At most `most` Gaussians for what the cameras see of a tree; none where they see nothing."""
+    """At most `most` Gaussians for the voxels that cameras see; none where they see nothing."""
     shell = environment_shell(tree, most, degree)
     shown = shown_voxels(tree, cameras)
     if not len(shown.voxels):

@@ -1,4 +1,4 @@
-"""The rasteriser as plain torch, one Gaussian after the other over all pixels: what the kernels are measured against. Pinhole cameras."""
+"""The rasteriser as plain torch, one Gaussian after the other over all pixels: the kernels' reference. Pinhole cameras."""
 
 from __future__ import annotations
 

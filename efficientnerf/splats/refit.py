@@ -1,6 +1,6 @@
 """Gaussians fitted to pictures: Adam on means, scales, rotations, opacities and harmonics.
 
-A step is a picture; of a large one rows that together have about PIXELS. What is minimised is the squared error, of a picture with alpha that over all
+A step takes a picture, or rows of a large one with about PIXELS. It minimises the squared error; for a picture with alpha, over all
 backgrounds at once. The order of the pictures and the rows are drawn by (seed, step). The same pictures give the same bytes on any number of threads.
 """
 
@@ -27,8 +27,8 @@ PIXELS = 2**18  # of a step
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
 LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS
-SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the error is, up to as many as there may be
-SPLIT_APART, SPLIT_SHARE = 0.5, 0.7  # of the longest standard deviation: how far the halves lie from the middle, and what is left of it
+SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the error is, up to the most allowed
+SPLIT_APART, SPLIT_SHARE = 0.5, 0.7  # of the longest standard deviation: distance of the halves from the middle, and their own
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +93,9 @@ def refitted(
 
 
 def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Values, moments and number of the Gaussians without those that hide nothing any more; those that had the greatest part in the errors (N,) are two.
+    """Values, moments and number of the Gaussians without those that hide nothing any more; those with the greatest part in the errors (N,) are split.
 
-    The halves lie along the longest axis, beside each other in memory, and begin without momentum.
+    The halves lie along the longest axis, next to each other in memory, and begin without momentum.
     """
     rows, state = ungrouped(values, len(errors)), ungrouped(moments, len(errors))
     alive = rows[:, OPACITY] > np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
@@ -128,7 +128,7 @@ def _band(view: View, rng: np.random.Generator) -> View:
 
 
 def _picture(view: View, background: tuple[float, float, float] | None) -> Picture:
-    """As kernels take it."""
+    """A view for the kernels."""
     pixels = view.pixels
     over_all = pixels.shape[2] == 4 or background is None
     if pixels.shape[2] == 3:

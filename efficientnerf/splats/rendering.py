@@ -15,8 +15,8 @@ from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.splats.gaussians import Gaussians
 
 NEAR = 0.05  # depth in front of which nothing is rendered, units of the training frame
-BESIDE = 0.15  # of the picture's width and height, beside it, up to where derivatives of the projection follow the means; as 3DGS
-LOG_SCALES = (-30.0, 20.0)  # what lies beyond is rendered as if it were this: float32 holds its square
+BESIDE = 0.15  # of the picture's width and height, outside of it, up to where derivatives of the projection follow the means; as 3DGS
+LOG_SCALES = (-30.0, 20.0)  # values beyond are rendered as these: float32 holds their squares
 LANES = 16
 
 
@@ -48,7 +48,7 @@ def render_values(values: np.ndarray, degree: int, camera: Camera, background: t
 
 
 def lens_of(camera: Camera, whole: Camera | None = None) -> Lens:
-    """The camera as kernels take it; of a part of a picture with the limits of the whole."""
+    """The camera as kernels take it; of a part of a picture with the limits of the full one."""
     k, fisheye = camera.intrinsics, camera.model == "OPENCV_FISHEYE"
     top, bottom = ("k1", "k2", "k3", "k4" if fisheye else ""), ("", "", "") if fisheye else ("k4", "k5", "k6")
     lens = [k.get(name, 0.0) for name in ("fx", "fy", "cx", "cy", *top, *bottom, "p1", "p2")]
@@ -75,7 +75,7 @@ def _limits(camera: Camera) -> np.ndarray:
 
 
 def values_of(gaussians: Gaussians) -> np.ndarray:
-    """(G, 11 + 3 K, 16) float32, rows as `efficientnerf.backends.numba.splats.projection` names them; what fills the last group cannot be seen."""
+    """(G, 11 + 3 K, 16) float32, rows as `efficientnerf.backends.numba.splats.projection` names them; the last group's padding cannot be seen."""
     count = len(gaussians)
     logits = np.log(gaussians.opacities) - np.log1p(-gaussians.opacities)
     parts = gaussians.means, np.log(gaussians.scales).clip(*LOG_SCALES), gaussians.rotations, logits[:, None], gaussians.harmonics.reshape(count, -1)

@@ -17,7 +17,7 @@ from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 
 OPAQUE = 0.5  # opacity of a pixel from which the surface has to cover it
 FAINT = 0.25  # below which a pixel shows nothing
-MARGIN_DEPTH, MARGIN_VOXELS = 0.03, 4.0  # of the depth, and voxels, that what is shown may lie off the asset's median depth
+MARGIN_DEPTH, MARGIN_VOXELS = 0.03, 4.0  # of the depth, and voxels, that the surface may lie off the asset's median depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ def shown_pixels(vertices: np.ndarray, faces: np.ndarray, component: np.ndarray,
     for view in views:
         image = mesh_image(vertices, faces, view.camera)
         own = np.where(image.covered, image.depth, 0)
-        other = np.where(np.isfinite(view.depth), view.depth, own)  # nothing but itself, where less than half of the light is absorbed
+        other = np.where(np.isfinite(view.depth), view.depth, own)  # its own, where less than half of the light is absorbed
         here = image.covered & (view.opacity >= FAINT) & (np.abs(own - other) <= MARGIN_DEPTH * own + MARGIN_VOXELS * voxel)
         out += np.bincount(component[image.face[here]], view.opacity[here], minlength=len(out))
     return out
@@ -74,7 +74,7 @@ def differences(view: AssetView, image: MeshImage) -> tuple[np.ndarray, np.ndarr
 
 
 def agreement(views: Sequence[AssetView], images: Sequence[MeshImage]) -> Agreement:
-    """Of a surface's images from the views' cameras with the views."""
+    """Agreement of a surface's images from the views' cameras with the views."""
     both = either = opaque = covered = 0
     errors = [np.zeros(0)]
     for view, image in zip(views, images, strict=True):

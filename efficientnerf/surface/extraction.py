@@ -44,7 +44,7 @@ def cleaned_surface(
 
 
 def _in_world(volume: Volume, shown: Shown | None) -> Shown | None:
-    """What is shown of components of the volume's frame."""
+    """`shown` for components of the volume's frame."""
     if shown is None or not isinstance(volume, NdcVolume):
         return shown
     ndc = volume.ndc
@@ -75,7 +75,7 @@ def surface(
     min_component  components with less than this share of the largest one's area are removed
     rounds         of smoothing, which keeps the volume; those of smoothing normals, which keep edges, are NORMALS or FUSED_NORMALS
     viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
-    shown          how much views of the world show of components: those that they do not show are removed; None: hollows and what is in them are
+    shown          how much views of the world show of components: those that they do not show are removed; None: hollows and parts in them are
     fusion         depths of views, which decide where the surface is wherever they agree; None: the densities alone do
     silhouettes    views of the asset by pinhole cameras, whose silhouettes the surface gets where it is sharply curved
     dense          is given vertices and faces as they were before decimation, in the training frame
@@ -92,7 +92,7 @@ def surface(
     if dense is not None:
         dense.append((vertices if ndc is None else ndc.ndc.world(vertices), triangles))
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
-    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # what decimation cut off
+    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # parts that decimation cut off
     if len(triangles):
         times, most, sharpness = NORMALS if fusion is None else FUSED_NORMALS
         most = min(most, rounds_within(SMOOTHING_REACH * float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices, triangles))

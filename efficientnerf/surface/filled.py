@@ -1,6 +1,6 @@
-"""Where a volume has density at all: the parts of a grid, which may be vast and nearly empty, that a surface has to be looked for in.
+"""Where a volume has density: the parts of a grid, which may be vast and nearly empty, that may hold a surface.
 
-Of a tree these are its bricks; of any other `Volume`, all of it.
+These are the bricks of a tree; all of any other `Volume`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SLAB = 64  # layers of voxels that are in memory at a time, of a volume without 
 
 
 def filled_parts(volume: Volume, axis: int, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Corners of the parts of a column of bricks along `axis` that may have density; what lies between does not count in its rays' depth."""
+    """Corners of the parts of a column of bricks along `axis` that may have density; gaps do not count in its rays' depth."""
     if not isinstance(volume, WorldVolume):
         yield low, high
         return
@@ -40,7 +40,7 @@ def dense_voxels(volume: Volume, threshold: float) -> Iterator[np.ndarray]:
 
 
 def filled_blocks(volume: Volume, counts: list[int], block: int) -> np.ndarray:
-    """(n, 3) numbers of the blocks that may hold a part of the surface, in order: those with a brick, and those beside them, where what is enclosed may end."""
+    """(n, 3) numbers of the blocks that may hold a part of the surface, in order: those with a brick, and those next to them, where enclosed space may end."""
     if not isinstance(volume, WorldVolume):
         return np.stack(np.unravel_index(np.arange(math.prod(counts)), counts), axis=1)
     at = np.unique(volume.cells * volume.brick // block, axis=0)

@@ -23,12 +23,12 @@ from efficientnerf.geometry.cameras import rays
 from efficientnerf.surface.agreement import AssetView
 
 # docs/experiments/surface.md
-ABSORBED = 0.15  # share of the light that is gone at the depths that are fused: half is gone well inside of what is soft
+ABSORBED = 0.15  # share of the light that is gone at the depths that are fused: half is gone well inside of soft parts
 LONGEST = 8.0  # voxels that this may lie before the median depth
 RADIUS = 4  # pixels around, that a plane is fitted to
 BAND = 3.0  # voxels off its plane that a pixel may be
 TRUNCATION = 3.0  # voxels
-EMPTY, HAZE = 0.01, 0.1  # opacities: nothing is fused a voxel beyond the first; from the second on, what views say is behind a surface is solid
+EMPTY, HAZE = 0.01, 0.1  # opacities: nothing is fused a voxel beyond the first; from the second on, voxels that views place behind a surface are solid
 DENSITY_WEIGHT = 0.5  # of the densities, in views
 BLUR = 1.2  # voxels, standard deviation
 THIN = (-1.2, -0.5)  # least distance around a voxel: up to the first it is a part of something thick, from the second on of something thin
@@ -66,7 +66,7 @@ def front_depth(tree: NerfTree, view: AssetView) -> np.ndarray:
 
 
 def fusion_of(tree: NerfTree, views: Sequence[AssetView], tick: Callable[[], None]) -> Fusion:
-    """What pinhole cameras with images of one size see of a tree, for its inmost cascade. `tick` is called before each; what it raises stops the work."""
+    """Views of a tree by pinhole cameras with images of one size, for its inmost cascade. `tick` is called before each; an exception from it stops the work."""
     height, width = views[0].depth.shape
     voxel = float(tree.voxel)
     planes = np.empty((len(views), height, width, CHANNELS), np.float32)

@@ -1,4 +1,4 @@
-"""From densities to a surface: its level, what is enclosed, marching cubes.
+"""From densities to a surface: its level, enclosed space, marching cubes.
 
 Letters: sigma density per world unit, tau the level of the surface, s the voxel's side; V vertices, F faces, R rays, S samples.
 Everything is in the frame of the volume (`efficientnerf.surface.volume`).
@@ -20,7 +20,7 @@ from efficientnerf.surface.volume import Volume, WorldVolume
 
 Progress = Callable[[int, int, str], None]
 LARGEST_SIDE = 4096  # voxels along a side of a grid that is baked
-CLIP = 2.0  # voxels on either side of the border of a region, in which what is clipped comes in and fades
+CLIP = 2.0  # voxels on either side of the border of a region, in which clipped surfaces come in and fade
 BLOCK = 64  # voxels a side that are in memory at a time
 
 
@@ -49,7 +49,7 @@ def pool_of(volume: Volume) -> int:
 
 
 def automatic_threshold(volume: Volume, lines: int = 24) -> float:
-    """The density of the surface where none is given: what light entering from outside meets.
+    """The default density of the surface: that which light from outside meets.
 
         tau = min( ln 2 / s,  lower quartile over rays of max_{j <= h} sigma_j ),   h: the voxel where the ray's transmittance falls to 1/2
 
@@ -97,7 +97,7 @@ def _densities_on_entry(sigma: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> np.ndarray:
-    """Empty space that nobody outside can see, because everything around it is dense: bool, one value per cell of `pool_of`^3 voxels.
+    """Empty space that cannot be seen from outside, because everything around it is dense: bool, one value per cell of `pool_of`^3 voxels.
 
     viewpoints  (N, 3) places that are outside by definition, besides the boundary of the volume: a camera may stand in a closed room
 
@@ -120,7 +120,7 @@ def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> 
 def _filled_block(volume: Volume, low: np.ndarray, high: np.ndarray, threshold: float, enclosed: np.ndarray | None) -> np.ndarray:
     """`volume.density_block` with infinite density in enclosed space.
 
-    What is enclosed grows by a few voxels, as far as nothing dense is in the way: into the corners that its coarse cells left out, and
+    Enclosed space grows by a few voxels, as far as nothing dense is in the way: into the corners that its coarse cells left out, and
     into pinholes, which it fills. The margin that is read makes the result the same for both blocks that share a plane.
     """
     if enclosed is None:
@@ -179,7 +179,7 @@ def isosurface(
     _, first, index = np.unique(keys, return_index=True, return_inverse=True)
     target[rows] = rows[first][index]
     grid_points, triangles = compact(np.concatenate(positions), target[np.concatenate(faces)])
-    # Sample i lies at the middle of voxel i. What closes the surface at the boundary must not stand out of the box.
+    # Sample i lies at the middle of voxel i. The lids at the boundary must not stand out of the box.
     grid_points = np.clip(grid_points + 0.5, 0, grid)
     return np.asarray(volume.bounds_min, np.float64) + grid_points * float(volume.voxel), triangles
 
@@ -190,7 +190,7 @@ def _opacity(sigma: np.ndarray, threshold: float) -> np.ndarray:
 
 
 def _clipped(volume: Volume, opacity: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Opacities of voxels from `low` on with what is outside of the volume's region left out."""
+    """Opacities of voxels from `low` on without those outside of the volume's region."""
     region = volume.region if isinstance(volume, WorldVolume) else None
     if region is None:
         return opacity

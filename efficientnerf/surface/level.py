@@ -1,7 +1,7 @@
 """The density at which a surface has the silhouettes of its asset. docs/experiments/surface.md
 
 `isosurface` draws where the opacity f = 1 - 2^(-sigma / level), interpolated between voxels, is one half. A ray meets that where the highest f along it is
-more. So no surface has to be made to know which pixels it would cover.
+more. So the pixels that a surface would cover are known without making it.
 
 R rays, S samples, L levels.
 """
@@ -33,7 +33,7 @@ def silhouette_level(tree: NerfTree, views: Sequence[AssetView], highest: float,
     `highest` where the views show no edge.
 
     tree  of one grid
-    tick  called before each view; what it raises stops the work
+    tick  called before each view; an exception from it stops the work
     """
     wrong = np.zeros(len(LEVELS))
     for view in views:

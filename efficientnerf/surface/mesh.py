@@ -89,7 +89,7 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def face_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) signed volumes of the tetrahedra from the middle of the vertices to each face; over a closed mesh they sum to what it encloses."""
+    """(F,) signed volumes of the tetrahedra from the middle of the vertices to each face; over a closed mesh they sum to its volume."""
     origin = vertices.mean(0) if len(vertices) else np.zeros(3)
     return np.einsum("fi,fi->f", vertices[faces[:, 0]] - origin, face_vectors(vertices, faces)) / 6
 

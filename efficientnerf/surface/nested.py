@@ -1,4 +1,4 @@
-"""The surface of a whole scene: that of each cascade in its own grid, joined.
+"""The surface of an unbounded scene: that of each cascade in its own grid, joined.
 
 A cascade's surface is cut where the one before begins and where its own box ends, and open there. The parts are not sewn together: between cascades, whose
 voxels differ by a factor of two, there may be cracks of about a voxel.
@@ -23,7 +23,7 @@ from efficientnerf.surface.visible_parts import Shown
 from efficientnerf.surface.volume import volume_of
 
 MIN_FACES = 20
-SKIPPED = 2  # of the views whose depths are fused, one in so many has its silhouette fitted
+SKIPPED = 2  # of the views whose depths are fused, one in this many has its silhouette fitted
 BORDER = 0.6  # voxels of a cascade from the borders of its box, and of the one before, in which its surface has lids
 ALONG = 0.7  # cosine of a lid's normal to that of the border
 
@@ -107,7 +107,7 @@ def _parts(tree: NerfTree) -> Iterator[tuple[int, NerfTree]]:
 
 
 def _fusion(number: int, tree: NerfTree, views: Sequence[AssetView], progress: Progress) -> Fusion | None:
-    """Of a cascade. What the outer ones hold may be a few voxels large, and fused distances are smoothed over more than one."""
+    """Of a cascade. The outer ones may hold parts of a few voxels, and fused distances are smoothed over more than one."""
     return fusion_of(tree, views, lambda: progress(0, 1, "marching cubes")) if views and tree.ndc is None and number == 0 else None
 
 

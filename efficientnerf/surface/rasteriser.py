@@ -13,7 +13,7 @@ from efficientnerf.backends.numba.mesh.rasterise import rasterise, row_spans
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project
 
-BANDS = 16  # of rows, that threads share
+BANDS = 16  # of rows, shared by threads
 FIRST = 4096  # faces in the first piece
 
 
@@ -35,7 +35,7 @@ class MeshImage:
 
 
 def mesh_image(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> MeshImage:
-    """What of a mesh each pixel's centre meets first, from either side. Edges are straight between the distorted places of their ends; faces that reach behind
+    """The face that each pixel's centre meets first, from either side. Edges are straight between the distorted places of their ends; faces that reach behind
     the camera, or beyond what its lens shows, are left out."""
     pixels, depth = project(camera, vertices)
     near = np.zeros((camera.height, camera.width), np.float32)

@@ -1,8 +1,8 @@
 """Vertices of a surface moved to where views of its asset end. docs/experiments/surface.md
 
-Fusing and smoothing round off edges and thin parts, so that the silhouettes of a surface lie inside of those of its asset. Where a vertex lies on the surface's
-silhouette in a view, the two say by how many pixels. It goes the mean of that over the views along its normal: where the surface is sharply curved, for the
-depths of views say better where it is flat.
+Fusing and smoothing round off edges and thin parts, so that the silhouettes of a surface lie inside of those of its asset. At a vertex on the surface's
+silhouette in a view, the two differ by some pixels. The vertex moves by the mean of that over the views along its normal, where the surface is
+sharply curved: where it is flat the depths of views are more accurate.
 
 V vertices, F faces, H x W pixels.
 """
@@ -36,7 +36,7 @@ def fitted_to_silhouettes(
     vertices: np.ndarray, faces: np.ndarray, views: Sequence[AssetView], tick: Callable[[], None] = lambda: None, rounds: int = ROUNDS
 ) -> np.ndarray:
     """(V, 3) the vertices (V, 3) of the world of faces (F, 3), moved to the silhouettes that views by pinhole cameras have of their asset. `tick` is called
-    before each view; what it raises stops the work."""
+    before each view; an exception from it stops the work."""
     edges = [(view.camera, edge) for view in views if (edge := _asset_edge(view)) is not None]
     if not edges or not len(faces):
         return vertices

@@ -40,8 +40,8 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
 
     sharpness  difference of two unit normals beyond which faces hardly count for each other. docs/experiments/surface.md
 
-    Each normal becomes the mean of its own and those of the three faces beside it, weighted by area and by exp(-difference^2 / (2 sharpness^2)); then vertices
-    go as far along the normals around them as makes the faces fit these. What the vertices of a place have gone along their normals in common is taken back:
+    Each normal becomes the mean of its own and those of the three faces next to it, weighted by area and by exp(-difference^2 / (2 sharpness^2)); then vertices
+    go as far along the normals around them as makes the faces fit these. The common motion of nearby vertices along their normals is taken back:
     thin parts would shrink to nothing. Zheng et al., "Bilateral normal filtering for mesh denoising", TVCG 2011; Sun et al., "Fast and effective
     feature-preserving mesh denoising", TVCG 2007.
     """

@@ -1,4 +1,4 @@
-"""Parts of a surface: which of them anybody sees.
+"""Parts of a surface that can be seen.
 
 V vertices, F faces, C components.
 """
@@ -18,7 +18,7 @@ SHOWN = 1.0  # pixel of all views together that a component has to show
 def visible_parts(
     vertices: np.ndarray, faces: np.ndarray, min_component: float, viewpoints: np.ndarray, shown: Shown | None = None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """The closed mesh without small components, hollows, and what lies in hollows; or, where views say what they see, without what they do not.
+    """The closed mesh without small components, hollows, and parts in hollows; or, where views say what they see, without parts that they do not.
 
     min_component   components with less than this share of the largest one's area are removed
     shown           how much views show of each component; None: not known
@@ -26,7 +26,7 @@ def visible_parts(
 
     A component that encloses a negative volume is the wall of a hollow inside something solid. It cannot be seen from anywhere outside, and neither can
     the components in it. All of this is kept where one of the
-    `viewpoints` (N, 3) lies in a hollow: that is a room, seen from inside.
+    `viewpoints` (N, 3) lies in a hollow, as in a room seen from inside.
     """
     label = face_components(faces, len(vertices))
     areas, volumes = face_areas(vertices, faces), face_volumes(vertices, faces)

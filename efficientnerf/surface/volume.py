@@ -1,7 +1,7 @@
-"""What a surface is extracted from: a grid of densities with colours, in a frame of its own.
+"""The input of surface extraction: a grid of densities with colours, in a frame of its own.
 
 `WorldVolume` is a tree in the world. `NdcVolume` is a forward-facing tree: its surface is found in normalised device coordinates and handed out in the
-world. There a voxel is about a pixel wide at any depth, so that marching cubes, smoothing and decimation treat near and far as images do. What lies
+world. There a voxel is about a pixel wide at any depth, so that marching cubes, smoothing and decimation treat near and far as images do. Space
 beyond the far limit is left out, for it reaches to infinity.
 """
 
@@ -122,7 +122,7 @@ class NdcVolume(WorldVolume):
         return (found[found[:, 2] < self.layers] for found in super().dense_voxels(threshold))
 
     def view_directions(self, points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
-        """Unit view directions (N, 3) of the world to points of the frame, from the reference camera and from about as far beside, above and below it as
+        """Unit view directions (N, 3) of the world to points of the frame, from the reference camera and from about as far to the sides, above and below it as
         the cameras were. From elsewhere nothing is known of the colours, whatever the normals are."""
         x, y, _ = (self.tree.metadata.get("spiral") or {}).get("radii", (0.0, 0.0, 0.0))
         places = np.array([[0, 0, 0], [x, 0, 0], [-x, 0, 0], [0, y, 0], [0, -y, 0]], np.float64)

@@ -1,4 +1,4 @@
-"""What the field shows at some pixels of every photograph, for the refinement of the cameras. C views, N pixels of a view, R = C N rays."""
+"""Renders of the field at some pixels of every photograph, for the refinement of the cameras. C views, N pixels of a view, R = C N rays."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _alignment(pixels: Pixels, view: int, index: np.ndarray, shown: np.ndarray, 
 def _rendered(m: Model, source: Pixels | DevicePixels, index: np.ndarray, exposure: Exposure | None) -> tuple[np.ndarray, np.ndarray]:
     """Colours (R, 3) and points (R, 3) in the world that the field shows at pixels, float64."""
     colours, points = [], []
-    # Where nothing is pruned a ray has as many samples as there are.
+    # Without pruning a ray has all samples.
     block = RAYS_AT_A_TIME if m.prunes else max(64, SAMPLES_AT_A_TIME // (m.num_coarse_samples + m.settings.num_importance_samples))
     for begin in range(0, len(index), block):
         part = index[begin : begin + block]

@@ -1,7 +1,7 @@
-"""Small corrections of the training cameras, found in the photographs beside the field (direct image alignment: Engel et al. 2018, "Direct Sparse Odometry").
+"""Small corrections of the training cameras, found together with the field (direct image alignment: Engel et al. 2018, "Direct Sparse Odometry").
 
-Now and then some pixels of every photograph are rendered, colour and depth. Were the camera right, its photograph would show the rendered colour at the
-pixel where the rendered point lies; it shows it a little beside it, and the gradient of the photograph says where to move the camera:
+Now and then some pixels of every photograph are rendered, colour and depth. With the right camera, the photograph shows the rendered colour at the
+pixel where the rendered point lies. With a wrong one it shows it a little off, and the photograph's gradient says where to move the camera:
 
     residual   I(u + P d) - c  ~  (I(u) - c) + grad I(u) P d
 
@@ -9,7 +9,7 @@ pixel where the rendered point lies; it shows it a little beside it, and the gra
 
 No gradient of the field is needed, so that every field, space and backend does. A correction is six numbers for a camera (rotation vector in the camera's
 axes, translation in units of its median depth) and one for all: the logarithm of the focal length's factor. Rounds are summed with a memory that fades,
-Huber's weights let few pixels disagree, a prior holds every camera near where it was given, and a similarity, which no photograph can show, is taken out.
+Huber's weights limit outliers, a prior holds every camera near where it was given, and a similarity, which no photograph can show, is taken out.
 
 C cameras, N pixels of a camera.
 """
@@ -53,7 +53,7 @@ class Alignment:
 
 @dataclass
 class CameraCorrections:
-    """What is learned of the cameras.
+    """The corrections that are learned.
 
     given    as they came
     depth    (C,) median depth of what each one shows, the unit of its translation; 0: not known yet
@@ -190,7 +190,7 @@ def solve(c: CameraCorrections) -> float:
 
 
 def take_similarity_out(c: CameraCorrections) -> None:
-    """Move all cameras together to where their frames lie closest to the given ones: the scene's place, turn and size are not to drift."""
+    """Move all cameras together so that their frames lie closest to the given ones: the scene's place, rotation and scale must not drift."""
     known, cameras = np.flatnonzero(c.depth > 0), c.cameras
     given, now = (np.stack([some[n].world_from_camera for n in known]) for some in (c.given, cameras))
     mean_given, mean_now = given[:, :3, 3].mean(axis=0), now[:, :3, 3].mean(axis=0)

@@ -5,7 +5,7 @@ any state to restore. What is restored: parameters, Adam's moments, density voxe
 
 On a CPU the same seed gives the same bytes with the same number of threads of torch. Our own kernels, the hash field's network among them, do not
 depend on the number; matrix products of the paper's networks (oneDNN, MKL) may sum in another order with another one. Either are in bfloat16 only where the
-processor has it, so that another machine's result is another one of the same quality.
+processor supports it, so that another machine's result differs, at the same quality.
 
 R rays, C views.
 """
@@ -39,7 +39,7 @@ from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.sparse_depth import RAYS_PER_RAY, SparseDepthRays, sparse_depth_loss, sparse_depth_weight
 from efficientnerf.training.view_checks.checks import ViewChecks, follow_checks
 
-MAX_STEPS = 2**40  # of a run: more than anyone waits for
+MAX_STEPS = 2**40  # of a run: beyond any practical one
 
 
 @dataclass
@@ -100,7 +100,7 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
     groups = parameter_groups(m)
     if exposure is not None:
         groups.append(ParameterGroup(exposure.parameters))
-    # Until it is known better, every interval is sampled, and as many pivots as there may be.
+    # At first every interval counts as sampled, with as many pivots as allowed.
     samples = float(m.max_intervals + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
     corrections = CameraCorrections.none(cameras) if m.settings.camera_refinement == "on" and cameras else None
     checks = ViewChecks.none(cameras) if m.settings.wrong_views == "auto" and cameras else None
@@ -108,7 +108,7 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
-    """All that a resumed run needs beside its schedule, by name."""
+    """All that a resumed run needs besides its schedule, by name."""
     moments = {f"adam.{k}.{name}": pair[k] for name, pair in t.adam.moments.items() for k in (0, 1)}
     progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
     exposure = {} if t.exposure is None else {name: values.detach() for name, values in t.exposure.parameters.items()}

@@ -47,7 +47,7 @@ def distortion_loss(m: Model, outputs: RayOutputs, fraction: float, complete: Te
 def scale_gradients_by_distance(m: Model, origins: Tensor, outputs: RayOutputs) -> None:
     """Scale gradients by the square of the distance to the camera, up to the distance of the box's centre.
 
-    Rays are dense close to a camera, so that samples there get gradients far more often than those on the subject, and floaters grow before the camera.
+    Rays are dense close to a camera: samples there get gradients far more often than those on the subject, and floaters grow before the camera.
     Philip and Deschaintre 2023, "Floaters no more: radiance field gradient scaling for improved near-camera training".
     """
     subject = (origins - to_device(torch.as_tensor(m.space.centre, dtype=origins.dtype), origins.device)).norm(dim=-1)

@@ -28,7 +28,7 @@ def update_occupancy(m: Model, outputs: RayOutputs, number: int, rng: np.random.
     due = number % m.settings.occupancy_update_interval == 0
     if due:
         update_at_random_cells(m, number, rng)
-    # Where nothing is sampled nothing has a gradient: a scene whose voxels are all invalid would stay empty.
+    # No samples, no gradients: a scene whose voxels are all invalid would stay empty.
     if not may_wait and due:
         reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
     elif may_wait and len(outputs.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):

@@ -26,7 +26,7 @@ class PatchGrid:
     mean_pixels      of a patch of these that may be used
     angle            across a patch, radians, about
 
-    What lies beyond the image, or is masked, is left out of a patch. So every pixel that may be used is as probable as any other where all tiles are.
+    A patch leaves out pixels beyond the image or masked. So every usable pixel is as probable as any other where all tiles are.
     """
 
     def __init__(self, pixels: Pixels, side: int) -> None:

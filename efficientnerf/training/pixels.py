@@ -104,7 +104,7 @@ class Pixels:
                 continue
             if bits is None:
                 bits = np.full(-(-len(self) // 8), 255, np.uint8)
-            # The bytes at both ends may hold pixels of the views beside this one.
+            # The bytes at both ends may hold pixels of the views next to this one.
             first, last = at // 8, -(-end // 8)
             whole = np.unpackbits(bits[first:last])
             whole[at - 8 * first : end - 8 * first] = mask.reshape(-1)

@@ -54,7 +54,7 @@ class AsyncReadback:
         return SampleCapacity(coarse, fine)
 
     def restart(self) -> None:
-        """Count exactly again: rays will have other numbers of samples than so far."""
+        """Count exactly again: the number of samples on a ray changes."""
         self.steps, self.valid_per_ray, self.fine_per_ray = 0, 0.0, 0.0
 
     def record(self, rays: int, loss: Tensor, coarse: Samples, pivotal: Tensor, fine: Samples) -> StepCounts:
@@ -78,7 +78,7 @@ class AsyncReadback:
         *counts, rays, coarse_complete, complete = (int(n) for n in counts)
         self.known = StepCounts._make([loss, *counts, rays - complete])
         share = 1.0 if self.valid_per_ray == self.fine_per_ray == 0 else 0.1
-        # Samples that did not fit are not counted: known is how many each of those rays has whose samples did.
+        # Samples that did not fit are not counted: these are means over the rays whose samples did.
         self.valid_per_ray += share * (self.known.valid / max(coarse_complete, 1) - self.valid_per_ray)
         self.fine_per_ray += share * (self.known.fine / max(complete, 1) - self.fine_per_ray)
 

@@ -1,4 +1,4 @@
-"""How far training goes, and what depends on how far it is: learning rate, samples per pivot. Imports nothing heavy."""
+"""The length of training, and what depends on its progress: learning rate, samples per pivot. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Schedule:
         return min(self.early_samples_per_pivot, self.samples_per_pivot) if early else self.samples_per_pivot
 
     def with_iterations(self, iterations: int, step: int) -> Schedule:
-        """The schedule with another number of iterations from `step` on. What it says of the steps up to `step` stays."""
+        """The schedule with another number of iterations from `step` on. The steps up to `step` stay as they were."""
         return replace(self, iterations=iterations, aims=(*self.aims, (self.iterations, step)))
 
     @property
@@ -65,7 +65,7 @@ class Schedule:
         return self.aims[-1][1] if self.aims else self.hold
 
     def state(self) -> dict[str, Any]:
-        """What a run decides, as JSON holds it; the rest are settings."""
+        """Decisions of a run, for JSON; the rest are settings."""
         return {"iterations": self.iterations, "hold": self.hold, "aims": [list(aim) for aim in self.aims]}
 
 

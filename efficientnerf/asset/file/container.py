@@ -1,6 +1,6 @@
 """The container of an asset: a safetensors file with one metadata entry, opened without trusting it.
 
-Everything that a file states is checked against the file's size before memory for it is allocated, and nothing in it is run.
+Every claim of a file is checked against the file's size before memory for it is allocated, and nothing in it is run.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _digest(values: np.ndarray) -> str:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, on the disk when this returns. What lies at `path` is replaced, links at it or beside it are not followed."""
+    """Write a file whole or not at all, on the disk when this returns. A file at `path` is replaced; links there or next to it are not followed."""
     aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.part")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
     descriptor = os.open(aside, flags, 0o666)  # less the umask

@@ -32,7 +32,7 @@ class Layout:
     """The tensors of one layout, and how they are read.
 
     minor    the format 1.x that brought it
-    tensors  names beside `coarse.occupancy` (which entropy-coded layouts do not have), and the types that each may have
+    tensors  names besides `coarse.occupancy` (which entropy-coded layouts do not have), and the types that each may have
     expected shapes that the tensors must have, from the metadata and the shapes they do have
     stored   which voxels of each brick are stored, (B, b^3) bool
     values   density (N,) float32 and harmonics of the stored voxels; anything wrong in them is a FormatError

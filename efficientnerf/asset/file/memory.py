@@ -1,6 +1,6 @@
 """Memory that an asset takes, from its header: the rule of FORMAT.md, section 10, which keeps it in proportion to the file's size.
 
-A bit of a file may stand for four bytes of an index, and a stranger's file may have little else; of an entropy-coded one for whatever its metadata claim.
+A bit of a file may stand for four bytes of an index, and an untrusted file may hold little else; in an entropy-coded one for whatever its metadata claim.
 """
 
 from __future__ import annotations

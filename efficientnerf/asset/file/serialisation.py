@@ -50,7 +50,7 @@ def written_as(tree: NerfTree, writer: str | None) -> Written:
 
 
 def bytes_per_voxel(writer: str, degree: int) -> int:
-    """Of a stored voxel, without the masks of the bricks; in `packed` what codes are chosen for (docs/experiments/packed.md)."""
+    """Bytes of a stored voxel, without the masks of the bricks; in `packed` the target of the codes (docs/experiments/packed.md)."""
     harmonics = harmonics_count(degree)
     return {"compact": 4 + (harmonics - 1), "packed": PACKED_BYTES, "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
 
@@ -58,7 +58,7 @@ def bytes_per_voxel(writer: str, degree: int) -> int:
 def most_voxels(
     size: int, writer: str, degree: int, shape: tuple[int, int, int], brick: int, *, outer: Sequence[tuple[int, int, int]] = (), environment: int = 0
 ) -> int:
-    """How many voxels, of all cascades together, a file of `size` bytes has room for, if a quarter of the voxels of its bricks are stored (usually more are).
+    """How many voxels, of all cascades together, fit a file of `size` bytes, if a quarter of the voxels of its bricks are stored (usually more are).
 
     shape        coarse cells of the grid; `outer` those of the cascades around it
     environment  rows of the environment map, 0 without one
@@ -148,7 +148,7 @@ def _checked(tree: NerfTree) -> NerfTree:
 
 
 def _full(tree: NerfTree, dtype: str = "<f2") -> Written:
-    """All voxels of each brick. What was not stored gets density 0, and harmonics that fade over from the stored ones of its brick, the nearer
+    """All voxels of each brick. Voxels that were not stored get density 0, and a mean of the stored harmonics of their brick, the nearer
     the more: colours are interpolated over stored voxels alone, so that grey ones would show at the rim."""
     index, voxels, harmonics = _bricks(tree), tree.brick**3, tree.harmonics_count
     _checked(tree)

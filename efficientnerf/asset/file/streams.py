@@ -5,7 +5,7 @@
     the slices                     how many words each has
     rANS                           words of 16 bits, slice by slice; a slice's begin with the upper and lower half of each lane's state
 
-Numbers are LEB128, but for T and tables, which are bytes.
+Numbers are LEB128; T and tables are bytes.
 
 M symbols, n contexts, T tables, S slices, L lanes.
 """

@@ -1,4 +1,4 @@
-"""What a file of a whole scene has beside one grid: nested grids, the environment map, the foreground region. FORMAT.md, sections 11 to 13.
+"""What a file of an unbounded scene has besides one grid: nested grids, the environment map, the foreground region. FORMAT.md, sections 11 to 13.
 
 B bricks, H rows of the environment map.
 """

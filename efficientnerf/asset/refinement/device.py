@@ -77,7 +77,7 @@ class DeviceArrays:
 
 
 def voxels_beside(tree: NerfTree) -> np.ndarray:
-    """(N, 6) int32: the voxels beyond the faces -x, x, -y, y, -z, z of each, -1 where none is stored. Those of different cascades are not beside each other."""
+    """(N, 6) int32: the voxels beyond the faces -x, x, -y, y, -z, z of each, -1 where none is stored. Voxels of different cascades are not neighbours."""
     around, b = neighbours_of(cells_of(tree)).around, tree.brick
     index = tree.voxel_index.reshape(-1, b, b, b)
     found = np.full((len(tree.density_values), 6), -1, np.int32)

@@ -1,4 +1,4 @@
-"""Patches drawn by an error map: where the errors of earlier rays were large, more rays are drawn.
+"""Patches drawn by an error map: more rays where the errors of earlier rays were large.
 
 Müller et al. 2022 ("instant-ngp") draw training pixels so. T tiles (`efficientnerf.training.patches`), P patches, R rays.
 """
@@ -15,7 +15,7 @@ MAX_CELLS = 2**22
 PART = 2**20  # tiles that are counted at a time
 INTERVAL = 32  # steps after which the chances are set again
 MEMORY = 0.5  # of the running mean, kept by each new error
-MOST = 4.0  # times the mean that the root of a cell's error counts, at most: what nothing can learn should not take all rays
+MOST = 4.0  # times the mean that the root of a cell's error counts, at most: errors that cannot be fitted should not take all rays
 
 
 class Drawn(NamedTuple):
@@ -61,7 +61,7 @@ class ErrorMap:
     def __init__(self, patches: PatchGrid, met: np.ndarray | None = None, errors: np.ndarray | None = None, *, share: float = 0.9) -> None:
         """met: (T,) bool of the tiles that may be drawn, or None: all. ValueError where `errors` are those of another grid.
 
-        share  of the patches that are drawn by errors, the rest from all tiles alike; below 1, for else an error of nothing would be believed for ever
+        share  of the patches that are drawn by errors, the rest from all tiles alike; below 1, for else an error of 0 would stay for ever
         """
         self.patches, self.tiles, self.share = patches, tiles_of_cell(patches), share
         self.rows, self.columns = _cells(patches, self.tiles)
@@ -100,7 +100,7 @@ class ErrorMap:
         chance = self.share * chance + (1 - self.share) * np.average(chance, weights=self.met)
         cumulative = np.cumsum(chance * self.met, dtype=np.float64)
         self.cumulative = cumulative / cumulative[-1]
-        # Were all tiles alike, each would have one chance of its number.
+        # If all tiles were alike, each would have one chance of its number.
         self.factor = (cumulative[-1] / (chance * self.met.sum())).astype(np.float32)
 
     def draw(self, count: int, rng: np.random.Generator) -> Drawn:
@@ -131,7 +131,7 @@ class ErrorMap:
         self._set_chances()
 
     def record(self, drawn: Drawn, loss: np.ndarray) -> float:
-        """Take in the losses (R,) of the rays of patches; where several are in a cell the greatest counts. The mean that all tiles would have."""
+        """Take in the losses (R,) of the rays of patches; where several are in a cell the greatest counts. Returns an unbiased mean over all tiles."""
         patches = drawn.patches
         total = np.add.reduceat(loss, patches.first[:-1], dtype=np.float64)
         mean, cell = total / np.diff(patches.first), self._cell(patches.tile)

@@ -1,6 +1,6 @@
 """From a baked tree to one that looks like the training images: gradient descent on its values.
 
-The structure of the tree stays. Fitted are the optical thickness of each voxel (its logarithm, so that it stays positive) and its harmonics. The loss
+The structure of the tree stays. The optical thickness of each voxel (its logarithm, so that it stays positive) and its harmonics are fitted. The loss
 of a ray is that of `RayTargets`: in unbounded scenes the training images are compared through what the field shows before and behind the box; objects
 with alpha over all backgrounds at once.
 

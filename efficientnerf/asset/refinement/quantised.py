@@ -1,6 +1,6 @@
-"""Refinement of a tree of codes: its tables and palettes are fitted to the images, its codes stay. What is written is then what was measured.
+"""Refinement of a tree of codes: its tables and palettes are fitted to the images, its codes stay. The file then has the measured quality.
 
-In each round the voxels take steps of their own from where their codes put them; an entry moves by the mean of what its voxels moved, weighted by the size of
+In each round the voxels take steps of their own from where their codes put them; an entry moves by its voxels' mean motion, weighted by the size of
 their gradients, as if gradients were summed by entries (VQRF, Li et al. 2023, section 3.4). It moves as far as the error of a sample of pixels falls.
 
 N voxels, P entries of a palette.

@@ -1,4 +1,4 @@
-"""What steps of tree training minimise besides the losses of rays, and which harmonics they move."""
+"""Terms that steps of tree training minimise besides the losses of rays, and the harmonics that they move."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Rule:
     degree: Callable[[int], int] | None = None
 
     def terms(self, step: int, most: int) -> int:
-        """Coefficients of a channel that a step moves, of so many."""
+        """Coefficients of a channel that a step moves, at most `most`."""
         return most if self.degree is None else min(most, (self.degree(step) + 1) ** 2)
 
     def hyperparameters(self, step: int, most: int, *, density_lr: float, sh_lr: float, view_share: float) -> Hyperparameters:
-        """Of a step, of a tree of so many coefficients of a channel, at its own learning rates."""
+        """Those of a step, for a tree of so many coefficients of a channel, at its own learning rates."""
         return Hyperparameters(
             density_lr, sh_lr, view_share, DECAY, EPSILON, total_variation=self.total_variation, sparsity=self.sparsity, entropy=self.entropy,
             terms=self.terms(step, most),

@@ -50,12 +50,12 @@ class RefinementSchedule:
         return RefinementSchedule((*self.each[:phase], one, *self.each[phase + 1 :]))
 
     def state(self) -> list[dict[str, Any]]:
-        """What a run decided, as JSON holds it: with it the same steps are taken again."""
+        """Decisions of a run, for JSON: with them the same steps are taken again."""
         return [one.state() for one in self.each]
 
 
 def stated_schedule(steps: int) -> RefinementSchedule:
-    """That of so many steps in all."""
+    """That of `steps` in all."""
     first = int(PHASES[0].share * steps)
     return RefinementSchedule((Schedule(first), Schedule(steps - first)))
 

@@ -13,7 +13,7 @@ import numpy as np
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
 from efficientnerf.asset.tree import NerfTree
 
-MAX_INITIAL_THICKNESS = 2.0  # optical thickness of a voxel at the beginning: networks give hundreds, behind which nothing would have a gradient
+MAX_INITIAL_THICKNESS = 2.0  # optical thickness of a voxel at the beginning: networks give hundreds, which would block all gradients behind
 
 
 class DeviceState(Protocol):
@@ -72,7 +72,7 @@ STATE = ("density", "sh", *MOMENTS)
 
 
 def initial_state(tree: NerfTree, max_thickness: float = np.inf) -> RefinementState:
-    """The state before the first step, of a copy. Optical thickness is limited to `max_thickness`, so that what lies behind a floater has a gradient from
+    """The state before the first step, of a copy. Optical thickness is limited to `max_thickness`, so that voxels behind a floater have a gradient from
     the first step on."""
     most = (max_thickness / cascade_sides(tree)).astype(np.float32)
     density = np.minimum(tree.density_values, most[voxel_cascades(tree)] if tree.outer else most)

@@ -1,4 +1,4 @@
-"""What a tree is fitted to: training pixels, and the background that it is composited with.
+"""The targets of a fit: training pixels, and the background that a tree is composited with.
 
 R rays, H rows.
 """

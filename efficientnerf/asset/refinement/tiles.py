@@ -1,4 +1,4 @@
-"""Which tiles of the training images a tree is trained on: those whose rays may meet it. Of the others no value has a gradient. T tiles."""
+"""Which tiles of the training images a tree is trained on: those whose rays may meet it. The others give no gradient. T tiles."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ class HashLevels(NamedTuple):
     """Levels of a hash grid, and the places of their entries in the table.
 
     sides   (L,) int64 resolution
-    dense   (L,) bool: whether a level is stored whole
+    dense   (L,) bool: whether a level is dense, not hashed
     starts  (L,) int64 first entry
     mask    entries of a hashed level, less one: all bits set
     """

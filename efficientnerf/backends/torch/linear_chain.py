@@ -42,7 +42,7 @@ def has_bfloat16(device: str) -> bool:
 
 
 def precision_of(setting: str, device: str) -> torch.dtype:
-    """The type to compute in: "auto" is bfloat16 where the device has it."""
+    """The type to compute in: "auto" is bfloat16 where the device supports it."""
     if setting == "auto":
         return torch.bfloat16 if has_bfloat16(torch.device(device).type) else torch.float32
     return {"float32": torch.float32, "bfloat16": torch.bfloat16}[setting]

@@ -1,4 +1,4 @@
-"""Textures from the asset alone: what it shows where no photograph does, or where there are none."""
+"""Textures from the asset alone: its colours where no photograph shows any, or where there are none."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ TEXELS_PER_VOXEL = 1.5
 
 
 def silent(done: int, total: int, text: str) -> None:
-    """Progress that nobody is told."""
+    """Progress that is not reported."""
 
 
 def texture_of_asset(tree: NerfTree, mesh: Mesh, *, largest: int = 2048, progress: Callable[[int, int, str], None] = silent) -> Mesh:
-    """The mesh with a texture that shows the colours of the tree that it was made of, and what is known of it beside its facts.
+    """The mesh with a texture that shows the colours of the tree that it was made of, and facts on that.
 
     mesh     in the training frame, as `efficientnerf.surface.nested.scene_surface` gives it; turn and scale it afterwards (`surface.mesh.moved`)
     largest  texels along a side, at most: about one and a half for each voxel where that is enough

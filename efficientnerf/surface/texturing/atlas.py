@@ -82,7 +82,7 @@ def atlas_of(vertices: np.ndarray, faces: np.ndarray, scale: float, largest: int
     wanted = scale * np.sqrt(area / FILLED) if np.isfinite(scale) and scale > 0 else largest
     size = int(np.clip(2 ** np.ceil(np.log2(max(wanted, 1.0))), min(SMALLEST, largest), largest))
     while True:
-        fitting = min(size * np.sqrt(FILLED / max(area, 1e-300)), 2 * size / max(extent, 1e-300))  # what is long and narrow has little area
+        fitting = min(size * np.sqrt(FILLED / max(area, 1e-300)), 2 * size / max(extent, 1e-300))  # long and narrow charts have little area
         charts = charts_of(vertices, faces, 1 / fitting)
         at, placed = fitting / STEP**3, None
         while placed is None:
@@ -90,7 +90,7 @@ def atlas_of(vertices: np.ndarray, faces: np.ndarray, scale: float, largest: int
             placed = _packed(charts, at, size)
         if at >= ENOUGH * min(scale, fitting) or 2 * size > largest:
             return Atlas(placed, charts.chart, size, at)
-        size *= 2  # gaps take more room than charts
+        size *= 2  # gaps take more space than charts
 
 
 def gap_of(size: int) -> int:
@@ -139,12 +139,12 @@ def _texels(atlas: Atlas) -> Texels:
     a, b = x[:, 1] * y[:, 2] - x[:, 2] * y[:, 1], x[:, 2] * y[:, 0] - x[:, 0] * y[:, 2]
     c = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
     share, total = np.stack([a, b, c], 1), (a + b + c)[:, None]
-    share = np.clip(np.divide(share, total, out=np.full_like(share, 1 / 3), where=total != 0), 0, 1)  # a texel that was given may lie beside its face
+    share = np.clip(np.divide(share, total, out=np.full_like(share, 1 / 3), where=total != 0), 0, 1)  # a texel that was given may lie outside of its face
     return Texels(place, begin, np.asarray(share / share.sum(1, keepdims=True), np.float32))
 
 
 def _give_each_a_texel(corners: np.ndarray, owner: np.ndarray) -> None:
-    """Faces in which no texel's centre lies have that round their middle, where no other one does: else a small chart had the colours of those beside it."""
+    """Faces without a texel's centre get the texel round their middle, if no other face has it: else a small chart had the colours of those next to it."""
     size = len(owner)
     without = np.ones(len(corners), bool)
     without[owner[owner >= 0]] = False

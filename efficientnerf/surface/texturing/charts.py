@@ -18,9 +18,9 @@ from efficientnerf.surface.mesh import face_neighbours, face_vectors
 SMOOTHING = 4  # rounds over neighbouring faces, of the normals that charts are grown by
 LIMIT = float(np.cos(np.radians(50)))  # of a smoothed normal to a chart's axis
 LEAST = float(np.cos(np.radians(80)))  # of a face's own normal: there a texel is stretched nearly sixfold
-ROUNDS = 6  # of taking out what lies over its own chart
+ROUNDS = 6  # of taking out faces that lie over their own chart
 TURNS = 12  # rotations tried
-SMALL = 40  # faces under which a chart joins one beside it, where it fits
+SMALL = 40  # faces under which a chart joins one next to it, where it fits
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ def _misplaced(charts: Charts, normals: np.ndarray, vectors: np.ndarray, grid: f
 
 
 def _joined(chart: np.ndarray, beside: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Small charts as part of that beside them that they have the most edges in common with, where all their normals fit its axis."""
+    """Small charts as part of the neighbour that they have the most edges in common with, where all their normals fit its axis."""
     for _ in range(3):
         count = int(chart.max(initial=-1)) + 1
         sizes = np.bincount(chart, minlength=count)
@@ -142,7 +142,7 @@ def _joined(chart: np.ndarray, beside: np.ndarray, normals: np.ndarray, areas: n
             break
         pairs, edges = np.unique(own * count + other, return_counts=True)
         own, other = pairs // count, pairs % count
-        # How well the least fitting face of a chart fits the axis of each chart beside it.
+        # How well the least fitting face of a chart fits the axis of each chart next to it.
         members = np.argsort(chart, kind="stable")
         begin = np.searchsorted(chart[members], np.arange(count + 1))
         rows = np.concatenate([np.arange(begin[a], begin[a + 1]) for a in own]) if len(own) else np.zeros(0, np.int64)

@@ -15,9 +15,9 @@ from efficientnerf.surface.mesh import Mesh
 from efficientnerf.surface.texturing.atlas import Atlas
 
 RINGS = 6  # of vertices, over which the colours that photographs show are carried on to where none shows anything. docs/experiments/textures.md
-NEAREST = 8  # vertices, of which what is further away has the mean, by the square of the distance
+NEAREST = 8  # vertices whose mean, by the squared distance, those further away get
 SEEN = 0.5  # texels' worth of photographs, from which the colour of a vertex is known
-EMPTY = 128  # what a texture holds that has no texel at all
+EMPTY = 128  # value of a texture without texels
 
 
 def texture_from(atlas: Atlas, colours: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ def texture_from(atlas: Atlas, colours: np.ndarray) -> np.ndarray:
 def carried_on(
     mesh: Mesh, atlas: Atlas, colours: np.ndarray, known: np.ndarray, expected: np.ndarray, tick: Callable[[], None] = lambda: None
 ) -> np.ndarray:
-    """(V, 3) float32 colours of a mesh's vertices, 0-1: what photographs show round each; where they show nothing, the mean of the vertices beside it that are
+    """(V, 3) float32 colours of a mesh's vertices, 0-1: what photographs show round each; where they show nothing, the mean of the vertices next to it that are
     known, ring by ring; further away that of the nearest in space, as on the back of a wall. An asset has no colours of its own where no photograph looks:
     those of `mesh` stay where photographs show none of it at all.
 

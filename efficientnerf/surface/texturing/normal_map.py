@@ -1,7 +1,7 @@
-"""Normal maps: what a dense mesh has of relief, on the texture of the mesh that was made of it with fewer faces.
+"""Normal maps: the relief of a dense mesh, on the texture of the mesh that was decimated from it.
 
 Each texel looks along the normal of its mesh, to either side, for the dense mesh; the normal there stands in the map, in the tangent frame of
-`efficientnerf.surface.texturing.tangents`: x where u grows, y where v grows (up, as glTF, OpenGL and USD have it), z outward.
+`efficientnerf.surface.texturing.tangents`: x where u grows, y where v grows (up, as in glTF, OpenGL and USD), z outward.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class Dense:
 
 
 def with_normal_map(mesh: Mesh, dense: Dense, tick: Callable[[], None] = lambda: None) -> Mesh:
-    """A mesh with a texture, its normal map baked from a dense mesh of the same surface; what is known of it beside its facts. `tick` is called often; what it
-    raises stops the work."""
+    """A mesh with a texture, its normal map baked from a dense mesh of the same surface, and facts on that. `tick` is called often; an exception
+    from it stops the work."""
     assert mesh.texture is not None
     size = len(mesh.texture.colours)
     places = mesh.texture.coordinates
@@ -113,7 +113,7 @@ class _Grid:
         edge = float(np.linalg.norm(vertices[faces[:, 1]] - vertices[faces[:, 0]], axis=1).mean())
         low, extent = vertices.min(0), np.ptp(vertices, 0)
         cell = max(CELL * edge, float(extent.max()) / MOST_CELLS)
-        low, shape = low - 0.5 * cell, np.floor(extent / cell).astype(np.int64) + 2  # what lies on its border is inside
+        low, shape = low - 0.5 * cell, np.floor(extent / cell).astype(np.int64) + 2  # points on its border are inside
         first = np.zeros(int(shape.prod()) + 2, np.int64)
         for part in pieces(len(faces), first=4096):
             tick()

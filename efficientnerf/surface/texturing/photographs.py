@@ -1,7 +1,7 @@
-"""Colours of texels from photographs: each texel keeps what the photographs that show it best show, and is given what most of these agree on.
+"""Colours of texels from photographs: each texel keeps its colours in the photographs that show it best, and gets the one that most of these agree on.
 
-A photograph shows a texel where the mesh's depth says so, away from depth edges, from what masks leave out and from the photograph's borders: the mesh is
-never exact, and what lies behind an edge must not rub off on it. Its grade there is the area of its pixels that a texel covers (so that oblique, distant
+A photograph shows a texel where the mesh's depth says so, away from depth edges, masked pixels and the photograph's borders: the mesh is
+never exact, and colours behind an edge must not bleed onto it. Its grade there is the area of its pixels that a texel covers (so that oblique, distant
 and coarse photographs count less), times the cosine to the normal, its sharpness and its distance from these edges. docs/experiments/textures.md
 """
 
@@ -42,7 +42,7 @@ MOST_GAIN = 0.7
 
 
 def _untold() -> None:
-    """Work that nobody stops."""
+    """Work that is not stopped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Photograph:
 
 
 def photograph(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) -> Photograph:
-    """A photograph as files have it: uint8 (H, W, 3), or (H, W, 4) with straight alpha; mask (H, W) bool, True: use."""
+    """A photograph as in files: uint8 (H, W, 3), or (H, W, 4) with straight alpha; mask (H, W) bool, True: use."""
     usable = np.ones(image.shape[:2], bool) if mask is None else np.array(mask, bool)
     if image.shape[2] == 4:
         usable[image[..., 3] < FAINT] = False
@@ -73,10 +73,10 @@ def halved(photo: Photograph) -> Photograph:
 
 @dataclass(frozen=True)
 class Survey:
-    """What a photograph is like on the mesh, before any texel sees it.
+    """Statistics of a photograph on the mesh, before any texel sees it.
 
     density    (F,) float32 pixels on the side of the square that a face is half of, where one of its vertices shows; zero elsewhere
-    sharpness  of what shows the mesh: how much of its detail is fine
+    sharpness  of its pixels of the mesh: how much of their detail is fine
     gains      (3,) factors that bring its colours to those of the vertices
     """
 
@@ -86,7 +86,7 @@ class Survey:
 
 
 def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours: np.ndarray, photo: Photograph, tick: Callable[[], None] = _untold) -> Survey:
-    """What a photograph is like on a mesh with normals (V, 3) and colours (V, 3) sRGB 0-1. `tick` is called often; what it raises stops the work."""
+    """Statistics of a photograph on a mesh with normals (V, 3) and colours (V, 3) sRGB 0-1. `tick` is called often; an exception from it stops the work."""
     seen = _seen(vertices, faces, normals, photo, tick)
     p = seen.pixels[faces]
     edge, other = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -130,7 +130,7 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _gains(values: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(3,) factors from values (N, 3) to what is expected (N, 3): medians of ratios, without what is nearly black or white; ones where all are small."""
+    """(3,) factors from values (N, 3) to those expected (N, 3): medians of ratios, without nearly black or white ones; ones where all are small."""
     good = ((values > 0.08) & (values < 0.92) & (expected > 0.08) & (expected < 0.92)).all(1)
     if good.sum() < MIN_SAMPLES:
         return np.ones(3)
@@ -184,7 +184,7 @@ def _seen(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: P
 
 
 def edge_distance(usable: np.ndarray, near: np.ndarray, tick: Callable[[], None] = _untold) -> np.ndarray:
-    """(H, W) float32 pixels from what may not be used (H, W) bool, and from jumps in the inverse depth (H, W) float32; 4 REACH at most."""
+    """(H, W) float32 pixels from unusable ones (H, W) bool, and from jumps in the inverse depth (H, W) float32; 4 REACH at most."""
     clear = np.where(usable, np.float32(4 * REACH), np.float32(0))
     rows = len(clear)
     for part in pieces(rows, first=64):

@@ -1,4 +1,4 @@
-"""Tangents of a mesh with texture coordinates, as MikkTSpace has them: the frame in which a normal map says how light meets the surface.
+"""Tangents of a mesh with texture coordinates, as in MikkTSpace: the frame in which a normal map says how light meets the surface.
 
 A face's tangent points where u grows. That of a vertex is the mean over the faces that share it and its texture coordinate, each turned into the plane of the
 vertex's normal, weighted by the angle of the face there. The bitangent is sign * (normal x tangent) and points where v grows (up). Between vertices normal and
@@ -38,7 +38,7 @@ def tangents(vertices: np.ndarray, normals: np.ndarray, coordinates: np.ndarray,
 
 
 def _in_plane(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Unit vectors (N, 3), without what is along unit normals; zero where nothing is left."""
+    """Unit vectors (N, 3), without their part along unit normals; zero where nothing is left."""
     rest = vectors - (vectors * normals).sum(1, keepdims=True) * normals
     length = np.linalg.norm(rest, axis=1, keepdims=True)
     kept = length > 1e-9 * np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -1,5 +1,5 @@
-"""By how much photographs differ in exposure, from what they show of the same points: log light of an observation = of the point + of the photograph +
-vignetting of its camera, by robust least squares. A far better witness than how bright photographs are, which depends on what is in them.
+"""How photographs differ in exposure, from observations of the same points: log light of an observation = of the point + of the photograph +
+vignetting of its camera, by robust least squares. Much better evidence than the brightness of photographs, which depends on what is in them.
 
 O observations, P points, C photographs, K cameras.
 """
@@ -57,7 +57,7 @@ def fit_exposure(light: np.ndarray, point: np.ndarray, view: np.ndarray, radius:
         known = np.concatenate([brightness[:, None], light], axis=1)  # (O, 4)
         right = weighted.T @ known - cross.T @ ((points.T @ (weight[:, None] * known)) / total[:, None])
         solved[:, 0] = np.linalg.solve(normal, right[:, 0])
-        # Vignetting is that of brightness; each channel's gains are found beside it.
+        # Vignetting is that of brightness; each channel's gains are found with it.
         own = right[:, 1:] - normal[:, count:] @ np.repeat(solved[count:, :1], 3, axis=1)
         solved[:count, 1:] = np.linalg.solve(normal[:count, :count], own[:count])
         unexplained = _within(light - solved[view, 1:] - (basis * solved[count:, 0].reshape(-1, 2)[of]).sum(axis=1)[:, None], points, weight, total)

@@ -1,4 +1,4 @@
-"""Exposure, white balance, vignetting and response of photographs: learned beside the field and left out of it.
+"""Exposure, white balance, vignetting and response of photographs: learned together with the field and left out of it.
 
     light      l   = f^-1(c)                     c: sRGB colour of the scene, f: response of the cameras on average
     exposed    l_v = l exp(g_v + d_k(r))         photograph v of camera k, at distance r from the middle of the image
@@ -8,10 +8,10 @@
     d_k    a (r^2 - 1/3) + b (r^4 - 1/9), vignetting; r = 1 in the corners. The mean of r^2 over an image is 1/3: images stay as bright as they are
     f_k    a shoulder, an offset, then sRGB's curve
 
-A camera's response bends how much a change of exposure does to light and dark colours; where nothing differs from the average it has no effect, whatever it is.
+A camera's response sets how a change of exposure affects light and dark colours; without a difference from the average it has no effect.
 The four parts are those of Deutsch et al. 2026, "PPISP"; theirs have a homography of chromaticities and curves of each channel. docs/experiments/exposure.md
 
-What is made of the field with the photographs' help is the scene as it was exposed on average, too: `averaged` undoes `exposed`.
+Later stages that use photographs show the scene as exposed on average, too: `averaged` undoes `exposed`.
 
 R rays, C photographs, K cameras.
 """
@@ -42,7 +42,7 @@ VIGNETTING, SHOULDER, OFFSET = slice(0, 2), 2, 3  # of a camera's numbers
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """What is learned; zero is no difference.
+    """Learned parameters; zero is no difference.
 
     photographs  (C, 3) logarithms of gains over SCALE, before their mean is taken off
     cameras      (K, 4) a, b and shoulder over SCALE, offset over OFFSET_SCALE
@@ -55,7 +55,7 @@ class Exposure:
 
     @property
     def parameters(self) -> dict[str, nn.Parameter]:
-        """What is learned, by name."""
+        """The parameters, by name."""
         assert isinstance(self.photographs, nn.Parameter)
         assert isinstance(self.cameras, nn.Parameter)
         return {"exposure.photographs": self.photographs, "exposure.cameras": self.cameras}
@@ -78,7 +78,7 @@ def is_learned(fraction: float) -> bool:
 def exposure_of(
     cameras: Sequence[Camera], gains: np.ndarray | None = None, vignetting: np.ndarray | None = None, device: torch.device | str = "cpu"
 ) -> Exposure:
-    """What is learned at its beginning.
+    """The parameters before training.
 
     cameras     of the photographs
     gains       (C, 3) g and vignetting (K, 2) a and b to begin with; None: zero
@@ -129,7 +129,7 @@ def averaged(colour: Tensor, view: Tensor, radius: Tensor, e: Exposure) -> Tenso
 
 def averaged_image(image: np.ndarray, mask: np.ndarray | None, number: int, e: Exposure) -> tuple[np.ndarray, np.ndarray | None]:
     """Photograph `number` as if all had been exposed alike: (H, W, 3 or 4) uint8, alpha as it was, and the mask (H, W) bool of what is to be used of it:
-    clipped pixels of what was exposed more say nothing of how bright the scene is."""
+    clipped pixels of a photograph exposed more do not show how bright the scene is."""
     height, width = image.shape[:2]
     at = _places_of_image(number, width, height)
     colour = torch.from_numpy(image[..., :3].reshape(-1, 3).astype(np.float32) / np.float32(255))

@@ -1,14 +1,14 @@
 """Training photographs whose cameras are wrong, found by the field: left out, tried with other poses, and taken back where evidence says otherwise.
 
 At a few steps of the schedule all training photographs are compared with what the field shows (`residuals`). One that is explained far worse than its
-neighbours is a suspect; it is left out only where a second witness agrees:
+neighbours is a suspect; it is left out only with further evidence:
 
     another place   a pose that is clearly elsewhere explains the photograph much better (`pose_search`)
     sparse points   those it observes lie outside its picture, or have other colours there
-    no likeness     nothing of it is explained, as one picture nor inside tiles, and it has no sparse points that speak for it
+    no likeness     nothing of it is explained, as one picture nor inside tiles, and no sparse points confirm it
 
-A photograph that observes as many sparse points as its neighbours, in the right colours, is no suspect. What is left out is held out: at the next check the
-field, which has not seen it since, decides whether its camera was right after all, or the one that was found for it is; only then it is trained on again.
+A photograph that observes as many sparse points as its neighbours, in the right colours, is no suspect. A view that is left out is held out: at the next check
+the field, which has not seen it since, decides whether its own camera or the one that was found is right; only then it is trained on again.
 C views of training.
 """
 
@@ -68,7 +68,7 @@ class Observations:
 
 @dataclass
 class ViewChecks:
-    """What is known of the training views so far.
+    """The state of the training views.
 
     given     the cameras as they came
     done      (1,) checks
@@ -76,7 +76,7 @@ class ViewChecks:
     replaced  (C,) bool: `pose` is the camera's, and trained on unless left out
     pose      (C, 4, 4) the pose that was found for a view, world from camera; else the given one
     evidence  (C, 6) of each view that was ever left out: step, error inside tiles, that of its neighbours, that with the pose that was found, by how many
-              cells this moves the picture (infinite where both see nothing of each other's), witnesses as bits (1 another place, 2 points, 4 no likeness)
+              cells this moves the picture (infinite without overlap), evidence as bits (1 another place, 2 points, 4 no likeness)
     """
 
     given: tuple[Camera, ...]
@@ -134,7 +134,7 @@ def check(c: ViewChecks, m: Model, pixels: Pixels, observed: Observations | None
 
 
 def follow_checks(c: ViewChecks, pixels: Pixels, corrections: CameraCorrections | None) -> None:
-    """Draw no pixels of views that are left out, and give those whose cameras were replaced the rays of these; what refinement learned of others goes."""
+    """Draw no pixels of views that are left out, and give views with replaced cameras these rays; their corrections by the refinement are reset."""
     pixels.leave_out(c.left_out)
     if corrections is not None:
         for n, (before, now) in enumerate(zip(corrections.given, c.cameras, strict=True)):
@@ -207,7 +207,7 @@ def _judge_again(c: ViewChecks, now: _Look, view: int, pixels: Pixels) -> None:
 
 
 def _leave_out(c: ViewChecks, now: _Look, pixels: Pixels, observed: Observations | None, number: int) -> None:
-    """Leave out the suspects against which a second witness speaks, the worst first, as many as may be."""
+    """Leave out the suspects with further evidence against them, the worst first, as many as may be."""
     room = min(int(MOST * len(c.given)), len(c.given) - MIN_VIEWS) - int(c.left_out.sum())
     for_view, against = point_evidence(now.search.cameras, now.cells, observed, now.trusted)
     suspects = now.trusted & now.suspects & ~for_view
@@ -241,7 +241,7 @@ def picture_moved(s: Search, before: Camera, after: Camera, side: int) -> float:
 
 
 def point_evidence(cameras: Sequence[Camera], cells: Cells, observed: Observations | None, trusted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(C,) bool and (C,) bool: whether the sparse points that a view observes speak for its camera, and whether they speak against it."""
+    """(C,) bool and (C,) bool: whether the sparse points that a view observes confirm its camera, and whether they contradict it."""
     count = len(cameras)
     nothing = np.zeros(count, bool)
     if observed is None:

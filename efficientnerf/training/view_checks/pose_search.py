@@ -1,7 +1,7 @@
-"""Where a photograph was taken from, by what the field shows: for cameras that are far off. C views, N cells of a photograph.
+"""The pose of a photograph whose camera is far off, found by renders of the field. C views, N cells of a photograph.
 
-Starts are the camera as it stands, its own place with the directions of its neighbours, and the cameras whose renders look most like it. Of each the shift
-of the picture is found by correlation and taken as a rotation. The best ones are aligned as in `efficientnerf.training.camera_refinement`, without its prior,
+Starts are the camera as it stands, its own place with the directions of its neighbours, and the cameras whose renders look most like it. The
+shift of each start is found by correlation and taken as a rotation. The best are aligned as in `efficientnerf.training.camera_refinement`, without its prior,
 in ever smaller cells.
 """
 
@@ -30,7 +30,7 @@ OVERLAP = 0.4  # of the cells have to meet where a picture is shifted
 
 @dataclass(frozen=True)
 class Search:
-    """What poses are found with.
+    """Inputs of the pose search.
 
     cameras    (C) of all photographs
     renders    of each the field in its cells (H, W, 3)
@@ -46,7 +46,7 @@ class Search:
     grey: bool
 
     def render(self, cameras: Sequence[Camera], side: int) -> list[np.ndarray]:
-        """What cameras see in their cells."""
+        """Renders from cameras in their cells."""
         count = len(cameras)
         return rendered(self.model, cameras, np.full(count, self.near), np.full(count, self.far), [side] * count, self.grey)
 

@@ -1,7 +1,7 @@
 """How badly the field explains each training photograph, whatever its exposure, sharpness and contrast, and how far that stands out from its neighbours.
 
-Photographs and renders are compared in cells that average many pixels, so that blur and fine texture hardly matter, by what is left of a photograph's
-variance once the render's colours are fitted to it channel by channel, so that exposure and white balance do not matter. C views, H x W cells of a view.
+Photographs and renders are compared in cells that average many pixels, so that blur and fine texture hardly matter. The error is what is left of a
+photograph's variance once the render's colours are fitted to it by channel: exposure and white balance do not matter. C views, H x W cells of a view.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _averaged_in_bands(pixels: Pixels, view: int, background: np.ndarray, side: 
 
 @torch.no_grad()
 def shown(m: Model, bundle: np.ndarray, grey: bool) -> tuple[np.ndarray, np.ndarray]:
-    """What the field shows along rays (R, 8), origin, unit direction, near and far: colours (R, 3) and distances (R,) of the surface, float64.
+    """Renders of the field along rays (R, 8), origin, unit direction, near and far: colours (R, 3) and distances (R,) of the surface, float64.
 
     grey  whether that lies behind the scene; else what the model has there
     """
@@ -121,7 +121,7 @@ def rendered(m: Model, cameras: Sequence[Camera], near: np.ndarray, far: np.ndar
 
 
 def _unexplained(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Of cells (N, 3) with weights (N,): the mean square of what is left once gain >= 0 and offset of each channel are fitted, and the variance."""
+    """The mean square left of cells (N, 3) with weights (N,) after a fit of gain >= 0 and offset of each channel, and the variance."""
     total = weight.sum()
     if total <= 0:
         return 0.0, 0.0
@@ -133,12 +133,12 @@ def _unexplained(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray)
 
 
 def global_error(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Of a view (H, W, 3): mean square left, and variance."""
+    """Mean square left of a view (H, W, 3), and variance."""
     return _unexplained(photograph.reshape(-1, 3), render.reshape(-1, 3), weight.reshape(-1))
 
 
 def local_error(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray, tile: int = TILE) -> float:
-    """Share of the variance inside tiles that is left, the median over tiles by their variance: what covers a part of the view does not change it."""
+    """Share of the variance inside tiles that is left, the median over tiles by their variance: an occluder in a part of the view does not change it."""
     shares, worth = [], []
     for y in range(0, photograph.shape[0], tile):
         for x in range(0, photograph.shape[1], tile):
