@@ -16,8 +16,8 @@ from efficientnerf.backends.kernel_cache import cache_folder, first_private
 
 @functools.cache
 def matplotlib() -> Any:
-    """The package. Where nothing has imported it before, its list of fonts lies in `matplotlib` of our cache folder, and what it finds in a `matplotlibrc`, for
-    which it looks in the working folder first, does not count."""
+    """The package. On first import its list of fonts goes into `matplotlib` of our cache folder, and a `matplotlibrc`, as of the working folder, is
+    ignored."""
     first = "matplotlib" not in sys.modules
     if first:
         os.environ["MPLCONFIGDIR"] = _folder()

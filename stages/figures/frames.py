@@ -56,9 +56,9 @@ def render_frames(
     """Write frame_0000.png and so on (and .exr) to a folder; returns the files in order.
 
     progress  called with (frames done, frames) before each and at the end; may raise to stop
-    reuse     keep frames that are whole by the note beside them: only for a scratch folder of this very request
+    reuse     keep frames that are complete by their note: only for a scratch folder of this very request
     draw      `efficientnerf.asset.rendering.render`, unless another is given
-    warn      is told of frames that can't be kept
+    warn      reports frames that can't be kept
     """
     background, similarity = frame_background(options.background), similarity_of(tree)
     surrounded = options.background == "auto" and tree.environment is not None

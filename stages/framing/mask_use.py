@@ -36,7 +36,7 @@ WRONG_CAMERAS = "; the cameras that were found from the photographs may be wrong
 
 @dataclass(frozen=True)
 class MaskUse:
-    """What masks and alpha channels of a capture mean, and why.
+    """The meaning of a capture's masks and alpha channels, and why.
 
     silhouettes  which of them are silhouettes
     reasons      "alpha" and "masks" -> why, of those that there are
@@ -189,7 +189,7 @@ def alike(pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[str, lis
 
 
 def _of_photographs(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[bool, str, list[str]]:
-    """Whether these are silhouettes, why, and the names of those that do not fit to the others."""
+    """Whether these are silhouettes, why, and the names of those that do not fit the others."""
     why_not, good = alike(pictures)
     if why_not:
         return False, why_not, []

@@ -1,9 +1,9 @@
 """Near and far planes of photographs in the training frame.
 
-Rays of unbounded scenes begin at half the depth of the nearest content, since floaters form where they begin earlier. What a photograph observes is no
-witness of where its content begins: on a plain subject it may have no sparse point but those of the room behind. Points that others observe are one: where
-three photographs agree on a point that a fourth has in its picture, that one shows it or something nearer. The neighbours of a camera, and what all cameras
-look at, are two more. The nearest of the three counts. See docs/priors.md.
+Rays of unbounded scenes begin at half the depth of the nearest content, since floaters form where they begin earlier. A photograph's own points do not
+bound its content: on a plain subject its only sparse points may be those of the room behind. Points of others do: where three photographs agree on a point
+that a fourth has in its picture, the fourth shows it or something nearer. The neighbours of a camera, and what all cameras look at, are two more bounds.
+The nearest of the three counts. See docs/priors.md.
 
 C photos, P points.
 """
@@ -76,8 +76,8 @@ def content_depths(capture: Capture, placed: Sequence[Camera], world: Similarity
 
 
 def reliable_points(points: SparsePoints, views: int) -> np.ndarray:
-    """(P,) bool: the sparse points that enough photographs observe, exactly enough, to be evidence that space is filled. Where nobody knows who observes them,
-    as of depth sensors, all are.
+    """(P,) bool: the sparse points that enough photographs observe, exactly enough, to be evidence that space is filled. All are where observers are
+    unknown, as of depth sensors.
 
     views  number of photographs
     """

@@ -1,4 +1,4 @@
-"""What of an asset is shown or exported: its foreground or all of it, or what lies in a box of the capture's frame."""
+"""The part of an asset to show or export: its foreground, all of it, or a box of the capture's frame."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """View coverage: how many training views have a point in view.
 
-What one photograph alone shows is explained by density at any distance along its rays. In unbounded scenes, the density voxels that fewer than
-`train.min_views` views have in view are masked in the box; and beside it where they would stand before it for a camera that just misses them, and behind it
-for those that show them. What these views show is learned farther away instead. Occlusion is not considered. See docs/experiments/min-views.md.
+Density at any distance along its rays explains what one photograph alone shows. In unbounded scenes, the density voxels that fewer than
+`train.min_views` views have in view are masked in the box; and outside it where they would stand before it for a camera that just misses them, and behind it
+for those that show them. Their content is learned farther away instead. Occlusion is not considered. See docs/experiments/min-views.md.
 
 A view counts only where its mask keeps the pixel: pixels that are left out tell nothing of what lies behind them. In scenes with masks, in every space, the
 density voxels are masked, too, that no view shows by a pixel that is kept, so that nothing fills them.
@@ -33,7 +33,7 @@ Masks = Sequence[np.ndarray | None]  # (h, w) bool of each view at any size, Tru
 
 MASK_SIZE = 256  # px, longest side of the masks that are looked at
 BLOCK = 8  # density voxels along a side of the blocks that no view shows
-COARSE = 32  # px, longest side of the masks by which such blocks are told: a pixel and its neighbours are wider than the points of a block are apart
+COARSE = 32  # px, longest side of the masks that find such blocks: a pixel and its neighbours are wider than the points of a block are apart
 CLEARANCE = 0.8  # of the near plane's distance: how far from the cameras' path nothing is. docs/experiments/near-cameras.md
 NEIGHBOURS = 8  # of a camera that its path leads to, where they are within twice the near plane's distance
 BEFORE_VIEWS = 2  # that must have a voxel before their near planes, or a quarter of the cameras (rounded up) if that is less
@@ -42,8 +42,8 @@ NEAR_BLOCK = 2  # density voxels along a side of the blocks before the near plan
 MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is required
 NEAREST = 0.1  # share of the cameras that may be nearer to the box's centre than what counts as standing before it
 BEFORE, BEHIND = 0.75, 1.1  # of the depth of the box's centre: what is nearer to a camera stands before the box, what is farther away behind it
-WIDENED = 1.5  # times a picture's sides: what misses the picture by no more is what cameras beside this one see
-FEW_BLOCK = 2  # density voxels along a side of the blocks beside the box that few views show
+WIDENED = 1.5  # times a picture's sides: neighbouring cameras see what misses the picture by no more
+FEW_BLOCK = 2  # density voxels along a side of the blocks outside the box that few views show
 
 
 def kept_pixels(folder: Path, views: Sequence[View]) -> Masks | None:
@@ -53,8 +53,8 @@ def kept_pixels(folder: Path, views: Sequence[View]) -> Masks | None:
 
 
 def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: int, side: int, masks: Masks | None = None) -> np.ndarray:
-    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those that are `poorly_seen`. Beside the box the middles of blocks of FEW_BLOCK
-    voxels a side decide: what is there is larger, for it is contracted."""
+    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those that are `poorly_seen`. Outside the box the middles of blocks of FEW_BLOCK
+    voxels a side decide: contracted voxels are larger."""
     count = -(-side // FEW_BLOCK)
     lattice = np.minimum((np.arange(count) + 0.5) * (FEW_BLOCK / side), 1.0)
     grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -71,10 +71,9 @@ def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: in
 
 
 def poorly_seen(points: np.ndarray, bounds: np.ndarray, cameras: Sequence[Camera], min_views: int, masks: Masks | None = None) -> np.ndarray:
-    """(N,) bool: at which points (N, 3) of the world density would be a guess that cameras between the given ones may see: those that `has_min_views` is
-    false for, in the box `bounds` (2, 3), or beside it before the box for a camera that just misses them and behind it for those that have them in view
-    (`stands_between`). Farther from its centre than nine in ten of the cameras nothing is asked. What one view shows of a wall beside the subject, or of the
-    floor before it, stays."""
+    """(N,) bool: the points (N, 3) of the world where density would be a guess that cameras between the given ones may see. `has_min_views` is false for
+    them; they are in the box `bounds` (2, 3), or outside it, nearer to its centre than nine in ten of the cameras, where `stands_between` is true. A wall next
+    to the subject, or the floor before it, stays where one view shows it."""
     low, high = np.asarray(bounds, np.float64)
     middle = (low + high) / 2
     reach = np.quantile([np.linalg.norm(camera.centre - middle) for camera in cameras], NEAREST)
@@ -87,7 +86,7 @@ def poorly_seen(points: np.ndarray, bounds: np.ndarray, cameras: Sequence[Camera
 
 
 def stands_between(points: np.ndarray, cameras: Sequence[Camera], middle: np.ndarray) -> np.ndarray:
-    """(N,) bool: which points (N, 3) a camera has beside its picture, within WIDENED times its sides, nearer than BEFORE of the depth of `middle` (3,), while
+    """(N,) bool: points (N, 3) that a camera has outside its picture, within WIDENED times its sides, nearer than BEFORE of the depth of `middle` (3,), while
     every camera that has them in view has them farther away than BEHIND of that depth."""
     before, behind = np.zeros(len(points), bool), np.ones(len(points), bool)
     for camera in cameras:
@@ -129,8 +128,8 @@ def count_views(points: np.ndarray, cameras: Sequence[Camera], masks: Masks | No
 def cells_without_view(space: Space, cameras: Sequence[Camera], side: int, masks: Masks) -> np.ndarray:
     """(D, D, D) bool of the density voxels of any space, D = `side`: those in blocks of which no view shows any point by a pixel that is kept.
 
-    Of a block the corners are tried, the middles of its edges and faces, and its own, with masks whose kept parts are wider than these are apart. What lies
-    a little outside of a picture counts as seen.
+    A block's corners are tried, the middles of its edges and faces, and its own, with masks whose kept parts are wider than these are apart. A point a
+    little outside of a picture counts as seen.
     """
     count = -(-side // BLOCK)
     lattice = np.minimum(np.arange(2 * count + 1) * (BLOCK / 2 / side), 1.0)

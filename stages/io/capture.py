@@ -1,4 +1,4 @@
-"""What an importer returns: cameras, images and points in the capture's frame, at the source's size."""
+"""The result of an importer: cameras, images and points in the capture's frame, at the source's size."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """Which of the two are silhouettes: what they leave out is background. Else what they leave out is ignored.
+    """Which of the two are silhouettes: pixels they leave out are background. Else those pixels are ignored.
 
     alpha  alpha channels of the photographs
     masks  mask files

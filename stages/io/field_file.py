@@ -141,7 +141,7 @@ def load_exposure(folder: Path) -> tuple[list[str], Exposure] | None:
 
 
 def _names_exposure(path: Path) -> bool:
-    """Whether a field file has it, by its head alone: where exposure was not learned, nobody waits for the rest. One that cannot be read has none: it is
+    """Whether a field file has it, by its header alone, without reading the rest. A file that cannot be read has none: it is
     refused where the field is needed."""
     try:
         with opened(path), safe_open(path, framework="pt", device="cpu") as file:

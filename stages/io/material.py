@@ -1,4 +1,4 @@
-"""What sources without cameras hold: photographs and their masks by name, and frames of videos, which become photographs here."""
+"""Contents of sources without cameras: photographs and their masks by name, and frames of videos, which become photographs here."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
         return found
     sizes = []
     for path in found.videos.values():
-        with contextlib.suppress(UnreadableVideo), opened(path) as video:  # said where it is read
+        with contextlib.suppress(UnreadableVideo), opened(path) as video:  # reported where it is read
             sizes.append(video.stored)
     refuse_what_does_not_fit(job, video_needed(sizes), "Export the video at a lower resolution.")
     reader = Reader(min(DECODERS, count_cores()), job.work / "videos", job.progress, job.safe_point, warn)
@@ -121,7 +121,7 @@ def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material
         if job.settings.lens == "auto" and is_panorama(path):
             panoramas[name] = path
         elif job.settings.lens == "equirectangular":
-            with contextlib.suppress(UnreadableImage):  # said where it is read
+            with contextlib.suppress(UnreadableImage):  # reported where it is read
                 width, height = read_header(path).size
                 if width != 2 * height:
                     raise BadInput(f"{name}: {width}x{height} pixels; a picture of 360 degrees is twice as wide as high. Without --lens it is a photograph.")

@@ -45,7 +45,7 @@ PIXELS_A_BYTE = 10_000  # of a larger picture at most: deflate makes 1,032 bytes
 
 _ORIENTATION = 274
 _JPEG = ("JPEG", "MPO")
-_LOWEST = 3  # rows and columns of a quantisation table that its coarseness is told by; libjpeg's at quality 50 have this mean there
+_LOWEST = 3  # rows and columns of a quantisation table that its coarseness is judged by; libjpeg's at quality 50 have this mean there
 _LOWEST_MEAN = 118 / 9
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 # The fault of the process or the machine, not of one file: to leave pictures out for these would change results in silence.
@@ -107,7 +107,7 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
 
 
 class _Bounded(io.BufferedReader):
-    """A file that never makes room for more than it holds: decoders ask for as many bytes as a length in the file says."""
+    """A file that never allocates more than it holds: decoders ask for as many bytes as a length in the file says."""
 
     def __init__(self, descriptor: int, size: int) -> None:
         super().__init__(io.FileIO(descriptor))

@@ -89,7 +89,7 @@ class Scene:
     kind        the kind of the capture ("photographs", "blender", ...)
     bounds      (2, 3) scene bounds
     background  constant sRGB colour (0-1) that the RGBA images are composited on, in bounded scenes; None: unbounded
-    points      whether points.safetensors stands beside scene.json
+    points      whether points.safetensors lies next to scene.json
     metric      whether a unit of the capture's frame is a metre
     space       of the field: "box" (bounded), "contracted", "ndc", or "auto": contracted without a background, else box
     forward     the forward-facing scene, for ndc alone

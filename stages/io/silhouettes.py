@@ -1,4 +1,4 @@
-"""What alpha channels and masks of photographs keep, at small size: enough to tell an object from the rest, and to bound it."""
+"""Alpha channels and masks of photographs at small size: enough to separate an object from the rest, and to bound it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SMALL = 160  # px, longest side
 class SmallPictures:
     """Alpha channels and masks of photographs (h, w) uint8, upright, longest side at most `SMALL`, the highest of each block; each file is read once.
 
-    Pixels up to `TRANSPARENT` are 0. None where a photograph has none, or it cannot be read, which is said where it is needed.
+    Pixels up to `TRANSPARENT` are 0. None where a photograph has none, or it cannot be read, which is reported where it is needed.
     """
 
     _alpha: dict[Path, np.ndarray | None] = field(default_factory=dict)

@@ -139,7 +139,7 @@ def image_paths(cameras: list[Camera]) -> list[str]:
 
 
 def _short(part: str) -> str:
-    """A part of a path that leaves room for what is added to it, within what file systems take: 255 bytes, and a name's escapes make it longer."""
+    """A part of a path that leaves space for what is added to it, within what file systems take: 255 bytes, and a name's escapes make it longer."""
     if len(part.encode()) <= MAX_PART:
         return part
     suffix = PurePosixPath(part).suffix
@@ -184,8 +184,8 @@ def _cut_out(pixels: np.ndarray, levels: np.ndarray, size: tuple[int, int]) -> n
 def mask_levels(photo: Photo, orientation: int) -> tuple[np.ndarray, list[str]]:
     """(H, W) uint8, upright, at the mask file's size: how much of each pixel a silhouette covers; and warnings.
 
-    A mask of two levels, as of labels, covers all where it is not black, and so does a mask that is nowhere bright; others are soft. What is nearly black or
-    nearly white is noise of a network or of a lossy format.
+    A mask of two levels, as of labels, covers all where it is not black, and so does a mask that is nowhere bright; others are soft. Levels nearly black or
+    nearly white are noise of a network or of a lossy format.
     """
     levels, lossy, warnings = _read_mask(photo, orientation)
     if not lossy and (levels.max(initial=0) < OPAQUE or len(np.flatnonzero(np.bincount(levels.ravel(), minlength=256))) <= 2):

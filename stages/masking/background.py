@@ -1,7 +1,7 @@
 """Whether photographs with silhouettes show a background that moves with the object, in which features help, or one that stands still while it turns.
 
-Where the camera goes round an object, all that stands beside it gives features, and the object alone often too few. Where the object turns before a camera on
-a stand, the background says that nothing moved. docs/experiments/silhouettes.md
+Where the camera goes round an object, its surroundings give features, and the object alone often too few. Where the object turns before a camera on a stand,
+the background shows no motion. docs/experiments/silhouettes.md
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stages.io.pictures import UnreadableImage, read_header
 from stages.io.silhouettes import SMALL, SmallPictures
 
 MOST_PAIRS = 24  # of photographs that follow each other
-FINE = 4.0  # px at `SMALL`, standard deviation of the blur that texture is told from shading by
+FINE = 4.0  # px at `SMALL`, standard deviation of the blur that separates texture from shading
 STANDING = 0.5  # correlation of the texture of two photographs, from which the background is the same
 LEAST_TEXTURE = 1.0  # of 255, standard deviation
 

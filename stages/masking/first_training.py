@@ -1,4 +1,4 @@
-"""A first quick training of all that photographs show, from which it is told what of them is the subject.
+"""A first quick training of all that photographs show; the subject is found in it.
 
 It is small and always on the CPU: a scene has the same bytes whatever its later stages compute on.
 """
@@ -48,7 +48,7 @@ class FirstField:
 
 
 def first_field(job: Job, capture: Capture, images: Sequence[np.ndarray], settings: TrainSettings = FIRST) -> FirstField:
-    """The field of a capture, without regard to masks. What an interrupted training did is done again: it is short.
+    """The field of a capture, without regard to masks. An interrupted training starts again: it is short.
 
     images  (H, W, 3) uint8 of the photographs, upright
     """

@@ -52,7 +52,7 @@ REMEDY = (
 
 
 class _Made(msgspec.Struct):
-    """What is noted of finished masks: the file of each photograph that has one, by its name, and facts for the report."""
+    """A note of finished masks: the file of each photograph that has one, by its name, and facts for the report."""
 
     masks: dict[str, str]
     facts: dict[str, Any]
@@ -100,7 +100,7 @@ def _has_alpha(photo: Photo) -> bool:
     try:
         return read_header(photo.image).alpha
     except UnreadableImage:
-        return False  # said where it is read
+        return False  # reported where it is read
 
 
 def _pictures(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[np.ndarray]]:
@@ -128,7 +128,7 @@ def _subject(field: FirstField) -> Subject:
     if found is None or not len(found.subject):
         raise _refused("no subject stands out from what is round it")
     if not found.planes:
-        raise _refused("nothing flat is found that the subject stands on, from which it could be told")
+        raise _refused("nothing flat is found that the subject stands on")
     return subject_of(found, points)
 
 

@@ -25,7 +25,7 @@ Warn = Callable[..., Any]
 def made_masks(
     paths: Mapping[str, Path], how: str, folder: Path, *, safe_point: Callable[[], None], progress: Callable[[int, int, str], None], warn: Warn
 ) -> dict[str, Path]:
-    """Name -> mask, written to a folder, of the photographs in which what is not the object could be told.
+    """Name -> mask, written to a folder, of the photographs whose background is found.
 
     paths  photograph by name
     how    static, green, white or #rrggbb
@@ -69,7 +69,7 @@ def _all_made(
             else:
                 without.append(name)
         except UnreadableImage:
-            continue  # said where it is read
+            continue  # reported where it is read
     if not found:
         article = "such a background" if what == "such background" else f"a {what}"
         raise BadInput(f"{option}: no photograph shows {article}. Choose another, or leave {option.split()[0]} away.")

@@ -1,7 +1,7 @@
 """Masks by a network that the user has: an ONNX file as rembg and others keep them, run by onnxruntime. Nothing is downloaded.
 
-A network takes (1, 3, h, w) RGB, normalised, and gives (1, 1, h, w) of how much of each pixel is subject, as probabilities or as logits. What a file does not
-say is as rembg has it for the networks that it knows: U2-Net, silueta and BiRefNet are normalised by ImageNet's mean and deviation, IS-Net (DIS) by its own.
+A network takes (1, 3, h, w) RGB, normalised, and gives (1, 1, h, w) of how much of each pixel is subject, as probabilities or as logits. The rest
+follows rembg for the networks that it knows: U2-Net, silueta and BiRefNet are normalised by ImageNet's mean and deviation, IS-Net (DIS) by its own.
 """
 
 from __future__ import annotations

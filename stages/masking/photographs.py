@@ -53,7 +53,7 @@ def cameras_of_photographs(job: Job, warn: Any) -> Capture:
 
 
 def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tuple[Capture, list[str]]:
-    """The capture in the frame of cameras that the source states, where it is read as photographs in spite of them; else by GPS; and what is to be said."""
+    """The capture in the frame of cameras that the source states, where it is read as photographs in spite of them; else by GPS; and sentences to report."""
     said, source = [], job.source
     assert source is not None
     name = posed_format(source, job.settings) if len(job.sources) == 1 else None
@@ -110,7 +110,7 @@ def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, 
 
 
 def mask_choice(settings: Any, facts: Mapping[str, object]) -> str:
-    """What masks mean: those that are made of a background, or by a network, are silhouettes."""
+    """The meaning of masks: those made of a background, or by a network, are silhouettes."""
     made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or facts.get(BACKGROUND) == LEFT_OUT
     return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
 
@@ -123,7 +123,7 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
     features, sizes = resolved(settings.max_features) or features_for(len(paths)), []
     for path in paths.values():
         job.safe_point()
-        with contextlib.suppress(UnreadableImage):  # said where it is read
+        with contextlib.suppress(UnreadableImage):  # reported where it is read
             sizes.append(read_header(path).size)
 
     def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
@@ -148,8 +148,8 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
 
 
 def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path]) -> tuple[Capture | None, bool]:
-    """The capture of photographs of which it looks as if a subject turned before a background that stands still, or None where all of the picture is to be
-    used without it; and whether that looks so for certain.
+    """The capture of photographs where a subject seems to have turned before a background that stands still, or None where all of the picture is to be
+    used; and whether that is certain.
 
     Cameras by the subject alone are taken where they have nearly all photographs, or where all of the picture does not explain more.
     """

@@ -1,7 +1,7 @@
 """Which level of given masks is kept. White is, as nerfstudio, Brush and COLMAP have it; but masks of an object that was painted black are met with, too.
 
 Masks that are white but for one compact thing in nearly all photographs either leave it out or show it the other way round. They show it where all of these
-black shapes are views of one thing: then they fit to its visual hull, which what moves through a scene does not. docs/experiments/silhouettes.md
+black shapes are views of one thing: these fit its visual hull, and shapes of moving things do not. docs/experiments/silhouettes.md
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _look_inverted(photos: Sequence[Photo]) -> bool:
 
 
 def _turned_round(job: Job, photos: Sequence[Photo]) -> dict[str, Path]:
-    """Name -> mask with black and white exchanged, in the scratch folder; those that cannot be used are left out, and named where they are read."""
+    """Name -> mask with black and white exchanged, in the scratch folder; those that cannot be used are left out, and reported where they are read."""
     folder = job.work / "masks_turned_round"
     folder.mkdir(parents=True, exist_ok=True)
     made = {}

@@ -1,6 +1,6 @@
-"""What stands still: the background behind an object on a turntable, photographed by a camera on a stand.
+"""The background that stands still behind an object on a turntable, photographed by a camera on a stand.
 
-A pixel that shows the background shows the same colour again and again; the object's texture turns away. What no colour comes back at is object in all
+A pixel that shows the background shows the same colour again and again; the object's texture turns away. A pixel without such a colour is object in all
 photographs. N photographs of (h, w).
 """
 
@@ -63,8 +63,8 @@ class StillBackground:
 
 
 def _commonest(images: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of images (N, h, w, 3) the colour (h, w, 3) of each pixel that most of the others are near to, and how many are (h, w): what stands still comes again,
-    and a texture that turns does not."""
+    """The colour (h, w, 3) of each pixel of images (N, h, w, 3) that most of the others are near to, and how many are (h, w): a background recurs, and a
+    texture that turns does not."""
     best, support = images[0].copy(), np.zeros(images.shape[1:3], np.int32)
     for one in images:
         close = np.zeros(support.shape, np.int32)

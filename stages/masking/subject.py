@@ -136,7 +136,7 @@ def may_show(subject: Subject, camera: Camera) -> np.ndarray:
     """(H, W) bool: the pixels near which a cell of the subject is projected."""
     place, depth = project(camera, subject.cells)
     found = np.zeros((camera.height, camera.width), np.uint8)
-    if np.linalg.norm(subject.cells - camera.centre, axis=1).min() <= subject.reach:  # the camera is beside it
+    if np.linalg.norm(subject.cells - camera.centre, axis=1).min() <= subject.reach:  # the camera is next to it
         return found == 0
     for (x, y), away in zip(place, depth, strict=True):
         if np.isfinite([x, y]).all() and max(abs(x), abs(y)) < 4 * max(found.shape):

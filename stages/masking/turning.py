@@ -1,8 +1,8 @@
 """Whether a subject turned before a camera on a stand: the background stays where it is, and the subject shows one side after the other.
 
-Two things are looked at before cameras are searched for: texture along the picture's border that comes again, pixel by pixel, in photographs that are far apart
+Two signs are checked before cameras are searched for: texture along the picture's border that recurs, pixel by pixel, in photographs that are far apart
 in the sequence; and something compact in the middle that does not. A camera that moves past a far background shows the same. So it is certain only afterwards:
-cameras found by the subject alone look at it from sides that no camera can have looked from while what is behind the subject stayed where it was.
+cameras found by the subject alone look at it from sides from which no camera could have seen the same background.
 docs/experiments/sfm.md
 """
 
@@ -38,7 +38,7 @@ def masks_of_turning_subject(paths: Mapping[str, Path], folder: Path, *, safe_po
         return {}
     try:
         masks = made_masks(paths, STATIC, folder, safe_point=safe_point, progress=progress, warn=lambda *_, **__: None)
-    except BadInput:  # no background that comes again
+    except BadInput:  # no background that recurs
         return {}
     small = SmallPictures()
     photos = [photo for name in sorted(masks) if (photo := photo_without_camera(name, paths[name], masks[name])) is not None]

@@ -1,1 +1,1 @@
-"""What each stage takes at its peak, and whether that fits: by terms, each measured (docs/experiments/memory.md)."""
+"""The memory of each stage at its peak, and whether it fits: by terms, each measured (docs/experiments/memory.md)."""

@@ -1,4 +1,4 @@
-"""What a stage will take of memory and write to disk at its peak, before it begins: fleets admit stages by it.
+"""A forecast of a stage's memory and disk space at its peak, before it begins: fleets admit stages by it.
 
 `stages.NAME.memory` of each stage has two functions of what is `Known` then.
 

@@ -1,4 +1,4 @@
-"""What a stage takes at its peak, and what becomes of a stage that does not fit.
+"""The memory of a stage at its peak, and the refusal of one that does not fit.
 
 Memory decides where data lie and in how large pieces they are worked on, and never what is made: a stage that does not fit even so is refused, with the
 setting that would make it smaller. So an artifact has the same bytes whatever memory it was made in, and memory is no part of its request.
@@ -17,8 +17,8 @@ MIB = 2**20
 TERMS_SHOWN = 3
 # The process with the libraries that a stage imports, its compiled kernels, and what the C library keeps of what was freed.
 IMAGING = 130 * MIB  # numpy, OpenCV and Pillow
-RENDERING = 600 * MIB  # torch and numba beside these
-SURFACES = 200 * MIB  # SciPy, scikit-image and what decimates, beside these
+RENDERING = 600 * MIB  # torch and numba with these
+SURFACES = 200 * MIB  # SciPy, scikit-image and what decimates, besides these
 CUDA = 2048 * MIB  # what torch adds on the host for a CUDA device
 
 
@@ -52,7 +52,7 @@ def has_room(job: Job, need: Need) -> bool:
 
 
 def most_threads(job: Job, threads: int, need: Callable[[int], Need]) -> int:
-    """As many of the threads as `has_room` for what they take; one where there is room for none."""
+    """As many of the threads as `has_room` for what they take; one where there is space for none."""
     return next((fewer for fewer in range(threads, 1, -1) if has_room(job, need(fewer))), 1)
 
 
@@ -80,7 +80,7 @@ def refuse_more_than(limit: Limit | None, what: str, need: Need, remedy: str) ->
 
 
 def record(job: Job, need: Need) -> None:
-    """Put a need into the manifest, beside what was measured (`peak_memory`); of several the largest."""
+    """Put a need into the manifest, next to what was measured (`peak_memory`); of several the largest."""
     if need.total < job.facts.get("memory", {}).get("needed", 0):
         return
     limit = None if job.memory is None else job.memory.bytes

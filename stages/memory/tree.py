@@ -1,4 +1,4 @@
-"""What an asset takes."""
+"""Memory of an asset."""
 
 from __future__ import annotations
 

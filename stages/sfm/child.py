@@ -1,4 +1,4 @@
-"""The process that structure from motion runs in; `stages.sfm.process` starts it and states what is said."""
+"""The process that structure from motion runs in; `stages.sfm.process` starts it and states the protocol."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _SIGACTION_BYTES = 1024  # bytes; a struct sigaction takes 152 on Linux
 
 
 def import_pycolmap() -> Any:
-    """pycolmap, the only place that imports it.
+    """Import pycolmap; nothing else does.
 
     zlib, numpy and Pillow come first: the libraries inside of pycolmap 4 hide those of the same names that are loaded later, and zlib then frees what
     it never had. Signal handlers are restored afterwards, by sigaction(2): Python's signal module knows nothing of handlers that faulthandler or
@@ -64,7 +64,7 @@ def quiet_pycolmap() -> Iterator[Any]:
 
 @contextlib.contextmanager
 def every_image_read(pycolmap: Any, folder: Path) -> Iterator[None]:
-    """Raise StageFailed where COLMAP could not read an image within: of that it says a word in its log, and goes on to another result.
+    """Raise StageFailed where COLMAP could not read an image within: it only logs that, and goes on to another result.
 
     folder  for the log, which is removed
     """

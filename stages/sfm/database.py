@@ -82,15 +82,15 @@ def _list_images(aside: Path, work: Path, images: Sequence[WorkImage]) -> None:
         with pycolmap.Database.open(aside) as database:
             listed = {image.name for image in database.read_all_images()}
     for image in images:
-        if image.file not in listed:  # COLMAP leaves out without a word what it cannot read
+        if image.file not in listed:  # COLMAP silently leaves out what it cannot read
             raise StageFailed(f"poses: {images_of(work) / image.file}: could not be read by COLMAP. Run again: what is done is kept.")
 
 
 def _first_guess(image: WorkImage) -> Any:
-    """SIMPLE_RADIAL, which few photographs suffice for; `mapping.bundle_adjusted` tries OPENCV. Without EXIF data the initial focal length is 1.2
-    times the longest side, as COLMAP has it.
+    """SIMPLE_RADIAL: few photographs suffice for it; `mapping.bundle_adjusted` tries OPENCV. Without EXIF data the initial focal length is 1.2
+    times the longest side, as in COLMAP.
 
-    Of a fisheye lens OPENCV_FISHEYE. Its focal length counts as known: pairs are then verified by rays, which lie on epipolar planes, while on such pictures
+    A fisheye lens gets OPENCV_FISHEYE. Its focal length counts as known: pairs are then verified by rays, which lie on epipolar planes, while on such pictures
     no fundamental matrix fits.
     """
     pycolmap = import_pycolmap()
@@ -150,8 +150,8 @@ def copy_database(work: Path, place: Path) -> None:
 
 
 def copy_with_own_cameras(work: Path, place: Path, images: Sequence[WorkImage]) -> None:
-    """A database in another scratch folder, in the place of what is there, of the same images, features and matches; but each image has a camera of its own,
-    of the first guess."""
+    """Replace the database of another scratch folder by one of the same images, features and matches, but with a camera for each image, of the first
+    guess."""
     remove_database(place)
     _list_images(database_path(place), place, [replace(image, camera_key=image.file) for image in images])
     with contextlib.closing(attached(place, work)) as connection, connection:

@@ -1,8 +1,8 @@
-"""Features that were detected before, in this run or another, by content: of the copy of the photograph, of its mask, and by what was asked of COLMAP.
+"""A cache of features, shared by all runs. The key is the content of a photograph's copy, of its mask, and COLMAP's options.
 
 One file an image, in `$ENERF_CACHE_DIR/features`, else in `features` of the user's cache folder, in a folder for the build of pycolmap: the SHA-256 of the
 rest, and the rows of COLMAP's database without the image's number, as MessagePack. The least recently used are removed beyond $ENERF_FEATURE_CACHE_MIB, 1024
-without; 0 keeps none. Where there can be no such folder, or a file of it is not as it was written, features are detected.
+without; 0 keeps none. Features are detected where there can be no such folder, or a file of it is damaged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def max_bytes() -> int:
 
 @functools.cache
 def folder() -> Path | None:
-    """Where the files are, made if need be; None where none are kept, or where there is no folder that the user alone can write to."""
+    """The folder of the files, made if need be; None where none are kept, or where no folder is writable by the user alone."""
     if not max_bytes():
         return None
     pycolmap = import_pycolmap()
@@ -49,7 +49,7 @@ def keys_of(place: Path, files: Sequence[str], asked: Mapping[str, object]) -> d
     """The key of each copy.
 
     place  that `images` and `masks` are in
-    asked  of COLMAP, all that features depend on beside the picture
+    asked  COLMAP's options that features depend on
     """
     wanted = repr(sorted(asked.items())).encode()
     keys = {}
@@ -74,7 +74,7 @@ def take(database: Path, wanted: Mapping[int, str]) -> list[int]:
 
 
 def put(database: Path, made: Mapping[int, str]) -> None:
-    """Keep the features of these images; without a word where there is no room.
+    """Keep the features of these images; silent where there is no space.
 
     made  key of each image by its id
     """

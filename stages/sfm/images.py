@@ -1,4 +1,4 @@
-"""Copies of the photographs that COLMAP reads: after EXIF rotation, at working size, with their masks. What a killed call left is used again."""
+"""Copies of the photographs that COLMAP reads: after EXIF rotation, at working size, with their masks. Copies of a killed call are reused."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Progress = Callable[..., None]
 
 
 class Callables(TypedDict):
-    """What a long piece of work calls: how far it is, whether to go on, and what the user should know."""
+    """Callbacks of long work: how far it is, whether to go on, and what the user should know."""
 
     progress: Progress
     safe_point: SafePoint
@@ -63,7 +63,7 @@ class WorkImage:
 
 
 def _sha256(path: Path) -> str:
-    """Of a plain file, or what keeps it from being read: a pipe among the photographs would be waited for."""
+    """Of a plain file, or the reason why it is unreadable. A pipe would block."""
     try:
         with open(open_plain(path), "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -155,14 +155,14 @@ def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> 
 
 @dataclass(frozen=True)
 class Copy:
-    """What became of a photograph: its copy, or None where it could not be read; and a remark, or the reason."""
+    """The result of copying a photograph: its copy, or None where it is unreadable; a remark, or the reason."""
 
     image: WorkImage | None
     remark: str
 
 
 def images_of(work: Path) -> Path:
-    """The folder of the copies: of a rung's own scratch folder that of the folder it lies in."""
+    """The folder of the copies; for a step's own scratch folder, that of its parent."""
     here = work / "images"
     return here if here.is_dir() else work.parent / "images"
 

@@ -1,7 +1,7 @@
-"""From features to cameras, rung by rung: each is tried where those before it left photographs without a camera, and what it finds is kept where it is better.
+"""From features to cameras in steps. A step is tried where those before left photographs without a camera; its result is kept where it is better.
 
     1  the matches of the pairs that are worth comparing, and COLMAP's mapper
-    2  the sub-models that it leaves are put together, where the points that they share fit; after 4 once more
+    2  its sub-models are merged where the points that they share fit; after 4 once more
     3  the mapper goes on from there with fewer matches to a photograph; where it has not half of the photographs, as of a way straight ahead, it begins anew
        from another pair, with smaller angles
     4  photographs without a camera are matched again, with more of the others, and along the geometry of the first matches
@@ -11,7 +11,7 @@
     8  each photograph gets a focal length of its own, where matches disagree with the cameras, or where single photographs would have another
     9  else each gets a principal point of its own, where single photographs would have another, as where they were cropped
 
-The rungs 4, 5, 7, 8 and 9 work in scratch folders of their own that are made anew: what a killed call has left there would change the rungs before.
+Steps 4, 5, 7, 8 and 9 work in scratch folders of their own, made anew: leftovers of a killed call would change the steps before.
 docs/experiments/sfm.md
 """
 
@@ -33,12 +33,12 @@ from stages.verdict.verdict import DOUBTFUL
 
 MAX_EXHAUSTIVE = 60  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
 OF_FEW, OF_MANY = 4096, 2048  # features of a photograph, at most: OF_MANY of more than MAX_EXHAUSTIVE photographs
-OVERLAPPING = 30  # verified matches, from which two photographs are said to overlap
+OVERLAPPING = 30  # verified matches, from which two photographs count as overlapping
 FEW_NEIGHBOURS = 3  # photographs that one overlaps with; of fewer, more are looked for
 WIDER = 48  # photographs that are most like one, which it is compared with then
-ENOUGH = 0.9  # of the photographs with a camera, from which the costlier rungs are not tried; and
+ENOUGH = 0.9  # of the photographs with a camera, from which the costlier steps are not tried; and
 AGREEING = 0.8  # of the verified matches, that agree with the cameras
-BETTER = 1.005  # times the score, from which a later rung is better than an earlier one
+BETTER = 1.005  # times the score, from which a later step is better than an earlier one
 MORE_FEATURES, LESS_CONTRAST = 2, 0.35
 EACH, CROPPED, MERGED = "a focal length each", "a principal point each", "merged sub-models"
 NETWORK, NETWORK_ANEW = "matches by a network", "another beginning with matches by a network"
@@ -55,7 +55,7 @@ class Found:
     models  sub-models, largest first
     work    the scratch folder whose database they are of
     rungs   what was tried: its name, the number of photographs that had a camera then, and the share of matches that agreed
-    rung    the name of that which found them
+    rung    the name of the step that found them
     """
 
     models: list[Any]
@@ -65,7 +65,7 @@ class Found:
 
 
 class _Climb:
-    """The rungs so far, and the best of them: by the number of registered photographs times the share of the matches that agree."""
+    """The steps so far, and the best of them: by the number of registered photographs times the share of the matches that agree."""
 
     def __init__(self, work: Path, images: Sequence[WorkImage]) -> None:
         self.images = images
@@ -74,7 +74,7 @@ class _Climb:
         self.agreement = 0.0
 
     def tried(self, rung: str, work: Path, models: list[Any], *, least: float = 0.0, better: float = BETTER) -> None:
-        """Keep what a rung has found where its score is so many times better, and at least such a share of the matches agrees."""
+        """Keep a step's result where its score is `better` times the best, and at least the share `least` of the matches agrees."""
         agreement = mapping.match_agreement(work, self.images, models[0]) if models else 0.0
         rungs = [*self.found.rungs, {"rung": rung, "registered": mapping.num_registered(models), "agreeing": round(agreement, 4)}]
         score = mapping.num_registered(models) * agreement
@@ -105,7 +105,7 @@ def find_models(
     progress: Progress,
     safe_point: SafePoint,
 ) -> Found:
-    """The best of what the rungs find, the features being detected.
+    """The best result of the steps; the features are detected already.
 
     how       pairs that are matched, as `match` takes it
     threads   on which features are detected, and processes in which pairs are matched
@@ -150,14 +150,14 @@ def find_models(
 
 
 def _begin_anew(climb: _Climb, work: Path, seed: int, **quiet: Any) -> None:
-    """The rungs on which the mapper begins from another pair."""
+    """The steps in which the mapper begins from another pair."""
     for rung, options in (("another beginning", mapping.RELAXED), ("small angles", mapping.FORWARD)):
         if not climb.is_enough():
             climb.tried(rung, work, mapping.sub_models(work, climb.images, seed, options, **quiet))
 
 
 def _try_merged(climb: _Climb, work: Path, others: Sequence[Any], seed: int, safe_point: SafePoint) -> list[Any]:
-    """The rung on which other sub-models are put together with the best one, as far as they have photographs that it lacks; returns those that remain.
+    """The step that merges other sub-models with the best one, as far as they have photographs that it lacks; returns those that remain.
 
     work  the scratch folder whose matches are used; the features are the same in all
     """
@@ -172,7 +172,7 @@ def _try_merged(climb: _Climb, work: Path, others: Sequence[Any], seed: int, saf
 
 
 def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> None:
-    """The rungs on which each photograph has a camera of its own, where there is reason to."""
+    """The steps in which each photograph has a camera of its own, where there is reason to."""
     remove(place)
     best = climb.found.models[0]
     zoomed = climb.agreement < DOUBTFUL or zoom.focal_length_spread(best) > SPREAD
@@ -191,8 +191,8 @@ def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> Non
 
 
 def _try_networks(climb: _Climb, place: Path, networks: tuple[Path, Path], *, seed: int, threads: int, **quiet: Any) -> None:
-    """Match photographs without a camera by networks: the model goes on from points that these matches give it, too; where it has not half of the photographs,
-    the mapper begins anew."""
+    """Match photographs without a camera by networks. The mapper continues the model with points of these matches; where it has less than half of the
+    photographs, the mapper begins anew."""
     remove(place)
     place.mkdir()
     copy_database(climb.found.work, place)
@@ -240,12 +240,12 @@ def _match_again(place: Path, images: Sequence[WorkImage], weak: Sequence[int], 
 
 
 def features_for(count: int) -> int:
-    """Of each of so many photographs, at most, where nothing else is asked for."""
+    """The default limit for each of `count` photographs."""
     return OF_FEW if count <= MAX_EXHAUSTIVE else OF_MANY
 
 
 def matching_for(count: int) -> str:
-    """What "auto" stands for."""
+    """The meaning of "auto"."""
     return "exhaustive" if count <= MAX_EXHAUSTIVE else "retrieval"
 
 

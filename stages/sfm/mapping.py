@@ -21,10 +21,10 @@ from stages.sfm.images import Progress, WorkImage, images_of
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
 MANY_OBSERVATIONS = 150_000  # of points in images; of more, an even choice holds the cameras as well
-NEARLY = 0.95  # of the photographs: later rungs may bring back the others
+NEARLY = 0.95  # of the photographs: later steps may bring back the others
 ALL_OF = 300  # points: a photograph with no more keeps all of them
-# Adjustments of all that is found so far: each time there are so many times more photographs or points than at the last, with those points that hold the
-# cameras, and not to the last digit, for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
+# Global bundle adjustments: one each time photographs or points have grown by these ratios, over the points that hold the cameras, and loosely converged,
+# for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
 ADJUSTMENTS: Mapping[str, object] = {
     "ba_global_frames_ratio": 1.4,
     "ba_global_points_ratio": 1.4,

@@ -1,7 +1,7 @@
-"""Sub-models put together: what the matches between them, and the photographs that are in both, say of where one lies in the frame of the other.
+"""Sub-models merged: the matches between them, and the photographs that are in both, place one in the frame of the other.
 
-A feature that has a point in each of two models, in a photograph of both or by a match, is a point that they share. A similarity is looked for that takes most
-shared points of one to where the other's photographs see them, and the other way round; then all is triangulated and adjusted anew. docs/experiments/sfm.md
+A feature that has a point in each of two models, in a photograph of both or by a match, is a shared point. A similarity is sought that takes most
+shared points of each to where the other's photographs see them; then all is triangulated and adjusted anew. docs/experiments/sfm.md
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from stages.sfm.images import WorkImage, images_of
 
 LEAST, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
 TOLERANCE = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart
-MATCHES = 15  # of a pair, from which they are looked at, as the mapper has it
+MATCHES = 15  # of a pair, from which they are used, as in the mapper
 HYPOTHESES, MOST = 500, 5000  # similarities that are tried; shared points that they are tried on
 REFINED = 5  # times that the best is fitted to all that fit it
 ROUNDS = 2  # of triangulating and adjusting: the second finds more points that go through both
@@ -76,7 +76,7 @@ def merged(work: Path, images: Sequence[WorkImage], models: Sequence[Any], seed:
 
 
 def _placed(work: Path, parts: Sequence[Mapping[int, Any]], placed: Mapping[int, Similarity], number: int, seed: int) -> Similarity | None:
-    """Where a sub-model lies in the frame of the first, by all that are placed already."""
+    """The place of a sub-model in the frame of the first, by all placed already."""
     shared = [(ours.moved(place), theirs) for k, place in placed.items() for ours, theirs in _shared(work, parts[k], parts[number])]
     if not shared:
         return None

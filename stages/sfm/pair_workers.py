@@ -1,7 +1,7 @@
 """Pairs matched in several processes, each with a database of its own: one process has one thread that compares (`matches.match_pairs`).
 
 A worker is a child as that of structure from motion (`stages.sfm.process`), started from it. For each block of pairs it copies the features of these images
-into its database, matches, and says so; the rows are then copied into the database of all, which one process alone writes.
+into its database, matches, and reports; one process copies the rows into the database of all.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, attached, copy_rows, database_path, pair_id_of, record
 
 GUIDED_RATIO = 0.88  # of the distances of the two best; COLMAP's own is 0.8
-POLL_SECONDS = 0.1  # seconds between two looks at the workers
+POLL_SECONDS = 0.1  # seconds between two checks of the workers
 Block = Sequence[tuple[int, int]]  # of image ids, the smaller first
 
 
@@ -29,7 +29,7 @@ class _Stopped(Exception):
 def match(work: Path, blocks: Mapping[str, Block], *, seed: int, guided: bool, workers: int, more: Callable[[int], None], safe_point: SafePoint) -> None:
     """Match blocks of pairs, by the name of the note of each.
 
-    more  is told of the number of pairs that are done
+    more  gets the number of pairs that are done
     """
     stop, one_at_a_time, failures, counts = threading.Event(), threading.Lock(), list[BaseException](), list[int]()
     names = list(blocks)

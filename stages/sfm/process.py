@@ -1,5 +1,5 @@
-"""Structure from motion in a process of its own: an abort inside of COLMAP, or the system's end of a process that takes too much memory, is then an
-error of the stage and not the end of the run.
+"""Structure from motion in a process of its own: an abort inside of COLMAP, or the system's out-of-memory killer, then fails the stage and does not end
+the run.
 
 The child is a fresh interpreter (`stages.sfm.child`), never a fork: threads of torch would not survive one. It speaks lines of JSON over two pipes:
 
@@ -44,18 +44,18 @@ class ChildAborted(StageFailed):
 
 
 class _ChildTraceback(Exception):
-    """Where an error was raised in the child: its cause, for a traceback."""
+    """The child's traceback, as the cause of its error."""
 
 
 def run(
     arguments: Mapping[str, Any], *, progress: Callable[..., None], safe_point: Callable[[], None], warn: Callable[..., None], task: str = "cameras"
 ) -> Any:
-    """What `stages.sfm.child` returns for `arguments`, which JSON can hold.
+    """The result of `stages.sfm.child` for `arguments`, which JSON can hold.
 
     task  "cameras" of photographs, or "pairs" to match
 
-    The callables are called here, in the order in which the child calls them, and `safe_point` also while it says nothing; what they raise stops the child
-    and passes: at its next safe point, or `GRACE` seconds later.
+    The callables are called here, in the order in which the child calls them, and `safe_point` also while it is silent. Their exceptions stop the child
+    at its next safe point, or `GRACE` seconds later, and pass on.
     An error of the child is raised again, of the same class. Raises ChildAborted where it ended without an answer.
     """
     child = _Child(task, arguments)
@@ -94,7 +94,7 @@ class _Child:
             self.process = subprocess.Popen(command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, former)
-        self._tail, self._said, self._looked = bytearray(), bytearray(), 0  # _looked: how much of what it said holds no end of a line
+        self._tail, self._said, self._looked = bytearray(), bytearray(), 0  # _looked: bytes of _said without a line end
         self._listener = threading.Thread(target=self._listen, name="last words of structure from motion", daemon=True)
         self._listener.start()
         self._write(json.dumps({"parent": os.getpid(), "task": task, "arguments": arguments}))

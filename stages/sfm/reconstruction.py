@@ -34,10 +34,10 @@ from stages.verdict.looks import look_at_all
 from stages.verdict.parallax import parallax
 from stages.verdict.verdict import CROPPED, LENS, MOVING, OWN_INTRINSICS, WITHOUT_TEXTURE, ZOOMED, failed
 
-WAIT = 0.05  # seconds between two looks at a lock
+WAIT = 0.05  # seconds between two checks of a lock
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
-FEW_FEATURES = 50  # of a photograph, below which nothing can be told by it
-OWN_LENSES = {ladder.EACH: ZOOMED, ladder.CROPPED: CROPPED}  # by rung
+FEW_FEATURES = 50  # of a photograph, below which it has too little detail
+OWN_LENSES = {ladder.EACH: ZOOMED, ladder.CROPPED: CROPPED}  # by step
 OTHER_FOCAL = 1.2  # times a focal length: that of another lens
 MAX_NAMES = 8  # photographs that an error lists by name
 
@@ -84,7 +84,7 @@ def find_cameras(
     try:
         found = process.run(arguments, **callables)
     except process.ChildAborted:
-        if resumed:  # what was left by an earlier attempt may be what COLMAP cannot bear
+        if resumed:  # leftovers of an earlier attempt may be what COLMAP cannot bear
             remove_database(work)
         raise
     return _capture_from(found, folder, paths, masks)
@@ -264,7 +264,7 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
 
 
 def _facts_of_matching(images: Sequence[WorkImage], found: ladder.Found, how: str) -> dict[str, object]:
-    """How the photographs were matched, the sizes of the parts they fall into, by overlap and of the sub-models that add to the first, and what was tried."""
+    """How the photographs were matched, the sizes of the components of overlap and of the sub-models that add to the first, and the steps tried."""
     parts = [{image.name for image in model.images.values() if image.has_pose} for model in found.models]
     return {
         "matching": how,
@@ -357,7 +357,7 @@ def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
 
 
 def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:
-    """What is suspicious in a model whose counts and reprojection error are fine."""
+    """Warnings about a model whose counts and reprojection error are fine."""
     warnings, cameras = [], [photo.camera for photo in photos]
     seen = parallax(points, photos)
     if seen.small and seen.angle < 2.0:

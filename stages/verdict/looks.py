@@ -18,7 +18,7 @@ NOISE = 0.8  # px, standard deviation of a blur that takes noise away
 COARSE = 8  # px between pixels that differ in a blurred photograph, too
 SMALL = (24, 16)  # px, of the picture that others are compared with
 OPAQUE, PAPER = 128, 128  # alpha from which a pixel counts; level of the others
-CLIPPED = (4, 250)  # levels that nothing is told by
+CLIPPED = (4, 250)  # levels without detail
 BLURRED = 0.15  # sharpness below which a photograph is blurred, whatever the others are
 LESS_SHARP = 0.77  # share of the capture's median, below which it is blurred among sharp ones
 STEP = 0.75  # stops from the capture's median that are a step of exposure
@@ -27,7 +27,7 @@ MOST_CLIPPED = 0.4  # share of pixels without detail
 SAME = 1.5  # of 255, root mean square between two small pictures that are the same
 NOISY = 12.0  # of 255, standard deviation of noise that hides weak features; docs/experiments/sfm.md
 LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # their difference: of edges hardly anything is left
-BLOCK, LEAST_BLOCKS = 16, 9  # px; of a picture of fewer nothing is told
+BLOCK, LEAST_BLOCKS = 16, 9  # px; a picture of fewer is not judged
 LEAST_POINTS = 30  # that a photograph's exposure is judged by
 FLAT = 4.0  # of 255, standard deviation of a small picture that all others of its kind would be the same as
 

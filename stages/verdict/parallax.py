@@ -1,7 +1,7 @@
-"""The angles at which cameras see what they look at: below some, depth is unreliable.
+"""Angles of parallax at the subject: below some, depth is unreliable.
 
-Where the view axes meet there is a subject, and what lies behind it says nothing of it: of photographs all round a table in a large room most sparse points
-are of the room, which all cameras see from about one place.
+The subject is where the view axes meet. Points behind it say nothing of it: in photographs all round a table most sparse points are of the large room, which
+all cameras see from about one place.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from efficientnerf.capture.coverage import meeting_point
 from stages.io.capture import Photo, SparsePoints
 
 SMALL_ANGLE = 4.0  # degrees of parallax
-AROUND = 0.5  # of the distance of the cameras from where their axes meet: what lies nearer to it than that is the subject, with what it stands on
+AROUND = 0.5  # of the distance of the cameras from where their axes meet: points nearer to it are the subject, with its support
 OBSERVERS, FEWEST = 3, 10  # photographs that see a point of the subject, and such points, that wrong matches hardly make: then something is there
 MOST = 2000  # points that are looked at
 

@@ -1,7 +1,7 @@
-"""Whether photographs will do, before their cameras are looked for: how they look, whether they overlap, and what a run of them will take.
+"""Checks of photographs before structure from motion: how they look, whether they overlap, and what a run of them will take.
 
-Overlap is told on small pictures: SIFT features of each, compared with those of the pictures most like it and with the next ones (`stages.sfm.pairs`), and one
-epipolar geometry that the matches fit. It is coarser than structure from motion, and quicker by far. docs/experiments/sfm.md
+Overlap is checked on small pictures: SIFT features of each, compared with those of the pictures most like it and of the next ones (`stages.sfm.pairs`), and
+one epipolar geometry that the matches fit. It is coarser than structure from motion, and quicker by far. docs/experiments/sfm.md
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from stages.verdict import looks, run_forecast
 from stages.verdict.grades import GRADES
 from stages.verdict.verdict import FEW, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, plural, zooms
 
-SIDE = 560  # px, longest side of the pictures that overlap is told on
+SIDE = 560  # px, longest side of the pictures that overlap is checked on
 FEATURES = 800  # of a picture
 CHOSEN = 150  # pictures of a larger folder, evenly spaced
 MOST_LIKE, NEXT = 3, 2  # pictures that each is compared with
@@ -59,7 +59,7 @@ FIRST_TRAINING, A_SILHOUETTE = 92.0, 0.8  # of --mask foreground, docs/experimen
 A_PAIR, COMPARING, MANY = 0.006, 0.030, 4096  # of verifying a pair, and of comparing so many features of each with each
 CONTRAST = 0.02  # from which SIFT detects about as many features as COLMAP's does
 PAIRS_AN_IMAGE = 20  # of retrieval
-MAPPED_AGAIN, LEAST_WEAK = 6, 0.1  # of the later rungs: times that all is mapped again, and share of the photographs that are matched again, at least
+MAPPED_AGAIN, LEAST_WEAK = 6, 0.1  # of the later steps: times that all is mapped again, and share of the photographs that are matched again, at least
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,7 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
 def forecast(
     first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool, joined: float
 ) -> dict[str, Any]:
-    """Seconds of the stage poses on a machine that does nothing else, where the first rung of `stages.sfm.ladder` suffices and where all are tried, and bytes
+    """Seconds of the stage poses on a machine that does nothing else, where the first step of `stages.sfm.ladder` suffices and where all are tried, and bytes
     at its peak; roughly.
 
     joined  share of the photographs that overlap, in the largest component

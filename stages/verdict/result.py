@@ -1,4 +1,4 @@
-"""What is to be thought of a result: a grade, and for each problem its likely cause, what to do, and the picture that shows it.
+"""The assessment of a result: a grade, and for each problem its likely cause, what to do, and the picture that shows it.
 
     good    nothing stands against it
     usable  it shows the scene; parts are worse than they need be, or nobody can say
@@ -26,7 +26,7 @@ USABLE_BLUR, POOR_BLUR, FAILED_BLUR = 0.0125, 0.0225, 0.04  # of the longest sid
 FAILED_GAIN = 3.0  # dB over one colour, below which less than half of what a photograph shows is there
 COLOURS_OFF = 2.0  # dB that fitted colours gain, from which exposure or white balance differ
 POOR_VIEWS = 0.25  # of the views
-GAP, LARGE_GAP = -0.5, -1.5  # dB of the asset behind its network: said; parts are worse than they need be
+GAP, LARGE_GAP = -0.5, -1.5  # dB of the asset behind its network: reported; parts are worse than they need be
 HOLES, MANY_HOLES = 0.01, 0.1  # share of the pixels
 FLOATERS, MANY_FLOATERS = 0.02, 0.15  # share of the asset's opacity, more than the network's own
 SHORT = 0.5  # of the steps that are usual: a refinement with fewer comes before other causes
@@ -101,7 +101,7 @@ class ResultVerdict:
 
 
 def blur_in_words(blur: float) -> str:
-    """What a PSNR amounts to."""
+    """A blur, in words."""
     at_most = "at most " if blur <= BLURS[0] else ""
     return f"as near to the photographs as these are after a blur of {at_most}{100 * blur:.2f} % of their longest side"
 
@@ -129,7 +129,7 @@ def verdict_on_result(metrics: Mapping[str, Any], cameras: CameraVerdict | None 
 
 
 def _figures(metrics: Mapping[str, Any], cameras: CameraVerdict | None) -> dict[str, Any]:
-    """What grades are made from: PSNR with fitted colours, for exposure that nobody can know of a photograph that was held out is no fault of the asset's.
+    """The figures that grades follow from. PSNR has fitted colours: the unknown exposure of a held-out photograph is no fault of the asset's.
 
     blur ..._blur  `equivalent_blur`: medians over the views; of mesh and Gaussians with as many decibels more as fitting its colours gives the asset
     gain           PSNR with fitted colours over that of pictures of one colour, means over the views
@@ -276,7 +276,7 @@ def _of_gap(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
 
 
 def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
-    """Named only where the photographs side with the network."""
+    """Reported only where the photographs side with the network."""
     holes, excess = metrics["holes"], metrics["holes_excess_error"]
     if holes is None or holes <= HOLES or (excess is not None and excess <= 0):
         return []
@@ -287,7 +287,7 @@ def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
 
 
 def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
-    """Named only where the photographs side with the network."""
+    """Reported only where the photographs side with the network."""
     floaters, own, excess = metrics["floaters"], metrics["network"]["floaters"] or 0.0, metrics["floaters_excess_error"]
     if floaters is None or floaters - own <= FLOATERS or (excess is not None and excess <= 0):
         return []
@@ -341,12 +341,12 @@ def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[R
 
 
 def _only_of_this(blur: float | None, figures: Mapping[str, Any]) -> bool:
-    """Whether pictures are strongly blurred, and those of the asset are not: else it has been said."""
+    """Whether pictures are strongly blurred, and the asset's are not: else that is reported."""
     return blur is not None and blur > POOR_BLUR and figures["blur"] is not None and figures["blur"] <= POOR_BLUR
 
 
 def _of_cameras(cameras: CameraVerdict | None) -> list[ResultProblem]:
-    """What held-out photographs cannot show of cameras: that those which have none are missing, or that depth is a guess."""
+    """Faults of cameras that held-out photographs cannot show: cameras are missing, or depth is a guess."""
     if cameras is None or cameras.grade not in ("poor", "failed"):
         return []
     picture = f"{PosesOutputs.stage}/{PosesOutputs.cameras}"

@@ -1,7 +1,7 @@
-"""What the stages after poses will take on a CPU, roughly, before anything is run: seconds from what they took of known scenes, and bytes at the peak.
+"""A rough forecast of the stages after poses on a CPU: seconds, from those of known scenes, and bytes at the peak.
 
-Processor seconds of a stage are taken for proportional to its steps, pictures or pixels, and to how long SIFT takes here; of a stage a share is done by one
-core alone. docs/experiments/sfm.md
+Processor seconds of a stage are assumed proportional to its steps, pictures or pixels, and to the time of SIFT here; a share of them is on one core.
+docs/experiments/sfm.md
 """
 
 from __future__ import annotations

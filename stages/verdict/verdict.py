@@ -1,4 +1,4 @@
-"""What is to be thought of the cameras of a capture: a grade, and for each problem the photographs that show it and what to do.
+"""The assessment of a capture's cameras: a grade, and for each problem the photographs that show it and what to do.
 
     good    nothing stands against it
     usable  it will give an asset, of which parts may be worse than they need be
@@ -27,7 +27,7 @@ OWN_INTRINSICS = "own_intrinsics"  # fact: which of them each photograph has of 
 MOVING = "moving_parts"  # fact: name of a photograph -> share of it that moves
 # Facts of a capture that stand among the figures.
 FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, OWN_INTRINSICS, "gps", "stated_cameras", BACKGROUND)
-NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
+NEAREST = 3  # registered photographs that are listed for one that is not registered
 FEW = 12  # views all round a subject
 FEW_POINTS = 60  # sparse points of a photograph, below which its pose is doubtful
 SHARE = 0.1  # of the photographs, from which a problem of single ones is one of the capture
@@ -39,7 +39,7 @@ LARGE_PART = 0.05  # of the picture, from which what moves may have more matches
 ZOOM = 1.05  # between focal lengths, from which they differ
 OFF_MIDDLE = 0.03  # of the longest side, from the middle to the principal point of a photograph that was cropped
 WITHOUT_TEXTURE = "blurred, dark or without texture"
-MOST_PIXELS = 1000  # of a reprojection error, that are told apart
+MOST_PIXELS = 1000  # of the largest reprojection error that is stated
 LONGEST = 1600  # px that reprojection errors are stated at
 MORE_PHOTOGRAPHS = "Take more photographs between those that do not fit together, with at least 60 % overlap between neighbours."
 
@@ -194,7 +194,7 @@ def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
 
 
 def _of_lens(capture: Capture) -> list[Problem]:
-    """Of photographs that were found to have focal lengths or principal points of their own, which no EXIF data told of."""
+    """Of photographs that were found to have focal lengths or principal points of their own, unknown to EXIF data."""
     cameras = [photo.camera for photo in capture.photos]
     if capture.facts.get(LENS) == ZOOMED:
         groups = zooms({camera.name: 1000.0 * camera.intrinsics["fx"] / max(camera.width, camera.height) for camera in cameras})
@@ -300,7 +300,7 @@ def _of_geometry(capture: Capture, seen: Parallax | None, counts: np.ndarray | N
 
 
 def _of_gps(capture: Capture) -> list[Problem]:
-    """Why GPS positions are not used: that stands against nothing, and indoors, or round a small subject, it is usual."""
+    """Why GPS positions are not used. This lowers no grade, and is usual indoors or round a small subject."""
     gps = capture.facts.get("gps")
     if not isinstance(gps, dict) or gps["used"] != "nothing":
         return []

@@ -1,4 +1,4 @@
-"""The verdict of the poses stage: looked for, written with its pictures, and said."""
+"""The verdict of the poses stage: found, written with its pictures, and reported."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
 
 
 class _Points:
-    """What the sparse points of a capture tell of its photographs' exposure: where each shows those that it observes, and how light they are on average."""
+    """The exposure of photographs by a capture's sparse points: where each shows those that it observes, and how light they are on average."""
 
     def __init__(self, capture: Capture) -> None:
         self._numbers = {photo.camera.name: n for n, photo in enumerate(capture.photos)}

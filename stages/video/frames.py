@@ -32,7 +32,7 @@ Progress = Callable[..., None]
 
 @dataclass(frozen=True)
 class Looked:
-    """What the first reading of a video found: of each frame that was looked at its number, time, sharpness and motion.
+    """The result of the first reading of a video: number, time, sharpness and motion of each frame looked at.
 
     width, height  upright, pixels
     """
@@ -65,7 +65,7 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Reader:
-    """What reading videos needs of the stage.
+    """What readers need of the stage.
 
     threads  that decode
     work     scratch folder
@@ -198,7 +198,7 @@ def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> 
 
 
 def _record(name: str, found: Looked, verdicts: list[str]) -> dict[str, object]:
-    """What frames.json says of a video: columns with an entry for each frame that was looked at."""
+    """A video's entry in frames.json: columns with an entry for each frame that was looked at."""
     return {
         "video": name,
         "size": [found.width, found.height],

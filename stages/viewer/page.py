@@ -1,7 +1,7 @@
 """A page that shows an asset in a browser: one file, which needs nothing but WebGL2 and sends no request.
 
 The page holds the asset's own bytes in the layout `compact`, compressed, and checks them as `enerf verify` does before it draws. Its scripts are the
-modules beside this one.
+modules next to this one.
 """
 
 from __future__ import annotations

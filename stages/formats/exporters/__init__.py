@@ -25,7 +25,7 @@ class Format:
     textures   whether it keeps textures, and takes `picture`
     coloured   whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
     extra      of the package efficientnerf, that has to be installed for it: `refuse_without_package` of its module
-    beside     whether a texture lies in files beside it: `companions` of its module
+    beside     whether a texture lies in files next to it: `companions` of its module
     """
 
     extension: str
@@ -47,7 +47,7 @@ class Format:
         self.write(what, path, frame, **options)
 
     def companions(self, path: Path, picture: str = "png", normal_map: bool = False) -> list[Path]:
-        """The files that it writes beside `path` where the mesh has a texture."""
+        """The files that it writes next to `path` where the mesh has a texture."""
         found: list[Path] = import_module(f"{__name__}.{self.module}").companions(path, picture, normal_map) if self.beside else []
         return found
 

@@ -13,7 +13,7 @@ from efficientnerf.geometry.cameras import Camera, opengl_from_pose
 from pipeline.files import write_json
 from stages.io.scene import SPLITS, Scene, views_of
 
-# nerfstudio knows these; what it does not know is written as the one that contains it.
+# nerfstudio knows these; any other is written as the one that contains it.
 _WRITTEN_AS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 

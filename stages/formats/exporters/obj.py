@@ -21,7 +21,7 @@ _MATERIAL = "captured_light"
 
 
 def companions(path: Path, picture: Picture = "png", normal_map: bool = False) -> list[Path]:
-    """The files that are written beside an OBJ with a texture, in order: colours, the normal map where there is one, the material."""
+    """The files that are written next to an OBJ with a texture, in order: colours, the normal map where there is one, the material."""
     suffixes = (EXTENSIONS[picture], *(("_normal.png",) if normal_map else ()), ".mtl")
     return [path.with_name(plain_stem(path) + suffix) for suffix in suffixes]
 

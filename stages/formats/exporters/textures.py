@@ -29,8 +29,8 @@ def encoded(pixels: np.ndarray, picture: Picture) -> bytes:
 
 
 def plain_stem(path: Path) -> str:
-    """The stem of a file as readers of OBJ and MTL take it in a reference: letters of ASCII, digits, dots, dashes and underscores alone. Where that is another
-    stem, a hash of the true one keeps names apart."""
+    """The stem of a file as readers of OBJ and MTL take it in a reference: letters of ASCII, digits, dots, dashes and underscores alone. A changed
+    stem gets a hash of the true one, to keep names apart."""
     stem = path.stem
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).lstrip(".-")[:100]
     return plain if plain == stem else f"{plain or '_'}-{hashlib.sha256(stem.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"

@@ -1,4 +1,4 @@
-"""USD: USDC with the texture's picture beside it, or USDZ with it inside. Needs the package usd-core, which is the extra `usd`.
+"""USD: USDC with the texture's picture next to it, or USDZ with it inside. Needs the package usd-core, which is the extra `usd`.
 
 Axes     y up, turned as for GLB (`gltf_from_capture`); a unit is stated to be a metre, and in the layer's custom data whether that is known.
 Light    UsdPreviewSurface that emits its colours and reflects nothing: they already hold the light of the capture. With a normal map it reflects them instead.
@@ -42,12 +42,12 @@ def refuse_without_package(path: Path) -> None:
 
 
 def companions(path: Path, picture: Picture = "png", normal_map: bool = False) -> list[Path]:
-    """The files that are written beside a USDC with a texture: colours, and the normal map where there is one."""
+    """The files that are written next to a USDC with a texture: colours, and the normal map where there is one."""
     return [path.with_name(plain_stem(path) + suffix) for suffix in (EXTENSIONS[picture], *(("_normal.png",) if normal_map else ()))]
 
 
 def write_usdc(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
-    """Write a mesh given in the capture's frame, and its pictures beside it. Raises BadInput and UsageError."""
+    """Write a mesh given in the capture's frame, and its pictures next to it. Raises BadInput and UsageError."""
     check_mesh(mesh, path)
     refuse_without_package(path)
     pictures = _pictures(mesh, picture)
@@ -88,7 +88,7 @@ def _pictures(mesh: Mesh, picture: Picture) -> list[bytes]:
 
 
 def _layer(mesh: Mesh, frame: SourceFrame, pictures: list[str]) -> bytes:
-    """The layer as a binary file; `pictures` are the files that it refers to, beside it."""
+    """The layer as a binary file; `pictures` are the files next to it that it refers to."""
     from pxr import Tf, Usd, UsdGeom, Vt  # an extra
 
     stage = Usd.Stage.CreateInMemory()

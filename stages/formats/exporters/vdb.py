@@ -1,12 +1,12 @@
 """OpenVDB: sparse grids of density and colour, as Blender and Houdini read them, in the capture's frame.
 
-No wheel of OpenVDB's own library is to be had for every Python, and what is written here is a small part of its format, version 224: a tree of nodes of
+OpenVDB's own library has no wheel for every Python. This module writes a small part of its format, version 224: a tree of nodes of
 32^3, 16^3 and 8^3 children, leaves of 8^3 voxels, and of each leaf a mask of its voxels and the values of those alone. Blender's library reads it in tests.
 
     density    float  per unit of the capture's frame: light falls to exp(-density) along one unit
     color      vec3s, 16 bits  linear light, 0 to 1, where there is density; as the captured cameras see it, for a volume has one colour
 
-The cascades around a whole scene follow as density_1 and color_1, and so on, their voxels twice as large each time, with what lies in the box before left out.
+The cascades of an unbounded scene follow as density_1 and color_1, and so on, their voxels twice as large each time, with what lies in the box before left out.
 
 N voxels, L leaves.
 """
@@ -90,9 +90,9 @@ def grids_of(tree: NerfTree, frame: SourceFrame, path: Path) -> list[Grid]:
 
 
 def _colours(tree: NerfTree, kept: np.ndarray) -> np.ndarray:
-    """(n, 3) float16, linear: of an asset that keeps its captured cameras the mean over some of these, by how squarely each looks at the surface; else
-    the median over views from outside, as `surface_colours` has it. The harmonic of degree 0 is no such mean: what nobody photographed, a surface from
-    within, looks like whatever fitted the rest. docs/experiments/volume-colours.md"""
+    """(n, 3) float16, linear: for an asset that keeps its captured cameras, the mean over some of these, by how squarely each looks at the surface; else
+    the median over views from outside, as in `surface_colours`. The harmonic of degree 0 is no such mean: unseen directions, as of a surface from
+    within, are overfitted. docs/experiments/volume-colours.md"""
     voxels, centres, eyes = np.flatnonzero(kept), voxel_centres(tree), _eyes(tree)
     out = np.empty((len(voxels), 3), np.float16)
     for start in range(0, len(voxels), AT_ONCE):

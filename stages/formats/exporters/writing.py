@@ -1,4 +1,4 @@
-"""What all exporters share: the frame that a file's numbers are in, the checks before, and writing."""
+"""Shared by all exporters: the frame that a file's numbers are in, the checks before, and writing."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str
 
 
 def posed_format(folder: Path, settings: Any) -> str | None:
-    """The format of the cameras that a folder states which is to be read as photographs in spite of them; None where it states none."""
+    """The format of a folder's stated cameras where it is to be read as photographs in spite of them; else None."""
     if settings.format != "photographs" or not folder.is_dir():
         return None
     try:
@@ -147,10 +147,10 @@ def posed_format(folder: Path, settings: Any) -> str | None:
 
 
 def files(folder: Path, settings: Any) -> list[Path]:
-    """What the poses stage depends on: the files of the format in question that it reads, and of photographs those that state cameras of them."""
+    """The files that the poses stage depends on: those that the format reads, and for photographs those that state their cameras."""
     name = detect(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else settings.format
     found, stated = set(IMPORTERS[name].files(folder, settings)), posed_format(folder, settings)
     if stated is not None:
-        with suppress(BadInput):  # said where it is read
+        with suppress(BadInput):  # reported where it is read
             found |= set(IMPORTERS[stated].files(folder, settings))
     return sorted(found)

@@ -4,7 +4,7 @@
     u  = fx x' + s y' + cx                                                               s: skew, pixels
 
 Our models have neither k4 of r^8 nor a skew. A radial polynomial with k4 becomes the quotient of two cubics in r^2 (FULL_OPENCV) that is the same to
-`MAX_ERROR` pixels as far as the image reaches; a skew that moves no pixel by more than `MAX_SKEW` is left out. What cannot be had like this is refused.
+`MAX_ERROR` pixels as far as the image reaches; a skew that moves no pixel by more than `MAX_SKEW` is left out. Any other lens is refused.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from stages.io.pictures import Header, UnreadableImage, read_header
 
 _MODEL_PLACES = (".", "sparse", "sparse/*", "colmap", "colmap/sparse", "colmap/sparse/*", "dense/sparse", "dense/*/sparse", "model", "models/*")
 _IMAGE_PLACES = ("images", "input", "rgb", "photos", ".", "../images", "../../images")
-_REMEDY = "Put the images into a folder `images` beside the model."
+_REMEDY = "Put the images into a folder `images` next to the model."
 
 
 def model_folders(source: Source) -> list[Path]:

@@ -1,7 +1,7 @@
-"""From a list of frames to a capture: what all importers of lists have in common.
+"""From a list of frames to a capture, for all importers of lists.
 
-Frames name images. Those that are not where they are listed are looked for, one listed folder at a time: where nothing of a listed folder is found, the one
-folder of the source in which most of its names lie stands in for it (images/ listed, rgb/ there). Two folders that hold as many are not chosen between.
+Frames name images. Missing images are looked for, one listed folder at a time: where nothing of a listed folder is found, the one folder of the source
+with most of its names stands in for it (images/ listed, rgb/ there). A tie between two folders is not decided.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Frame:
     name    as listed, relative to the folder `beside`
     where   what messages call it
     camera  (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
-    bare    the format states no folder: the name alone is looked for, and nothing is said about where it was
-    mask    where the format names masks; else one beside the image is looked for
+    bare    the format states no folder: the name alone is looked for, and its place is not reported
+    mask    where the format names masks; else one next to the image is looked for
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""LLFF: poses_bounds.npy beside images/, images_4/, images_8/ ...
+"""LLFF: poses_bounds.npy next to images/, images_4/, images_8/ ...
 
 A row is 3x5 [R | t | (h, w, f)] with camera columns down, right, back, then near and far; rows are in the order of the sorted names.
 h, w, f are those of the full images; the images at hand may be smaller, and f is scaled to them.
@@ -31,15 +31,15 @@ def recognises(folder: Path, allow_outside: bool = False) -> bool:
 
 
 def holds_less_than_colmap(folder: Path, allow_outside: bool = False) -> bool:
-    """Whether the folder's COLMAP model is of all the images that poses_bounds.npy is of, and they look round about, as in mip-NeRF 360's data.
+    """Whether the folder's COLMAP model has all images of poses_bounds.npy, and they look round about, as in mip-NeRF 360's data.
 
-    The file was made from the model, and has one focal length for its lens and none of its points. Of forward-facing captures its depths give the space that
-    they are trained in.
+    The file was made from the model, and has one focal length for its lens and none of its points. For forward-facing captures its depths give the space of
+    the training.
     """
     source = Source(folder, allow_outside)
     try:
         rows, named = _rows(source), colmap.image_names(source)
-    except BadInput:  # said where it is read
+    except BadInput:  # reported where it is read
         return False
     here = [name_key(path.name) for path in images_in(folder / "images")]
     if sorted(name_key(PurePosixPath(name).name) for name in named) != sorted(here) or len(here) != len(rows):
@@ -166,7 +166,7 @@ def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[
     """The images in the order of the rows, the reduction factor of their folder, and warnings."""
     folders = image_folders(source.root)
     if not folders:
-        raise BadInput(f"{source.root}: {POSES} without images: expected a folder images, images_4, images_8 ... beside it.")
+        raise BadInput(f"{source.root}: {POSES} without images: expected a folder images, images_4, images_8 ... next to it.")
     counts = {factor: len(images_in(folder)) for factor, folder in folders.items()}
     if settings.llff_factor != "auto":
         if settings.llff_factor not in folders:

@@ -1,6 +1,6 @@
-"""Masks beside photographs.
+"""Masks next to photographs.
 
-A mask lies in a folder `masks` (or `mask`, in any case) beside or inside that of the images, or at the top of the source, at the image's own relative path.
+A mask lies in a folder `masks` (or `mask`, in any case) next to or inside that of the images, or at the top of the source, at the image's relative path.
 That of IMG_1.jpg is called IMG_1.png (nerfstudio), IMG_1.jpg.png (COLMAP), IMG_1.mask.png or IMG_1.jpg.mask (Brush), or IMG_1_mask.png; by the latter names it
 may lie in the folder of the photograph itself. Where it is black, the image is left out.
 """
@@ -20,7 +20,7 @@ _SUFFIX = ".mask"
 
 @dataclass
 class _Folders:
-    """What was found in folders, each read once.
+    """The contents of folders, each read once.
 
     masks   folders of masks by the folder that they lie in
     inside  masks by the key of their stem, by the folder of masks

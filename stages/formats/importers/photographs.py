@@ -1,6 +1,6 @@
 """Folders of photographs or videos: which files are photographs, and which are videos.
 
-Photographs come first: a phone keeps a short clip beside each of its own. Videos count where there are fewer photographs than make a data set.
+Photographs come first: a phone keeps a short clip with each of its own. Videos count where there are fewer photographs than make a data set.
 
 One picture that lies there twice (IMG_1.HEIC and IMG_1.JPG, as clouds export them) is read once: of two photographs of one name in a folder, which differ by
 their extension, those that were taken at one time, or look alike.
@@ -24,7 +24,7 @@ from stages.io.photo import read_photo
 from stages.io.pictures import RAW_SUFFIXES, UnreadableImage, exif_of, opened, read_header
 from stages.video import KNOWN, SUFFIXES
 
-# What conversions leave beside the photographs, in any case: reductions, depth maps, masks.
+# Left next to photographs by conversions, in any case: reductions, depth maps, masks.
 NOT_PHOTOGRAPHS = {*FOLDERS, "depth", "depths", "sparse", "dense", "stereo", "thumbnails", "thumbs", "@eadir"}
 CORRECTED = "corrected_images"
 _REDUCED = re.compile(r"images_\d+")
@@ -51,7 +51,7 @@ def _videos_in(folder: Path) -> list[Path]:
 
 def photographs(source: Source) -> list[Path]:
     """The photographs of a source: directly in it, in its folder images/, or, where there are too few, anywhere below it; sorted by path. Where there are too
-    few below, too, its videos. What is left aside is said in the source's remarks.
+    few below, too, its videos. The source's remarks list those left aside.
 
     Raises BadInput.
     """
@@ -82,13 +82,13 @@ def _all(source: Source) -> list[Path]:
 
 
 def _corrected_once(images: Sequence[Path]) -> list[Path]:
-    """Without those in a folder images/ that lie in corrected_images/ beside it, too, as Polycam writes them."""
+    """Without those in a folder images/ that lie in corrected_images/ next to it, too, as Polycam writes them."""
     corrected = {(path.parent.parent, path.name) for path in images if path.parent.name == CORRECTED}
     return [path for path in images if path.parent.name != "images" or (path.parent.parent, path.name) not in corrected]
 
 
 def _without_maps(images: Sequence[Path]) -> list[Path]:
-    """Without depth_00000.png and conf_00000.png where frame_00000.json lies beside them, as 3D Scanner App writes them."""
+    """Without depth_00000.png and conf_00000.png where frame_00000.json lies next to them, as 3D Scanner App writes them."""
     numbers = {path: found[1] for path in images if (found := _MAP.fullmatch(path.name))}
     return [path for path in images if path not in numbers or not path.with_name(f"frame_{numbers[path]}.json").is_file()]
 
@@ -98,7 +98,7 @@ def _count(paths: Sequence[Path], what: str, source: Source) -> str:
 
 
 def _is_beside(path: Path, folder: Path) -> bool:
-    """Whether a file lies in a folder of what conversions leave beside photographs."""
+    """Whether a file lies in a folder that conversions leave next to photographs."""
     return not NOT_PHOTOGRAPHS.isdisjoint(map(name_key, path.relative_to(folder).parts[:-1]))
 
 
@@ -121,7 +121,7 @@ def _remark_on_others(source: Source, found: Sequence[Path]) -> None:
 
 
 def _without_twins(source: Source, found: Sequence[Path]) -> list[Path]:
-    """One of each picture that is there in several formats; the others are named in the source's remarks."""
+    """One of each picture that is there in several formats; the source's remarks list the others."""
     named: dict[tuple[Path, str], list[Path]] = {}
     for path in found:
         named.setdefault((path.parent, name_key(path.stem)), []).append(path)

@@ -32,11 +32,11 @@ MAX_PATH = 4096  # characters of a listed name
 MAX_DEPTH = 32  # last parts of a listed name that are searched for below the source
 MIN_IMAGES = 3  # images that make a data set
 MAX_NAMES = 5  # names that a message lists
-MASK_ENDINGS = ("_mask", ".mask")  # of a mask that lies beside its photograph: IMG_1_mask.png
+MASK_ENDINGS = ("_mask", ".mask")  # of a mask that lies next to its photograph: IMG_1_mask.png
 
 
 class ImportSettings(Protocol):
-    """What importers read of the settings of the poses stage."""
+    """Settings of the poses stage that importers read."""
 
     @property
     def strict(self) -> bool: ...
@@ -52,13 +52,13 @@ def abbreviated(names: Sequence[str]) -> str:
 
 
 def name_key(name: str) -> str:
-    """What names are looked up by."""
+    """The key of a name."""
     return unicodedata.normalize("NFC", name).lower()
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a listed name led to.
+    """The file of a listed name.
 
     path  the file, or None
     how   "listed", "extension" (another one than listed) or "elsewhere" (at another place in the source)
@@ -74,9 +74,9 @@ class Source:
 
     root           the folder
     allow_outside  whether files outside it may be read
-    runs           run folders below it that a look-up came by: what they hold was made from the source, and is no part of it
-    links          linked folders that a look-up came by and did not follow, for they lead out of it
-    remarks        sentences about what of it is left aside, each once
+    runs           run folders below it that a look-up met: they were made from the source, and are no part of it
+    links          linked folders that a look-up met and did not follow, for they lead out of it
+    remarks        sentences about files that are left aside, each once
     """
 
     root: Path
@@ -96,7 +96,7 @@ class Source:
         self._real[self.root] = Path(os.path.realpath(self.root))
 
     def name_of(self, path: Path) -> str:
-        """What a file is called from here on: its path relative to the source folder, with /; for a file outside, its last two parts. Line ends, terminal
+        """The name of a file from here on: its path relative to the source folder, with /; for a file outside, its last two parts. Line ends, terminal
         escapes and bytes of no encoding are escaped, and no two files have one name.
         """
         if path not in self._names:
@@ -144,7 +144,7 @@ class Source:
         return [printable(sentence) for sentence in (*runs, *links, *self.remarks)]
 
     def linked_folders(self) -> str:
-        """What is said of the linked folders that were not followed."""
+        """A message about linked folders that were not followed."""
         names = [f"{path.relative_to(self.root)} -> {os.path.realpath(path)}" for path in sorted(self.links)]
         return f"linked folders, which are not followed ({abbreviated(names)}): name the target itself, or pass --allow-outside"
 
@@ -288,14 +288,14 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """The same with the masks that lie beside them, and with raw pictures that have a JPEG."""
+    """The same with the masks next to them, and with raw pictures that have a JPEG."""
     if not os.path.isdir(folder):
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file())
 
 
 def one_of_each(images: Sequence[Path]) -> list[Path]:
-    """Without a camera's raw pictures that lie beside the same as JPEG or the like, and without masks that lie beside their photograph."""
+    """Without a camera's raw pictures next to the same as JPEG or the like, and without masks next to their photograph."""
     developed = {path.with_suffix("") for path in images if path.suffix.lower() not in RAW_SUFFIXES}
     named = {(path.parent, name_key(name)) for path in images for name in (path.stem, path.name)}
 

@@ -6,7 +6,7 @@ All state camera-to-world matrices with x right, y up, looking along -z, and are
     nerfstudio   intrinsics at the top or per frame, `mask_path` (black is left out), `train_filenames` etc., points in a PLY file
     instant-ngp  `aabb_scale`, `scale`, `offset`; masks `dynamic_mask_<image>.png` (white is left out); rolling-shutter pairs of matrices
 
-Where a frame names no mask, one that lies beside its image counts. Depth that frames name (PNG; nerfstudio's `depth_file_path`, instant-ngp's `depth_path`)
+Where a frame names no mask, one next to its image counts. Depth that frames name (PNG; nerfstudio's `depth_file_path`, instant-ngp's `depth_path`)
 becomes sparse points where images agree on it. The capture's frame is that of the matrices; `applied_transform` is recorded only.
 """
 
@@ -229,7 +229,7 @@ def _photos(source: Source, listing: Listing[_Frame]) -> tuple[list[Photo], list
 
 
 def _masks(source: Source, found: Sequence[tuple[_Frame, Path]]) -> dict[Path, tuple[Path, str]]:
-    """Image -> its mask and which of the mask's pixels are left out: the mask that its frame names; of frames that name none, that beside the image."""
+    """Image -> its mask and which of the mask's pixels are left out: the mask that its frame names; of frames that name none, that next to the image."""
     masks: dict[Path, tuple[Path, str]] = {}
     unnamed = []
     for frame, image in found:

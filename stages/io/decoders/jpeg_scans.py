@@ -51,9 +51,9 @@ def _of_several_scans(data: bytes) -> bool | None:
 
 
 def holds_more_scans(data: bytes, limit: int) -> bool:
-    """Whether a JPEG somewhere in a file has more scans than `limit`: those of a raw picture's tiles lie where its directories say, which nobody checked.
+    """Whether a JPEG somewhere in a file has more scans than `limit`: those of a raw picture's tiles lie where its directories say, unchecked.
 
-    Each that may begin one is looked at; a file in which they overlap again and again is refused, too.
+    Each possible beginning is checked; a file in which they overlap again and again is refused, too.
     """
     at, left = -1, OVERLAPS * len(data)
     while (at := data.find(_BEGINNING, at + 1)) >= 0:

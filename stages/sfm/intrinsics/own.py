@@ -1,8 +1,8 @@
 """Intrinsics of its own for each photograph, where they explain observations that they were not fitted to.
 
 A lens that focuses nearer has another focal length ("focus breathing"), and stabilisation moves the lens or crops the frame. Both change from photograph to
-photograph by a few per cent, which one camera for all cannot follow. More parameters always fit better, so a fifth of the observations is left out, and tells
-whether what was fitted to the others is so. docs/experiments/sfm.md
+photograph by a few per cent, which one camera for all cannot follow. More parameters always fit better, so a fifth of the observations is left out as a
+test of the fit to the others. docs/experiments/sfm.md
 """
 
 from __future__ import annotations

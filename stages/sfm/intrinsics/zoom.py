@@ -80,7 +80,7 @@ def with_principal_points(model: Any, safe_point: SafePoint) -> Any:
     """The model adjusted so that each of its cameras, SIMPLE_RADIAL and of one photograph each, has a principal point of its own, but all the same focal
     length and distortion, as of one lens: a photograph by itself does not determine them all.
 
-    The distortion that was found is that of photographs taken for whole ones, and a wrong start.
+    The distortion found before assumes uncropped photographs, and is a wrong start.
     """
     adjusted = deepcopy(model)
     used = sorted({adjusted.images[image_id].camera_id for image_id in adjusted.reg_image_ids()})

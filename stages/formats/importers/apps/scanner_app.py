@@ -1,4 +1,4 @@
-"""3D Scanner App's export "All Data" (Laan Labs): frame_00000.jpg beside frame_00000.json, directly in the folder or in the only folder that it holds.
+"""3D Scanner App's export "All Data" (Laan Labs): frame_00000.jpg next to frame_00000.json, directly in the folder or in the only folder that it holds.
 
 Layout: the readers of PSegs (ios_lidar) and nuwa (from_3dscannerapp). cameraPoseARFrame is ARCamera.transform row by row: camera to world with x right, y up,
 looking along -z, for the picture as the sensor has it (landscape); the world is ARKit's: y up, metres. intrinsics are K row by row, in pixels of the picture.
@@ -45,7 +45,7 @@ def _signs(source: Source) -> Sequence[Path]:
 
 def _recognised(source: Source, signs: Sequence[Path]) -> bool:
     for path in signs[:_TRIED]:
-        with suppress(BadInput):  # said where it is read
+        with suppress(BadInput):  # reported where it is read
             document = read_json(source.real(path), _AGAIN, limit=LARGEST_FRAME)
             if isinstance(document, dict) and POSE in document:
                 return True
@@ -110,4 +110,4 @@ def _camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Came
     return at
 
 
-FORMAT = ListFormat("3d-scanner-app", "frame_00000.jpg beside frame_00000.json and so on", _signs, _listed, _recognised)
+FORMAT = ListFormat("3d-scanner-app", "frame_00000.jpg next to frame_00000.json and so on", _signs, _listed, _recognised)

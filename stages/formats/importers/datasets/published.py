@@ -460,4 +460,4 @@ KAPTURE = ListFormat("kapture", f"{SENSORS} and {RECORDS}", _kapture_files, _kap
 MVSNET = ListFormat("mvsnet", "cams/00000000_cam.txt and so on", _mvsnet_files, _mvsnet)
 IDR = ListFormat("idr", "cameras_sphere.npz or cameras.npz", _idr_files, _idr)
 NSVF = ListFormat("nsvf", "intrinsics.txt and pose/<name>.txt", _nsvf_files, _nsvf)
-TANKS = ListFormat("tanks-and-temples", "one trajectory (.log) beside the folder of images", _tanks_files, _tanks)
+TANKS = ListFormat("tanks-and-temples", "one trajectory (.log) next to the folder of images", _tanks_files, _tanks)

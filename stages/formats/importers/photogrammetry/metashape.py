@@ -1,4 +1,4 @@
-"""Agisoft Metashape's camera export ("File > Export > Export Cameras", Agisoft XML) beside the photographs.
+"""Agisoft Metashape's camera export ("File > Export > Export Cameras", Agisoft XML) next to the photographs.
 
 Layout: the XML files that Metashape 1.5 to 2.2 write; lens: the Metashape user manual, appendix "Camera models" (frame and fisheye cameras)
 
@@ -115,7 +115,7 @@ class _Sensors:
             element = self.elements.get(number_of)
             where = f"{self.where}: sensor {printable(number_of, 20)}"
             if element is None:
-                raise BadInput(f"{where}: named by a camera, and missing. {_ALIGN}")
+                raise BadInput(f"{where}: listed by a camera, and missing. {_ALIGN}")
             self._made[number_of] = self._sensor(element, where)
         return self._made[number_of]
 
@@ -169,4 +169,4 @@ def _world(transform: Element | None, where: str) -> tuple[Similarity, bool, np.
     return Similarity(scale, turn, np.zeros(3)), metric, up, said
 
 
-FORMAT = ListFormat("metashape", "an XML file with the cameras of Metashape beside the photographs", _camera_files, _listed)
+FORMAT = ListFormat("metashape", "an XML file with the cameras of Metashape next to the photographs", _camera_files, _listed)

@@ -1,4 +1,4 @@
-"""RealityCapture (RealityScan): its table of internal and external camera parameters (CSV), or XMP files beside the photographs.
+"""RealityCapture (RealityScan): its table of internal and external camera parameters (CSV), or XMP files next to the photographs.
 
 Layout: the application's help, "Export registration", and the article "RealityCapture XMP camera math". Lengths of the lens are shares of the image's longer
 side: `f` and FocalLength35mm in 36ths, px, py and PrincipalPointU, V as they are, from the middle of the image.
@@ -205,4 +205,4 @@ def _sidecar(stated: Callable[[str], str | None], where: str) -> Callable[[str, 
     return _lens(value("FocalLength35mm", "0"), (value("PrincipalPointU", "0"), value("PrincipalPointV", "0")), radial, tangential, pose, where)
 
 
-FORMAT = ListFormat("realitycapture", f"a CSV file with the columns {', '.join(REQUIRED)}, or XMP files beside the photographs", _signs, _listed)
+FORMAT = ListFormat("realitycapture", f"a CSV file with the columns {', '.join(REQUIRED)}, or XMP files next to the photographs", _signs, _listed)
