@@ -1,4 +1,4 @@
-"""The few operations on files that everything else is made of: atomic writes, bounded reads, canonical JSON, safe names.
+"""Basic operations on files: atomic writes, bounded reads, canonical JSON, safe names.
 
 What must survive a kill or a power cut goes through these functions and no others, so that tests can cut the power at each of them. `atomic` is the
 one writer of files that appear whole or not at all. Nothing is written or deleted through a link, and nothing but plain files is opened.
@@ -216,7 +216,7 @@ def atomic_together(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _disk_full_behind(error: BaseException, path: Path) -> OSError | None:
-    """The error of a full disk where a library failed without the number of an error, as long as what it has written still fills the disk."""
+    """The full-disk error, for a library that failed without an error number, while what it wrote still fills the disk."""
     if not isinstance(error, Exception) or (isinstance(error, OSError) and error.errno is not None):
         return None
     with contextlib.suppress(OSError):
@@ -233,7 +233,7 @@ def _created_beside(path: Path) -> Path:
 
 
 def _repeated(name: str) -> str:
-    """As much of a file's name as its temporary's has room for."""
+    """As much of a file's name as fits into its temporary's."""
     while len(os.fsencode(name)) > _LONGEST:
         name = name[:-1]
     return name
@@ -318,7 +318,7 @@ def sync_file(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Whatever it is, with all that is in it; a link goes, not what it points to."""
+    """Remove anything, with all that is in it; of a link, the link and not its target."""
     if not is_folder(path):
         path.unlink(missing_ok=True)
         return

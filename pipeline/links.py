@@ -1,4 +1,4 @@
-"""What no run holds: links, pipes, sockets and devices. A run that a stranger packed may hold them, and lead what opens its files elsewhere.
+"""Refuses runs with links, pipes, sockets or devices: a run that a stranger packed may hold them, to lead what opens its files elsewhere.
 
 The engine writes and deletes within a run, and stages append to files of their scratch folders. One rule makes that safe: under the names that the
 engine and its stages use, a run holds plain files and folders, and in its scratch folders no file has a second name (a hard link). Artifacts may have

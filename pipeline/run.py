@@ -53,13 +53,13 @@ _FIELDS: dict[str, Any] = {
 
 
 class ResumeText(Protocol):
-    """What messages say of how to go on with a run: a workflow gives the command, the engine knows none.
+    """How to resume a run, for messages: a workflow gives the command, the engine knows none.
 
     until        the last stage to run; None: all
     start        the first stage to run even if it is up to date; None: none
     only         the one stage to run
     force        whether that one is to run even if it is up to date
-    with_source  whether the source has to be named
+    with_source  whether the source has to be given
     """
 
     def __call__(

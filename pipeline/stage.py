@@ -170,7 +170,7 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") -> T:
-    """An instance of the settings dataclass from plain values, as JSON or TOML give them; what is not named keeps its default.
+    """An instance of the settings dataclass from plain values, as JSON or TOML give them; fields that are missing keep their defaults.
 
     where  put before names in errors, e.g. "train": `train.iterations: ...`
 

@@ -45,7 +45,7 @@ def note(path: Path, value: Any, outputs: Sequence[Path] = ()) -> None:
 def noted(path: Path, kind: type[T], warn: Warn, check: Callable[[T, Collection[str]], object] | None = None) -> T | None:
     """The value of a note, of this type as msgspec decodes it; None where there is none that counts.
 
-    warn   is told of a note that does not count
+    warn   is called for a note that does not count
     check  is given the value and the names of the files, and raises where they are not what the stage needs
     """
     try:

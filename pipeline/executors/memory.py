@@ -1,6 +1,6 @@
-"""How much memory a run may take: what `--memory` says, or what the machine and the limits on this process leave.
+"""How much memory a run may take: the value of `--memory`, or what the machine and this process's limits allow.
 
-Nothing here depends on what other programs take at the moment, `available_now` apart: the same limits give the same plan.
+Only `available_now` depends on the memory that other programs take: the same limits give the same plan.
 
     machine   all of its memory
     cgroup    the smallest limit of the process's control group and of those above it, version 1 or 2
@@ -130,7 +130,7 @@ def _cgroup_folders(root: Path) -> Iterator[tuple[Path, str]]:
     """(folder, name) of each control group of this process that memory is limited by, the innermost first.
 
     A line of /proc/self/cgroup is `number:controllers:/path`. In version 2 (number 0, no controllers) all are mounted at one place, /sys/fs/cgroup, or
-    `unified` in it beside version 1; in version 1 those of memory at `memory`. Within a container the path may be that of the host, and the
+    `unified` in it together with version 1; in version 1 those of memory at `memory`. Within a container the path may be that of the host, and the
     container's own group the root of the mount; so the root is always among them.
     """
     try:

@@ -55,7 +55,7 @@ class Progress:
         return None if estimate is None else int(HEADROOM * estimate)
 
     def too_little(self, memory: int | None) -> str | None:
-        """A sentence where these bytes are less than its stage is estimated to take: then they are all of the largest worker's."""
+        """A warning where these bytes, all of the largest worker's, are less than the stage's estimate."""
         need = self.memory.get(self.what, 0)
         if memory is None or need <= memory or self.attempts.memory is not None:
             return None

@@ -16,7 +16,7 @@ from pipeline.fleet.state import MOST_SCENES
 
 FOLDER = ".requests"
 MOST = 100  # that are taken at a time
-ANSWER_SECONDS = 30.0  # that who asks waits for the process that runs the fleet, which looks every second
+ANSWER_SECONDS = 30.0  # that the caller waits for the process that runs the fleet, which checks every second
 _LIMIT = 4 * 2**20  # bytes of one
 
 
@@ -39,7 +39,7 @@ def ask(fleet: Path, do: Literal["cancel", "retry"], scenes: Sequence[str] | Non
 
 
 def outcome(path: Path, is_running: Callable[[], bool], seconds: float | None = None) -> Literal["taken", "ended", "left"]:
-    """What becomes of a request: taken; ended: the fleet did first, and it is withdrawn; or left: nobody answered in this time, by default ANSWER_SECONDS."""
+    """What becomes of a request: taken; ended: the fleet did first, and it is withdrawn; or left: no answer in this time, by default ANSWER_SECONDS."""
     deadline = time.monotonic() + (ANSWER_SECONDS if seconds is None else seconds)
     look = time.monotonic() + 2.0
     while files.exists(path):

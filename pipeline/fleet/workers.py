@@ -1,4 +1,4 @@
-"""What stages of a fleet run on, as the scheduler sees it: workers with room, tasks for them, and what comes back."""
+"""What stages of a fleet run on, as the scheduler sees it: workers with their capacity, tasks, and results."""
 
 from __future__ import annotations
 

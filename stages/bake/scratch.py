@@ -13,7 +13,7 @@ from stages.scratch import Warn, note, noted
 
 
 def write_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
-    """Write PATH_NAME.npy of each, then the note PATH.json that says they are whole."""
+    """Write PATH_NAME.npy of each, then the note PATH.json that says they are complete."""
     outputs = []
     for name, values in arrays.items():
         outputs.append(path.with_name(f"{path.name}_{name}.npy"))

@@ -25,7 +25,7 @@ OnRays = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (
 class EvaluatedAsset:
     """What is measured of an asset.
 
-    render   the whole of it, as `efficientnerf.asset.rendering.render`
+    render   all of it, as `efficientnerf.asset.rendering.render`
     inner    cascade 0 alone, where that lies in surroundings that the asset shows too; None: the asset shows what lies in its box, and no more
     box      (2, 3) of cascade 0; None: that of the field's space
     reach    (2, 3) of all cascades; None: the same
@@ -55,7 +55,7 @@ def evaluated(tree: NerfTree) -> EvaluatedAsset:
 def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The asset's image of a view (H, W, 3), and the opacity and the depth of its voxels (H, W).
 
-    seen    the field's rendering on every stride-th pixel: the surroundings of an asset that shows none in an unbounded scene; else it is not looked at
+    seen    the field's rendering on every stride-th pixel: the surroundings of an asset that shows none in an unbounded scene; else it is not used
     """
     background = constant_background(scene)
     if background is None and asset.inner is None:

@@ -3,7 +3,7 @@
 gap       asset minus network on the pixels that the network was rendered at: PSNR, SSIM, PSNR with fitted colours
 holes     share of those pixels where the asset's opacity is below HOLE and the network's above SOLID. Where the asset has cascades, the network's is that of
           what lies before the end of the last one: what is beyond has its place in the environment map
-floaters  opacity of the asset nearer than the network's surfaces, less a margin (`efficientnerf.evaluation.surfaces`), over its whole opacity: means over at
+floaters  opacity of the asset nearer than the network's surfaces, less a margin (`efficientnerf.evaluation.surfaces`), over its total opacity: means over at
           most FLOATER_RAYS pixels. The network's own figure, the same of itself, says how much of that is soft edges
 holes_excess_error, floaters_excess_error  the asset's squared error less the network's, of those pixels and weighed by that opacity, over what `holes` and
           `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there

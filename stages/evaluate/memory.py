@@ -45,7 +45,7 @@ def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, d
 
 
 def memory_needed(known: Known) -> Need:
-    """`needed` for the whole asset."""
+    """`needed` for all of the asset."""
     return needed(asset_of(known), known.settings["evaluate"], known.inputs(EvaluateInputs), known.device)
 
 

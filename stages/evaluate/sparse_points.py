@@ -1,7 +1,7 @@
 """Whether an asset is where structure from motion found points: its depth at the pixels of sparse points against theirs.
 
-A sparse point that three photographs see says twice what a picture cannot: that something is there, and that the way to it is free. Where the asset is
-nearer, something hangs before its surfaces; where it is farther, what the photographs show is missing, however right its colours are.
+A sparse point that three photographs see shows what a picture cannot: there is a surface, and nothing before it. Where the asset is nearer, it has
+a floater; where it is farther, a surface is missing, however right its colours are.
 
 nearer, agreeing, farther  shares of the points; subject_farther: the same of those in the scene bounds. A point agrees where the asset's depth is within
                            TOLERANCE of its own in a pixel or in one next to it: points are found at edges
@@ -23,7 +23,7 @@ from stages.framing.near_planes import reliable_points
 from stages.io.scene import Scene, read_points
 
 TOLERANCE = 0.05  # of a point's depth; docs/experiments/verdict.md
-FEW = 30  # points of all views together, below which nothing is said
+FEW = 30  # points of all views together, below which nothing is reported
 NEARER, AGREES, FARTHER = -1, 0, 1
 COUNTS = ("points", "nearer", "farther", "subject_points", "subject_farther")  # of a view
 COLOURS = {NEARER: (220, 40, 40), AGREES: (40, 170, 70), FARTHER: (40, 90, 230)}

@@ -56,7 +56,7 @@ def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
 
 
 def memory_needed(known: Known) -> Need:
-    """`needed` for the whole asset."""
+    """`needed` for all of the asset."""
     return needed(asset_of(known), known.settings["mesh"], known.inputs(MeshInputs))
 
 

@@ -11,7 +11,7 @@ WRITTEN = 30  # bytes of a point
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage points takes for the whole asset."""
+    """What the stage points takes for all of the asset."""
     return surface_needed(asset_of(known), known.settings["points"].num_points)
 
 

@@ -56,7 +56,7 @@ def pixels_of(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Pa
 
 
 def memory_needed(known: Known) -> Need:
-    """`needed` for the whole asset."""
+    """`needed` for all of the asset."""
     if known.settings["splats"].make == "off":
         return Need({"libraries": libraries()})
     inputs = known.inputs(SplatsInputs)

@@ -1,4 +1,4 @@
-"""The splats stage: the asset as 3D Gaussians, which the programs of others render in real time; as PLY and SPZ, with a preview and a report.
+"""The splats stage: the asset as 3D Gaussians, which other programs render in real time; as PLY and SPZ, with a preview and a report.
 
 Where splats.make is off, or auto and none can be made, the report says so, and there is no more.
 """

@@ -61,7 +61,7 @@ def begin_exposure(
     """What is learned of the training photographs' exposure, as it begins: as sparse points show it, where there are any. None: nothing is learned.
 
     choice  train.exposure
-    say     is told where it is learned
+    say     is called where it is learned
     """
     if choice == "off" or s.background is not None or (choice == "auto" and not s.points):
         return None

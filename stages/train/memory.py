@@ -116,7 +116,7 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
         return None
     pixels = count_pixels(tuple(views))
     job.warn(
-        f"the training pixels, {size_text(pixels * channels)}, are kept in a file, for they do not fit into memory beside the rest: reading them takes longer."
+        f"the training pixels, {size_text(pixels * channels)}, are kept in a file, for they do not fit into memory with the rest: reading them takes longer."
         " Give more by --memory, or lower poses.max_image_size."
     )
     return PixelFile(pixels, channels, job.work)

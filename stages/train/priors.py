@@ -5,7 +5,7 @@
     masks        what no view shows by a pixel that its mask keeps is not asked for
 
 Reliable sparse points (`stages.framing.near_planes`) are evidence that space is filled. The first two are dropped where they contradict more than
-MAX_CONTRADICTED of them; masks are the word of the user, or of a stage that has judged them. All rules of the program: docs/priors.md.
+MAX_CONTRADICTED of them; masks are given by the user, or by a stage that has checked them. All rules of the program: docs/priors.md.
 """
 
 from __future__ import annotations

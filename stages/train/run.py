@@ -117,7 +117,7 @@ def colours_seen(renderer: FieldRenderer, camera: Camera) -> np.ndarray:
 
 
 def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> SparseDepthRays | None:
-    """Rays to sparse points. It is said where there are points and none of them can be used."""
+    """Rays to sparse points. A message says where there are points and none can be used."""
     found = sparse_depth_of(folder, s, settings.seed)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
         job.say("no sparse point lies before enough of the training cameras that observe it: train.sparse_depth_loss_weight has no effect")
@@ -134,7 +134,7 @@ def begin_budget(job: Job, t: Trainer, spent: float) -> Budget | None:
 
 
 def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
-    """Take over the budget's schedule where a step has changed it."""
+    """Adopt the budget's schedule where a step has changed it."""
     before, known = budget.schedule.iterations, budget.known
     if budget.after(t.step):
         t.schedule = budget.schedule

@@ -9,7 +9,7 @@ from stages.memory.tree import asset_of, tree_bytes
 
 FRAME = 116  # bytes of a pixel of a frame with all its channels while it is written as EXR
 BAND = 160 * MIB  # rays at a time where each is rendered on its own
-VIDEO_PIXEL = 1  # written byte of a pixel of a frame, beside a byte for each of its channels as PNG
+VIDEO_PIXEL = 1  # written byte of a pixel of a frame, besides a byte for each of its channels as PNG
 EXR_PIXEL = 4 * (4 + 1 + 3 + 3)  # float32: colour with alpha, depth, normal, position
 
 
@@ -23,7 +23,7 @@ def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage turntable takes for the whole asset."""
+    """What the stage turntable takes for all of the asset."""
     own = known.settings["turntable"]
     return frames_needed(asset_of(known), own.width * own.height, known.device)
 

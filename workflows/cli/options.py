@@ -29,7 +29,7 @@ crop_option = click.option(
 
 
 class PathOfAnything(click.Path):
-    """A path as it was given; what is at it is looked at later."""
+    """A path as it was given; its target is checked later."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if "\0" in str(value):

@@ -1,4 +1,4 @@
-"""Standard output and standard error while a command runs: output that cannot be written ends nothing, and is not forgotten.
+"""Standard output and standard error while a command runs: a failed write ends nothing, but is reported.
 
 The result of a command decides its exit code. What goes to standard error, and the closing words of a command that makes files, is at most lost. What the
 command is for (a listing, anything with --json) is missed: a command that went well then ends with UNWRITTEN. A reader that closes the pipe of a
@@ -96,7 +96,7 @@ class Stream:
             self.failure = error if isinstance(error, OSError) else OSError(errno.EBADF, os.strerror(errno.EBADF))
 
     def settle(self) -> None:
-        """Leave nothing in the buffer that Python would stumble over when it flushes at exit, and answer with exit code 120."""
+        """Empty the buffer: Python flushes it at exit, and a failure there would give exit code 120."""
         self.flush()
         if self.stream is None:
             return

@@ -22,7 +22,7 @@ from stages.settings import SettingInfo, describe_settings
 from workflows.asset import WORKFLOW
 
 Table = Mapping[str, Mapping[str, Any]]
-# Beside the tables of the stages, a configuration file may hold what the dedicated options say.
+# Besides the tables of the stages, a configuration file may hold the values of the dedicated options.
 CONFIG_OPTIONS = ("preset", "device", "seed")
 MAX_TOML = 2**16  # bytes; all settings together are a tenth of it
 MAX_SHOWN = 200  # characters of a value in a message
@@ -49,7 +49,7 @@ class Preset:
 
 @dataclass(frozen=True)
 class Config:
-    """A configuration file, read: the tables of the stages and the options named in CONFIG_OPTIONS."""
+    """A configuration file, read: the tables of the stages and the options in CONFIG_OPTIONS."""
 
     table: Table
     options: Mapping[str, Any] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""What `enerf check` tells of photographs before a run of them."""
+"""`enerf check`: the verdict on photographs before a run."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
 
 
 def _nothing(*values: object) -> None:
-    """Who is told of progress and warnings, where nobody is."""
+    """Takes progress and warnings, and drops them."""
 
 
 def in_words(found: dict[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""`enerf paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, beside the paper's figures.
+"""`enerf paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, next to the paper's figures.
 
     OUT/table_N.md     for people
     OUT/table_N.json   {"table", "title", "scale", "columns", "rows", "notes", "hardware", "versions"}

@@ -1,7 +1,7 @@
 """Whether a page of a run is one that this program wrote, and wrote here: a page is a program that a browser runs, and a run may come from anybody.
 
 A page's last line is a comment with the SHA-256 of all before it, and with an HMAC of that by a key which the user alone can read. By the first `verify`
-knows a page that was altered; by the second it is known before it is opened whether who wrote it has the key. One that does not is made again.
+finds a page that was altered; by the second a page is known, before it is opened, to be by a holder of the key. Others are made again.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _key() -> bytes:
         if not path.is_file() or path.stat().st_size != KEY:
             files.write_atomically(path, secrets.token_bytes(KEY))
         return path.read_bytes()
-    except (OSError, RuntimeError):  # no home, no room
+    except (OSError, RuntimeError):  # no home, no space
         return secrets.token_bytes(KEY)
 
 

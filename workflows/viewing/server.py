@@ -1,6 +1,6 @@
 """A server of a few pages for one browser: it reads, and answers GET and HEAD for the names that its site lists, and nothing else.
 
-Whoever runs on this machine may ask it, a page of another site in this machine's browser too. Hence: it listens on the loopback interface unless told
+Whoever runs on this machine may ask it, a page of another site in this machine's browser too. Hence: it listens on the loopback interface unless asked
 otherwise; requests must name it by that (a name that was made to point here, DNS rebinding, is refused); no other site may embed or read its answers; no
 part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; who is slow keeps nobody else waiting.
 """
@@ -98,7 +98,7 @@ class Server(ThreadingHTTPServer):
         return f"http://{host}:{self.server_address[1]}/"
 
     def server_bind(self) -> None:
-        """As the class above it, which would look up the name of this machine."""
+        """As the base class, which would look up the name of this machine."""
         if self.allow_reuse_address:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
@@ -193,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             answer = self.server.site(self.path)
-        except Exception:  # whatever it is, it is told where the command runs, not here
+        except Exception:  # any error is reported where the command runs, not here
             self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR)
             return
         if answer is None:

@@ -1,8 +1,8 @@
-"""Second chances: what is known to rescue captures, tried by short trainings where a run learns nothing.
+"""Second chances: where a run learns nothing, short trainings try changes that have rescued other captures.
 
 Each trial leaves out one of the priors that keep density away, or lets training correct what photographs and cameras have wrong. All begin from nothing, draw
-the same pixels, and are compared on the same pixels of the same held-out views. A trial is small enough that one which a kill cut short is done again; those
-that are finished are not. docs/experiments/early-check.md
+the same pixels, and are compared on the same pixels of the same held-out views. A trial that a kill cut short is done again; finished
+ones are not. docs/experiments/early-check.md
 """
 
 from __future__ import annotations

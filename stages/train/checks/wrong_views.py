@@ -1,4 +1,4 @@
-"""Training views whose cameras turn out to be wrong: the checks between the steps, and what is written and shown of them."""
+"""Training views with wrong cameras: the checks between the steps, and what is written and shown of them."""
 
 from __future__ import annotations
 
