@@ -1,4 +1,4 @@
-"""What made an artifact, and what it consists of: manifest.json, the last file written into an artifact's folder.
+"""The origin and files of an artifact: manifest.json, the last file written into an artifact's folder.
 
 request   stage, version, settings, digests of the inputs, digests of the source's files. Its SHA-256 names the work folder
 outputs   name -> SHA-256, size, and whether it depends on the clock (volatile)

@@ -218,7 +218,7 @@ class Run:
             raise RunLocked(f"{self.path}: no longer this process's to write: {why}. What is done is kept. Go on with: {self.how_to_resume()}")
 
     def _clear_temporaries(self) -> None:
-        """What kills left of writing files outside of artifacts; if they cannot be removed, they do no harm."""
+        """Remove files outside of artifacts that killed writers left; those that cannot be removed do no harm."""
         with contextlib.suppress(OSError):
             for path in (self.path / NAME, self.path / HOLDER, self.cache):
                 files.remove_temporaries(path)
@@ -252,7 +252,7 @@ class Run:
 
 
 def named(sources: Sequence[Path]) -> dict[str, Path]:
-    """Sources by the name that what they hold goes by: "" for one alone; else that of the folder or file, with a number where another has it."""
+    """Sources by name: "" for one alone; else the name of the folder or file, with a number where another has it."""
     if len(sources) == 1:
         return {"": sources[0]}
     found: dict[str, Path] = {}

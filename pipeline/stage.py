@@ -1,4 +1,4 @@
-"""What a stage is, what it is handed when it runs, and the strict reading of its settings."""
+"""A stage, the job that it is handed when it runs, and the strict reading of its settings."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Name:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a stage leaves in a folder.
+    """The outputs of a stage.
 
     stage  its name, which is also that of its folder in a run
     """

@@ -1,4 +1,4 @@
-"""What a stage leaves in its scratch folder for a later attempt: each piece with a note of the SHA-256 of its files.
+"""Pieces of work in a stage's scratch folder for a later attempt, each with a note of the SHA-256 of its files.
 
 Scratch is not synced: after a power cut a file may have its name and nothing, or half, of what was in it; and a run may come from someone else. A piece
 counts only where the note and all of its files are as they were written, and the note's value is of the type that is expected. Else the note is

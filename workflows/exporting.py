@@ -1,4 +1,4 @@
-"""What `enerf export` does: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras. 3D Gaussians:
+"""`enerf export`: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras. 3D Gaussians:
 `workflows.exporting_splats`."""
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Written = dict[str, Any]
 
 @dataclass(frozen=True)
 class Export:
-    """What is asked for.
+    """An export request.
 
     what       a run or an asset
     files      to write, by extension; those that are there only if `force`

@@ -47,7 +47,7 @@ def parse_size(text: str) -> int:
 
 
 def limit_for(asked: int | None, recorded: int | None, root: Path = Path("/")) -> Limit | None:
-    """What a run may take: what was asked for now, else the smaller of what its run.json says and what this machine has, else that.
+    """A run's limit: the value asked for now, else the smaller of run.json's and this machine's, else this machine's.
 
     A run.json may come from anybody: it can lower the limit, and not lift it.
     """
@@ -77,7 +77,7 @@ def usable_memory(root: Path = Path("/"), cores: int | None = None) -> Limit | N
 
 
 def available_now(root: Path = Path("/")) -> int | None:
-    """Bytes that this process could have right now: its own, and what no other program uses; None where the system does not say.
+    """Bytes that this process could have now: its own and all unused ones; None where the system does not say.
 
     It changes from moment to moment. Only where data lie may depend on it, and warnings; never what is made, nor what is refused.
     """

@@ -29,7 +29,7 @@ from pipeline.text import printable
 
 
 class Program(Protocol):
-    """What a workflow knows and the engine does not.
+    """The workflow's part, unknown to the engine.
 
     stages  in order
     """

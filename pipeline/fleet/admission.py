@@ -31,7 +31,7 @@ class _Kept:
 
 
 class Admission:
-    """What of each worker is taken. Scenes ask in the order in which they may begin."""
+    """The used part of each worker. Scenes ask in the order in which they may begin."""
 
     def __init__(self) -> None:
         self._tasks: dict[str, dict[int, Task]] = defaultdict(dict)
@@ -105,7 +105,7 @@ class Admission:
         return sum(task.memory or 0 for task in tasks if task.number >= kept.since) + memory + kept.memory <= worker.memory
 
     def _keep(self, who: int, demand: Demand, workers: Sequence[Worker]) -> None:
-        """Reserve the largest of these workers for a scene; a reservation stays."""
+        """Reserve the worker with most free memory; a reservation stays."""
         for worker in self._workers:
             kept = self._kept.get(worker.name)
             if kept is not None and kept.who == who:

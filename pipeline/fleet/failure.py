@@ -1,4 +1,4 @@
-"""What becomes of a scene whose stage failed: tried again, differently, or given up with the reason.
+"""Decides about a scene whose stage failed: try again, try differently, or give up with the reason.
 
 its process crashed                           once more, on another worker if there is one
 its worker died                               the same, and then failed: stages run in processes of their own, so that it says little of the scene

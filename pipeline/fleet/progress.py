@@ -69,7 +69,7 @@ class Progress:
         return True
 
     def record(self, result: Mapping[str, Any], known: Collection[str]) -> None:
-        """What an answer says of the run: what its stages took, of those that are known; what they made; and what the next takes."""
+        """Read an answer about the run: what its known stages took, what they made, and what the next takes."""
         for found in [*result.get("stages", []), *([result] if "fresh" in result else [])]:
             if found.get("name") not in known or not found.get("fresh"):
                 continue

@@ -1,4 +1,4 @@
-"""What `enerf fleet retry` and `cancel` ask of the process that runs the fleet, on whatever machine that is: files in FLEET/.requests, taken in order."""
+"""Requests of `enerf fleet retry` and `cancel` to the process that runs the fleet, on any machine: files in FLEET/.requests, taken in order."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ class Scheduler:
         return not (uses and self.device == "cuda"), each.todo is None, each.number
 
     def _demand(self, each: Progress) -> Demand:
-        """What it waits for: what its stage takes, or all of the largest worker where that is less. The worker that had more may have gone."""
+        """The scene's demand: its stage's, or all of the largest worker where that is less: the worker that had more may have gone."""
         stage, memory = self.stages.get(each.what), each.bytes_needed()
         if memory is not None and self._largest is not None:
             memory = min(memory, self._largest)

@@ -247,7 +247,7 @@ def read_fleet(fleet: Path) -> FleetState:
 
 
 def _check(path: Path, found: FleetState) -> None:
-    """What types alone do not say."""
+    """Checks beyond types."""
     try:
         check_scenes([scene.scene() for scene in found.scenes])
     except UsageError as error:

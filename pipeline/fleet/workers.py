@@ -1,4 +1,4 @@
-"""What stages of a fleet run on, as the scheduler sees it: workers with their capacity, tasks, and results."""
+"""The scheduler's view of its executor: workers with their capacity, tasks, and results."""
 
 from __future__ import annotations
 
@@ -87,10 +87,10 @@ class Workers(Protocol):
         """Begin with a task; its messages come by `receive`."""
 
     def stop(self, task: Task) -> None:
-        """Ask a task to stop at its next safe point; its result comes as ever."""
+        """Ask a task to stop at its next safe point; its result still comes."""
 
     def receive(self, timeout: float) -> list[Message]:
-        """What has come, after at most so many seconds if nothing has."""
+        """Messages that have come; waits at most so many seconds for one."""
 
     def close(self) -> None:
         """End all that still runs."""

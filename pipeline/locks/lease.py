@@ -131,7 +131,7 @@ def age_of(folder: Path) -> float | None:
 
 @cache
 def machine() -> str:
-    """What no other machine has while this one runs."""
+    """A unique identifier of this machine, while it runs."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:

@@ -1,4 +1,4 @@
-"""What baking takes: at most, before it begins; and once its voxels are known. docs/experiments/memory.md"""
+"""Memory of baking: at most, before it begins; and once its voxels are known. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def free_on_device(device: str) -> int:
 def needed(
     settings: BakeSettings, m: Model, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, whole: bool, device: str
 ) -> Need:
-    """What baking a model takes.
+    """Memory to bake a model.
 
     channels  of the pixels
     voxels    that are baked
@@ -108,7 +108,7 @@ def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: 
 def most_needed(
     settings: BakeSettings, m: Model, s: Scene, views: Sequence[View], channels: int, mib: float, whole: bool, device: str
 ) -> tuple[int, int, Callable[..., Need]]:
-    """What baking a model takes at most, before its voxels are counted.
+    """Most memory to bake a model, before its voxels are counted.
 
     mib      that the asset may have
     returns  voxels along the finest grid in question; how many are baked at most; and `needed` as a function of (voxels, stored=)
@@ -150,7 +150,7 @@ def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: P
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage bake takes at most, before its voxels are counted."""
+    """Most memory of the stage bake, before its voxels are counted."""
     return _before(known)[-1]
 
 

@@ -1,4 +1,4 @@
-"""What is baked: the voxels of one grid, or of the cascades of an unbounded scene."""
+"""The voxels to bake: of one grid, or of the cascades of an unbounded scene."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def _write_array(values: np.ndarray, file: BinaryIO) -> None:
 
 
 def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]], warn: Warn) -> dict[str, np.ndarray] | None:
-    """What `write_arrays` wrote, mapped from the files; None where something is missing, or not as it was written.
+    """The arrays of `write_arrays`, mapped from the files; None where something is missing, or not as it was written.
 
     expected  type and number of dimensions of each by name
     """

@@ -23,7 +23,7 @@ OnRays = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedAsset:
-    """What is measured of an asset.
+    """An asset to be measured.
 
     render   all of it, as `efficientnerf.asset.rendering.render`
     inner    cascade 0 alone, where that lies in surroundings that the asset shows too; None: the asset shows what lies in its box, and no more
@@ -65,7 +65,7 @@ def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, str
 
 
 def over_field(render_tree: RenderTree, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What lies in the field's box rendered from a tree, between what the field shows before and behind it: (H, W, 3), and the tree's opacity and depth (H, W).
+    """The tree rendered in the field's box, between the field's rendering before and behind it: (H, W, 3), and the tree's opacity and depth (H, W).
 
     before + (1 - before's alpha) (asset + (1 - asset's alpha) behind)
     """

@@ -123,7 +123,7 @@ def differences(
 
 
 def trivial(truth: GroundTruth) -> dict[str, Any] | None:
-    """What pictures of its mean colour and of its blurs would score; None where no pixel counts."""
+    """The scores of pictures of its mean colour and of its blurs; None where no pixel counts."""
     if truth.mask is not None and not truth.mask.any():
         return None
     return {"mean_colour": mean_colour_psnr(truth.colour, truth.mask), "blurred": blurred_psnrs(truth.colour, truth.mask)}

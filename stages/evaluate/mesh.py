@@ -38,7 +38,7 @@ MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedMesh:
-    """What is measured of a mesh.
+    """A mesh to be measured.
 
     shader        of the mesh in the training frame
     surroundings  what of the asset is not in it, as `EvaluatedAsset.render`; None: nothing

@@ -74,7 +74,7 @@ def observed_points(folder: Path, scene: Scene, reach: np.ndarray | None) -> Rel
 
 
 def judged(points: ReliablePoints, view: int, camera: Camera, depth: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points that a view sees in pixels that count: (N, 2) their pixels, (N,) NEARER, AGREES or FARTHER, (N,) bool whether they are of the subject.
+    """The points that a view sees in pixels that count: (N, 2) their pixels, (N,) NEARER, AGREES or FARTHER, (N,) bool whether they are of the subject.
 
     view   its place in the scene
     depth  (H, W) of the asset along the view axis; not finite where nothing is hit
@@ -102,7 +102,7 @@ def counts_of(kinds: np.ndarray, subject: np.ndarray) -> dict[str, int]:
 
 
 def agreement(views: Sequence[Mapping[str, Any] | None]) -> dict[str, float | int] | None:
-    """Of all views together: how many points, and the shares of them; None of fewer than FEW. Those of the subject: None of fewer than FEW."""
+    """The number of points of all views together, and their shares; None of fewer than FEW. The subject's share is None of fewer than FEW."""
     total = {name: sum(view[name] for view in views if view is not None) for name in COUNTS}
     if total["points"] < FEW:
         return None

@@ -1,4 +1,4 @@
-"""What reading photographs takes, and finding their cameras. docs/experiments/memory.md"""
+"""Memory of reading photographs and finding their cameras. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ REMEDY = "Lower poses.feature_image_size, or reduce the largest photographs."
 
 
 def decoding_needed(sizes: Sequence[tuple[int, int]], threads: int = 1) -> Need:
-    """What it takes to read photographs of these sizes, one at a time on each thread."""
+    """Memory to read photographs of these sizes, one at a time on each thread."""
     return Need({"a photograph": DECODED * threads * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
 
 
 def video_needed(sizes: Sequence[tuple[int, int]]) -> Need:
-    """What it takes to decode videos of these sizes, one at a time."""
+    """Memory to decode videos of these sizes, one at a time."""
     return Need({"frames of a video": FRAME * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
 
 
 def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int, *, networks: bool = False) -> Need:
-    """What it takes to find the cameras of photographs of these sizes.
+    """Memory to find the cameras of photographs of these sizes.
 
     max_side  of the photographs in which features are detected, pixels
     features  of a photograph, at most

@@ -62,7 +62,7 @@ def gaussians_of(
 
 
 def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
-    """What Gaussians are made and fitted with, for pictures of so many pixels each."""
+    """The budget of Gaussians, for pictures of so many pixels each."""
     steps = resolved(settings.iterations)
     if steps is None:
         steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, MOST_STEPS))

@@ -1,4 +1,4 @@
-"""What a scene gives training: pixels with their rays, near and far planes, and sparse depth."""
+"""The training data of a scene: pixels with their rays, near and far planes, and sparse depth."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ MIN_VIEWS, NEAR_PLANES, MASKS = "min_views", "near_planes", "masks"
 
 @dataclass(frozen=True)
 class Prior:
-    """What a prior would mask.
+    """The effect of a prior.
 
     masked        share of the density voxels
     contradicted  share of the reliable sparse points that lie in them

@@ -150,7 +150,7 @@ def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], fo
 
 
 def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[str, Any], priors: Sequence[Prior]) -> None:
-    """What was reached; the seconds differ from run to run.
+    """The report; its seconds differ from run to run.
 
     found  figures of the last preview, and what the checks found
     """

@@ -1,4 +1,4 @@
-"""What rendering and writing frames of an asset takes, one at a time. docs/experiments/memory.md"""
+"""Memory of rendering and writing frames of an asset, one at a time. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EXR_PIXEL = 4 * (4 + 1 + 3 + 3)  # float32: colour with alpha, depth, normal, po
 
 
 def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
-    """What it takes to render and write frames of so many pixels."""
+    """Memory to render and write frames of so many pixels."""
     return Need({
         "a frame": pixels * FRAME + (0 if tree.ndc is None and tree.lookup == "trilinear" else BAND),
         "the asset": tree_bytes(tree),
@@ -23,7 +23,7 @@ def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage turntable takes for all of the asset."""
+    """Memory of the stage turntable for all of the asset."""
     own = known.settings["turntable"]
     return frames_needed(asset_of(known), own.width * own.height, known.device)
 

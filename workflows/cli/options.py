@@ -41,7 +41,7 @@ folder_type = PathOfAnything(path_type=Path)
 
 
 def memory_limit(text: str | None) -> Limit | None:
-    """What --memory says, or what the machine has where it is "auto" or not given. Raises UsageError."""
+    """The value of --memory, or the machine's limit where it is "auto" or not given. Raises UsageError."""
     return limit_for(None if text in (None, "auto") else parse_size(text), None)
 
 

@@ -157,7 +157,7 @@ def listing(*lines: str) -> None:
 
 
 def closing(*lines: str) -> None:
-    """What a command did, on standard output: lost where that cannot be written."""
+    """Print what a command did on standard output; lost where that fails."""
     stream = sys.stdout
     with stream.unimportant() if isinstance(stream, Stream) else contextlib.nullcontext():
         listing(*lines)

@@ -33,7 +33,7 @@ class Text(str):
 
 @dataclass
 class Choice:
-    """What was chosen for a scene, or for all: settings that are not the preset's, and options."""
+    """The choices for a scene, or for all: settings that are not the preset's, and options."""
 
     settings: Table = field(default_factory=dict)
     preset: str | None = None

@@ -45,7 +45,7 @@ def folder_entries(given: str, fleet: Path) -> tuple[Found, Path | None]:
 
 
 def _format_of(folder: Path) -> str | None:
-    """What a folder is where it is a scene by itself: a data set, or photographs. Videos in it are scenes each."""
+    """The kind of a folder that is one scene: a data set, or photographs. Videos in it are scenes each."""
     for name, importer in IMPORTERS.items():
         if name != "photographs" and importer.recognises(folder):
             return name
@@ -53,7 +53,7 @@ def _format_of(folder: Path) -> str | None:
 
 
 def glob_entries(pattern: str) -> tuple[Found, Path | None]:
-    """What a pattern fits, each named by the parts of its path that the pattern leaves open: of `shoots/*/photos/` by the folder between."""
+    """Paths that match a pattern, each named by the parts that its wildcards match: of `shoots/*/photos/` by the folder between."""
     if "**" in pattern or "\0" in pattern:
         raise UsageError(f"{printable(pattern, 300)}: found '**', expected a pattern of *, ? and [...], as 'shoots/*/'.")
     parts = Path(pattern).parts

@@ -110,7 +110,7 @@ def _text(path: Path) -> str:
 
 
 def _toml(text: str, checker: Checker) -> tuple[Choice, list[Entry]]:
-    """What holds for all scenes, and the scenes."""
+    """The choices for all scenes, and the scenes."""
     try:
         content = parse_toml(text, MAX_BYTES)
     except ValueError as error:

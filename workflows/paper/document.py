@@ -97,7 +97,7 @@ def shown(value: Any) -> str:
 
 
 def hardware(device: str) -> dict[str, Any]:
-    """What the figures were measured on."""
+    """The hardware of the measurement."""
     name = platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

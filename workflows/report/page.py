@@ -78,7 +78,7 @@ def write_report(run: Run, stages: Sequence[Stage]) -> Path:
 
 
 def _published(run: Run, stages: Sequence[Stage]) -> list[tuple[int, int] | None]:
-    """What tells the artifact of each stage from one that replaces it: a stage is published by a rename of its folder."""
+    """Identifiers of the artifacts, which change with a replacement: a stage is published by a rename of its folder."""
     found: list[tuple[int, int] | None] = []
     for stage in stages:
         try:

@@ -1,4 +1,4 @@
-"""What a run has come to: the states of its stages, the curves of their logs, and the previews, of finished stages and of what is being made."""
+"""The progress of a run: the states of its stages, the curves of their logs, and the previews, of finished stages and of what is being made."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
 
 class _Line(msgspec.Struct):
-    """What is shown of a line of a log."""
+    """The shown part of a log line."""
 
     step: Annotated[int, msgspec.Meta(ge=0, le=2**53)]
     seconds: _Number | None = None
@@ -80,7 +80,7 @@ class Progress:
 
 
 def asset_identity(run: Path) -> str | None:
-    """What tells the asset of a run from one that replaces it; None where there is none."""
+    """An identifier of a run's asset, which changes when it is replaced; None: no asset."""
     try:
         status = os.lstat(BakeOutputs.of_run(run).asset)
     except OSError:

@@ -45,7 +45,7 @@ NOTHING = "default-src 'none'; frame-ancestors 'none'"
 
 @dataclass(frozen=True)
 class Answer:
-    """What is sent: bytes, or an open file, which whoever sends it closes.
+    """An answer: bytes, or an open file, which the sender closes.
 
     kind    content type
     policy  content security policy
@@ -139,7 +139,7 @@ class Server(ThreadingHTTPServer):
         self._hang_up(next(request for request, each in self._open.items() if each.peer == peer))
 
     def _hang_up(self, request: socket.socket) -> None:
-        """What its thread reads ends, and what it writes fails."""
+        """Its thread's reads end, and its writes fail."""
         del self._open[request]
         with suppress(OSError):
             request.shutdown(socket.SHUT_RDWR)

@@ -1,4 +1,4 @@
-"""What there is to be served: of a run its live page, its progress, its previews and its viewer; of an asset file the viewer alone."""
+"""Sites to serve: of a run its live page, its progress, its previews and its viewer; of an asset file the viewer alone."""
 
 from __future__ import annotations
 

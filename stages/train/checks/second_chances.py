@@ -42,7 +42,7 @@ AS_STATED = "as stated"
 
 @dataclass(frozen=True)
 class Trial:
-    """What a short training with other choices came to."""
+    """The result of a short training with other choices."""
 
     name: str
     choices: TrainingChoices
