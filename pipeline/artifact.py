@@ -17,7 +17,7 @@ A start that finds old-<stage> without RUN/<stage> was cut short between 2 and 3
 both was cut short between 3 and 4. A work folder without out/ belongs to an artifact that was published.
 
 Only names that these lines give are completed, undone or deleted, only for stages of the workflow, and only folders whose manifest is of that stage:
-.work may come from anybody. links.py has seen to it that it holds no links.
+.work may be untrusted. links.py has checked that it holds no links.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def prepare(place: Workplace, trash: Path) -> bool:
     """Make the folders of a request: an empty out/, scratch/ as it was; other requests' work is removed. Returns whether scratch/ held anything."""
     for folder in (place.root, place.folder, place.scratch):
         if files.exists(folder) and not files.is_folder(folder):
-            files.discard(folder, trash)  # anybody may have put a file there
+            files.discard(folder, trash)  # a stranger may have put a file there
     place.root.mkdir(parents=True, exist_ok=True)
     for other in list(place.root.iterdir()):
         if other.name != place.request:

@@ -24,12 +24,12 @@ from typing import Any
 SafePoint = Callable[[], None]
 
 MAX_JSON = 32 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
-MAX_DEPTH = 100  # of nested JSON; whoever walks through a value by recursion stays far from Python's limit
+MAX_DEPTH = 100  # of nested JSON; recursion over a value stays far from Python's limit
 
 NOTHING_FREE = 2**16  # bytes of a disk that is full
 
 _CONTAINERS = 2**20  # lists and objects that a small file may hold; each takes about a hundred bytes of memory, and two in the file
-_RANDOM = 8  # bytes; nobody guesses the name of a temporary file
+_RANDOM = 8  # bytes; the names of temporary files cannot be guessed
 # Names that `atomic` and `discard` give now, and those with a process's number that they gave before release 0.2.
 _TEMPORARY = re.compile(r"\.(.+)\.(?:[0-9a-f]{16}|[0-9]{1,10})\.part", re.DOTALL)
 _TRASH = re.compile(r"trash-(?:[0-9a-f]{16}|[0-9]{1,10}-[0-9]{1,20})")
@@ -121,7 +121,7 @@ def read_json(path: Path, limit: int = MAX_JSON, *, follow: bool = True) -> Any:
 
 
 def json_value(data: bytes) -> Any:
-    """The value that a JSON text of anybody's holds, finite and not deeply nested. Raises Unreadable."""
+    """The value of an untrusted JSON text, finite and not deeply nested. Raises Unreadable."""
     if data.count(b"[") + data.count(b"{") > _CONTAINERS + len(data) // 64:
         raise Unreadable("it holds too many lists and objects")
     try:
@@ -226,7 +226,7 @@ def _disk_full_behind(error: BaseException, path: Path) -> OSError | None:
 
 
 def _created_beside(path: Path) -> Path:
-    """A new, empty file in the same folder: whoever writes to it next finds this file, not a link that somebody put there."""
+    """A new, empty file in the same folder: the next writer finds this file, not a link that somebody put there."""
     temporary = path.with_name(f".{_repeated(path.name)}.{secrets.token_hex(_RANDOM)}.part")
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
     return temporary

@@ -150,4 +150,4 @@ def _show(log: int, stream: TextIO | None) -> None:
     with contextlib.suppress(OSError, ValueError):
         said = os.pread(log, MOST_SHOWN, max(0, os.fstat(log).st_size - MOST_SHOWN)).decode("utf-8", "replace").splitlines()
         if said and stream is not None:
-            print("\n".join(["enerf: libraries said:", *map(printable, said)]), file=stream, flush=True)
+            print("\n".join(["enerf: libraries' output:", *map(printable, said)]), file=stream, flush=True)

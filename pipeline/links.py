@@ -39,7 +39,7 @@ def is_stage_name(name: str) -> bool:
 def refuse_links(run: Path, stages: Collection[str] | None = None) -> None:
     """Raise CorruptArtifact if a run holds what is neither a file nor a folder under a name that is used; see `failed` where it cannot be listed.
 
-    stages  names of the stages that the run may have; None: all that a stage could have. Other names are not looked at
+    stages  names of the stages that the run may have; None: all that a stage could have. Other names are not checked
 
     Takes no lock: what another process removes meanwhile is not there.
     """

@@ -180,7 +180,7 @@ def _plain_output(output: Output) -> dict[str, Any]:
 
 
 class _Document(msgspec.Struct):
-    """manifest.json, as anybody may have written it. Those of 2026 before release 0.1.0 have no cpu_seconds, cores and facts."""
+    """manifest.json, untrusted. Those of 2026 before release 0.1.0 have no cpu_seconds, cores and facts."""
 
     request: Request
     request_digest: Sha256

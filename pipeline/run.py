@@ -37,8 +37,8 @@ FORMAT = "enerf-run"
 VERSION = 1
 MOST_SOURCES = 100
 _CHANGEABLE = ("source", "also", "settings", "preset", "seed", "device", "memory")
-_ABANDONED = 24 * 3600.0  # seconds after which nobody is writing to a temporary file any more, such as that of a report
-# The fields of a run.json that anybody may have written. Settings are checked by the stages that have them.
+_ABANDONED = 24 * 3600.0  # seconds after which no process still writes to a temporary file, such as that of a report
+# The fields of an untrusted run.json. Settings are checked by the stages that have them.
 _Path = Annotated[str, msgspec.Meta(max_length=4096)]
 _FIELDS: dict[str, Any] = {
     "source": _Path | None,
@@ -140,7 +140,7 @@ class Run:
         if not path.is_dir():
             raise BadInput(f"{path}: {'is not a folder' if files.exists(path) else 'no such folder'}. Give the folder of a run.")
         if not files.exists(path / NAME):
-            raise _no_run(path)  # and nothing in it is looked at
+            raise _no_run(path)  # and nothing in it is read
         refuse_links(path, stages)
         return cls(path, **_recorded(path), resume_text=resume_text, stages=stages)
 

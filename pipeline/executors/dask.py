@@ -198,7 +198,7 @@ def _work(task: dict[str, Any], topic: str, module: str) -> dict[str, Any]:
     over = threading.Event()
 
     def watch() -> None:
-        """Stop the stage where nobody waits for it any more: Dask does not end what runs."""
+        """Stop the stage once its task is not wanted: Dask does not end what runs."""
         while not over.wait(LOOK_SECONDS):
             state = worker.state.tasks.get(key)
             if state is None or state.state in ("cancelled", "resumed", "forgotten", "released"):

@@ -22,7 +22,7 @@ from pipeline.errors import UsageError
 from pipeline.text import printable
 
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
-MOST = 2**60  # bytes; no limit that anybody means is larger, and version 1 of control groups says "none" by a number above it
+MOST = 2**60  # bytes; larger than any real limit; version 1 of control groups states "none" by a number above it
 KEPT_BACK = 0.1  # of the machine, or of the control group: for the system, page tables and buffers of files
 # Addresses that a process with torch and OpenCV reserves beyond what it uses, and for each thread its stack and the C library's arena.
 RESERVED, RESERVED_BY_THREAD = 1200 * 2**20, 72 * 2**20  # under RLIMIT_AS
@@ -49,7 +49,7 @@ def parse_size(text: str) -> int:
 def limit_for(asked: int | None, recorded: int | None, root: Path = Path("/")) -> Limit | None:
     """A run's limit: the value asked for now, else the smaller of run.json's and this machine's, else this machine's.
 
-    A run.json may come from anybody: it can lower the limit, and not lift it.
+    A run.json may be untrusted: it can lower the limit, not raise it.
     """
     here = usable_memory(root)
     if asked is not None:

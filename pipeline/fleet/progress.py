@@ -46,7 +46,7 @@ class Progress:
         return "prepare" if self.todo is None else self.todo[0] if self.todo else "finish"
 
     def bytes_needed(self) -> int | None:
-        """Bytes that it takes next; None where nobody knows: a worker's share."""
+        """Bytes that it takes next; None where unknown: a worker's share."""
         if self.attempts.memory is not None:
             return self.attempts.memory
         if not self.todo:

@@ -72,7 +72,7 @@ def take(fleet: Path) -> list[Request]:
 
 
 def left(fleet: Path) -> list[str]:
-    """Take the requests to a process that has ended: the scenes to try again. That one was to be cancelled concerns nobody any more."""
+    """Take the requests to a process that has ended: the scenes to try again. Cancellations no longer matter."""
     names: list[str] = []
     while found := take(fleet):
         names += [name for request in found if request.do == "retry" for name in request.scenes or ()]

@@ -43,7 +43,7 @@ class Scheduler:
     """One call of `enerf fleet`.
 
     fleet    its folder, whose lock is held
-    states   all scenes, as they were before: done ones are looked at again, quarantined ones left alone
+    states   all scenes, as they were before: done ones are checked again, quarantined ones left alone
     stages   of the workflow, in order
     device   "cpu" or "cuda"
     report   takes events, each with "scene": those of stages, and scene_done, scene_failed, scene_quarantined, retry
@@ -115,7 +115,7 @@ class Scheduler:
         return all(each.state.state == "done" for each in self._all.values())
 
     def _look(self) -> bool:
-        """Now and then: which workers there are, what was requested, whether the fleet is still ours. Returns whether it was looked at."""
+        """Now and then: which workers there are, what was requested, whether the fleet is still ours. Returns whether the check was due."""
         now = time.monotonic()
         if now < self._next_look:
             return False
@@ -175,7 +175,7 @@ class Scheduler:
             place = self._admission.place(each.number, self._demand(each), avoided=each.attempts.lost_on, preferred=each.last_worker)
             need = each.space.get(each.what, 0)
             if place is not None and ((self._tasks and need >= too_much) or not self._has_disk(each, need)):
-                too_much = min(too_much, need)  # where nothing runs each is looked at: what it has written already counts
+                too_much = min(too_much, need)  # where nothing runs each is tried: what it has written already counts
                 cramped.append(each)
             elif place is not None:
                 self._start(each, *place)

@@ -4,7 +4,7 @@
     FLEET/<scene>/      a run (pipeline/run.py)
     FLEET/.requests/    what `retry` and `cancel` ask of the process that runs the fleet
 
-A fleet.json may come from anybody: every value is checked and bounded when it is read, and a scene's run lies in the fleet's folder.
+A fleet.json may be untrusted: every value is checked and bounded when it is read, and a scene's run lies in the fleet's folder.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Message:
-    """An event of a task, or its result: the last that is heard of it. "kind" is "lost" where its worker has gone, "unheard" where nobody knows."""
+    """An event of a task, or its result, which comes last. Its "kind" is "lost" where the worker has gone, "unheard" where that is unknown."""
 
     task: int
     kind: Literal["event", "result"]

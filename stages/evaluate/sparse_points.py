@@ -54,7 +54,7 @@ class ReliablePoints:
 
 
 def observed_points(folder: Path, scene: Scene, reach: np.ndarray | None) -> ReliablePoints | None:
-    """Those of a scene; None where there are none, or nobody knows who sees them.
+    """Those of a scene; None where there are none, or their observers are unknown.
 
     reach  (2, 3) beyond which the asset has no density; None: the scene bounds, or of a forward-facing scene nothing
     """

@@ -19,7 +19,7 @@ from stages.mesh.texture import largest_photograph
 from stages.train.data import count_pixels
 
 # Bytes. Of a stored voxel: vertices and faces while they are joined, cleaned and decimated, as many as a thin shell has; of a cell in which enclosed space
-# is found, and of a voxel of the bricks that these are made from; of a point with what its colour is looked up by.
+# is found, and of a voxel of the bricks that these are made from; of a point with the data to look up its colour.
 VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
 # Of a pixel of a view whose depth is fused, and of a voxel of a block that is fused at a time.
 PIXEL, BLOCK_VOXEL = 36, 120

@@ -82,7 +82,7 @@ def run(job: Job) -> None:
     outputs, settings = SplatsOutputs(job.out), job.settings
     if settings.make == "off":
         write_json(outputs.report, {"gaussians": 0, "made": False})
-        job.say("none are asked for (splats.make=off)", gaussians=0)
+        job.say("none are made (splats.make=off)", gaussians=0)
         return
     try:
         _make(job, outputs, settings)

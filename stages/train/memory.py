@@ -155,7 +155,7 @@ def space_needed(known: Known) -> int:
 
 
 def _before(known: Known) -> tuple[tuple[View, ...], TrainSettings, Space]:
-    """Views that are trained on, settings without "auto" as for `needed`, and the field's space."""
+    """Training views, settings without "auto" as for `needed`, and the field's space."""
     s = load(known.inputs(TrainInputs).poses.folder)
     views = views_of(s, "train")
     return views, with_auto_sizes(known.settings["train"], s, count_pixels(views)), space_of(s)

@@ -2,7 +2,7 @@
 
     min_views    what fewer than `train.min_views` views show could be at any depth
     near_planes  what lies before the near planes, and close to the cameras, is empty
-    masks        what no view shows by a pixel that its mask keeps is not asked for
+    masks        what no view shows in a pixel that its mask keeps is left out
 
 Reliable sparse points (`stages.framing.near_planes`) are evidence that space is filled. The first two are dropped where they contradict more than
 MAX_CONTRADICTED of them; masks are given by the user, or by a stage that has checked them. All rules of the program: docs/priors.md.

@@ -143,7 +143,7 @@ def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
 
 
 def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
-    """The training cameras, where they were refined or replaced, the views that were left out, and what these two show; `folder` is the scene's."""
+    """The training cameras, where they were refined or replaced, the views that were left out, and pictures of both; `folder` is the scene's."""
     if (cameras := cameras_of(t)) is not None:
         refined_cameras.write(views, cameras, outputs.cameras, left_out_of(t, views))
         draw_wrong_views(outputs.wrong_views, t, views, folder, renderer)

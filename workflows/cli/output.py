@@ -19,7 +19,7 @@ from typing import Any, TextIO, cast
 from pipeline.library_output import libraries_apart
 from pipeline.text import printable
 
-UNWRITTEN = 3  # exit code: what was asked for on standard output could not be written
+UNWRITTEN = 3  # exit code: the requested output could not be written
 DEEPEST = 64  # levels of a value in JSON; a document that nests deeper was made to
 _LARGEST = 2**64  # readers of JSON know no larger integers
 

@@ -77,7 +77,7 @@ class Plan:
 
     @contextmanager
     def written(self) -> Iterator[Run]:
-        """Create the run, or update the existing one, and hold its lock: nobody changes its settings while its stages run.
+        """Create the run, or update the existing one, and hold its lock: its settings do not change while its stages run.
 
         The settings that the options change are those that run.json holds under the lock, whatever it held before.
         """

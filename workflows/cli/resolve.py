@@ -117,7 +117,7 @@ def read_toml(option: str, path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, limit: int = MAX_TOML) -> dict[str, Any]:
-    """A TOML document of anybody. Raises ValueError, UnicodeDecodeError and tomllib.TOMLDecodeError being such."""
+    """An untrusted TOML document. Raises ValueError, UnicodeDecodeError and tomllib.TOMLDecodeError being such."""
     if len(text) > limit:
         raise ValueError(f"larger than {limit} bytes")
     if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):

@@ -19,7 +19,7 @@ from stages.formats.importers.source import images_in
 
 Found = list[tuple[str, str]]
 
-_ENTRIES = 200_000  # of a folder, or paths that a pattern fits, that are looked at
+_ENTRIES = 200_000  # of a folder, or paths that a pattern fits, that are read
 _WILD = re.compile(r"[*?\[]")
 
 
@@ -71,7 +71,7 @@ def glob_entries(pattern: str) -> tuple[Found, Path | None]:
 def listed_entries(given: Sequence[str]) -> tuple[Found, Path | None]:
     """Folders and videos that were given one by one, as by a shell that expands a pattern; named by their last part, or by what differs."""
     if any(each.lower().endswith((".toml", ".csv")) for each in given):
-        raise UsageError("several manifests, or a manifest beside sources; expected one manifest, or sources alone.")
+        raise UsageError("several manifests, or a manifest together with sources; expected one manifest, or sources alone.")
     if len(given) > MOST_SCENES:
         raise UsageError(f"found {len(given)} sources, expected at most {MOST_SCENES}.")
     paths = [Path(os.path.abspath(each)) for each in given]

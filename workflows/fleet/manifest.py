@@ -10,7 +10,7 @@
 
 A CSV has a scene a line and the same keys as columns: name, source (which may stand several times), preset, as, seed, budget, and stage.setting.
 
-A manifest may come from anybody. It is small, its names name folders, and its sources lie in its own folder or in one that the operator gave.
+A manifest may be untrusted. It is small, its names name folders, and its sources lie in its own folder or in one that the operator gave.
 All mistakes are reported at once, before anything runs.
 """
 

@@ -1,6 +1,6 @@
 """The documents of a run that the page and the summary read: metrics.json and the stages' reports, each checked against its schema.
 
-A run may come from anybody, or be damaged: a document that does not follow its schema is left out, and reported.
+A run may be untrusted or damaged: a document that does not follow its schema is left out, and reported.
 """
 
 from __future__ import annotations

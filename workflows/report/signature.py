@@ -1,4 +1,4 @@
-"""Whether a page of a run is one that this program wrote, and wrote here: a page is a program that a browser runs, and a run may come from anybody.
+"""Whether a page of a run was written by this program, and here: a page is a program that a browser runs, and a run may be untrusted.
 
 A page's last line is a comment with the SHA-256 of all before it, and with an HMAC of that by a key which the user alone can read. By the first `verify`
 finds a page that was altered; by the second a page is known, before it is opened, to be by a holder of the key. Others are made again.
@@ -91,7 +91,7 @@ def _key() -> bytes:
 
 
 def viewer_is_missing(run: Run) -> bool:
-    """Whether the run has no viewer though its asset is one that gets a page: it could not be read, or nobody has written the page yet."""
+    """Whether the run has no viewer though its asset is one that gets a page: it could not be read, or the page is not written yet."""
     size = size_of(BakeOutputs.of_run(run.path).asset)
     return size is not None and size <= LARGEST and not os.path.lexists(run.path / VIEWER)
 

@@ -30,7 +30,7 @@ PREVIEW = re.compile(r"preview_([0-9]{6,12})\.png")
 MOST_PREVIEWS, MOST_POINTS = 100, 300
 LARGEST_LOG = 2**25  # bytes
 PAUSE = 1.0  # seconds at least between two readings of a run,
-SHARE = 0.1  # of which reading takes at most this share, whoever asks and however often
+SHARE = 0.1  # of which reading takes at most this share, however many requests come
 _Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
 

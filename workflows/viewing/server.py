@@ -1,8 +1,8 @@
 """A server of a few pages for one browser: it reads, and answers GET and HEAD for the names that its site lists, and nothing else.
 
-Whoever runs on this machine may ask it, a page of another site in this machine's browser too. Hence: it listens on the loopback interface unless asked
+Any program on this machine may ask it, a page of another site in this machine's browser too. Hence: it listens on the loopback interface unless asked
 otherwise; requests must name it by that (a name that was made to point here, DNS rebinding, is refused); no other site may embed or read its answers; no
-part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; who is slow keeps nobody else waiting.
+part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; slow clients delay no others.
 """
 
 from __future__ import annotations
@@ -239,7 +239,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def open_inside(folder: Path, name: str, most: int) -> int | None:
-    """A descriptor of a plain file of at most `most` bytes, opened from the folder downwards through no link; None where there is none such.
+    """A descriptor of a plain file of at most `most` bytes, opened from the folder downwards through no link; None where there is none.
 
     name  relative, of our own making
     """
