@@ -105,7 +105,7 @@ def serve(program: Program) -> None:
                 answer = {"ok": False, **_failure(error)}
         channel.send({"event": "result", **answer})
     sys.stderr.flush()
-    os._exit(0)  # libraries that take the process down while they are unloaded have no say
+    os._exit(0)  # libraries that crash while they are unloaded do no harm
 
 
 def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dict[str, Any]:

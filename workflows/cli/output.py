@@ -1,7 +1,7 @@
 """Standard output and standard error while a command runs: a failed write ends nothing, but is reported.
 
-The result of a command decides its exit code. What goes to standard error, and the closing words of a command that makes files, is at most lost. What the
-command is for (a listing, anything with --json) is missed: a command that went well then ends with UNWRITTEN. A reader that closes the pipe of a
+The result of a command decides its exit code. Failed writes to standard error, or of the closing words of a command that makes files, are ignored. Where the
+command's output proper (a listing, anything with --json) fails, a command that went well ends with UNWRITTEN. A reader that closes the pipe of a
 plain listing (`| head`) has had enough, which is no failure.
 """
 

@@ -77,7 +77,7 @@ def _signature(digest: str) -> str:
 
 @functools.cache
 def _key() -> bytes:
-    """32 random bytes, the same ones for all that a user does on a machine; where they cannot be kept, for all that this process does."""
+    """32 random bytes, one key for each user of a machine; where it cannot be kept, one for this process."""
     try:
         folder = first_private([cache_folder() / "pages"], "key")[0]
         if folder is None:

@@ -29,7 +29,7 @@ from pipeline.errors import UsageError
 LOOPBACK = "127.0.0.1"
 READING = 10.0  # seconds that a request may take to come
 SENDING, SLOWEST = 20.0, 2**15  # seconds, and bytes a second, that its answer may take to go
-MOST_AT_ONCE, MOST_OF_A_PEER = 32, 16  # connections; a browser opens six. Who comes then takes the place of the oldest
+MOST_AT_ONCE, MOST_OF_A_PEER = 32, 16  # connections; a browser opens six. A new one takes the place of the oldest
 MOST_THREADS = 2 * MOST_AT_ONCE  # those that are hung up on may still be at work on an answer
 HEADERS = {
     "Cache-Control": "no-store",
@@ -130,7 +130,7 @@ class Server(ThreadingHTTPServer):
         self.slots.release()
 
     def _make_room(self, peer: str) -> None:
-        """Hang up on the oldest connection of a peer that has as many as it may, or of who has most where there are as many as may be."""
+        """Close the oldest connection of a peer at its limit, or, at the total limit, of the peer that has most."""
         peers = Counter(each.peer for each in self._open.values())
         if peers[peer] < MOST_OF_A_PEER:
             if len(self._open) < MOST_AT_ONCE:
