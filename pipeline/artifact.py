@@ -13,11 +13,11 @@ Publishing, where each line is durable before the next begins:
     3  out          ->  RUN/<stage>
     4  .work/old-<stage>  ->  .work/trash-*, deleted; the request's work folder too
 
-A start that finds old-<stage> without RUN/<stage> was cut short between 2 and 3: it does 3 if out/ is whole, else it undoes 2. One that finds
+A start that finds old-<stage> without RUN/<stage> was cut short between 2 and 3: it does 3 if out/ is complete, else it undoes 2. One that finds
 both was cut short between 3 and 4. A work folder without out/ belongs to an artifact that was published.
 
 Only names that these lines give are completed, undone or deleted, only for stages of the workflow, and only folders whose manifest is of that stage:
-.work may come from anybody. links.py has seen to it that it holds no links.
+.work may be untrusted. links.py has checked that it holds no links.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def outputs_of(folder: Path, stage: Stage, hashes: Hashes | None = None) -> dict[str, Output]:
-    """Hash all that a stage left in its folder. Raises StageFailed for what is no plain file, and for nothing at all."""
+    """Hash all files of a stage's folder. Raises StageFailed for anything but a plain file, and for an empty folder."""
     hashes = hashes or Hashes()
     outputs = {}
     for name, status in files.walk(folder):
@@ -130,7 +130,7 @@ def prepare(place: Workplace, trash: Path) -> bool:
     """Make the folders of a request: an empty out/, scratch/ as it was; other requests' work is removed. Returns whether scratch/ held anything."""
     for folder in (place.root, place.folder, place.scratch):
         if files.exists(folder) and not files.is_folder(folder):
-            files.discard(folder, trash)  # anybody may have put a file there
+            files.discard(folder, trash)  # a stranger may have put a file there
     place.root.mkdir(parents=True, exist_ok=True)
     for other in list(place.root.iterdir()):
         if other.name != place.request:
@@ -175,7 +175,7 @@ def publish(run: Path, stage: str, place: Workplace) -> None:
 
 
 def finished(place: Workplace, stage: str) -> Manifest | None:
-    """The manifest of a sealed out/ whose publication was cut short, every file checked; None if there is none such."""
+    """The manifest of a sealed out/ whose publication was cut short, every file checked; None if there is none."""
     made = _sealed(place.out, stage)
     if made is None or made.request.digest != place.request or differences(place.out, made.outputs).damaged:
         return None
@@ -189,14 +189,14 @@ def is_published(run: Path, stage: str, place: Workplace) -> bool:
 
 
 def clear_published(run: Path, place: Workplace) -> None:
-    """Delete the work on what is published: an interrupted run that was forced left it, and nobody asks for it any more."""
+    """Delete the work folder of a published artifact: an interrupted forced run left it, and nothing resumes it."""
     files.discard(place.folder, run / WORK)
     if files.is_folder(place.root) and files.is_empty(place.root):
         place.root.rmdir()
 
 
 def recover(run: Path, stages: Collection[str]) -> list[str]:
-    """Complete or undo what a kill cut short; returns a sentence for each thing done. Only for who holds the run's lock.
+    """Complete or undo what a kill cut short; returns a sentence for each thing done. The caller holds the run's lock.
 
     stages  names of the workflow's; what .work holds of others stays as it is
     """
@@ -249,7 +249,7 @@ def _is_of(made: Manifest | None, request: str) -> bool:
 
 
 def _sealed(folder: Path, stage: str) -> Manifest | None:
-    """The manifest of an artifact of this stage; None if the folder is none such."""
+    """The manifest of an artifact of this stage; None if the folder is not one."""
     if not files.is_folder(folder):
         return None
     try:

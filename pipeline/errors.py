@@ -1,4 +1,4 @@
-"""Everything that the engine raises on purpose. Each carries one or two lines for the user and the exit code of the process.
+"""All errors that the engine raises on purpose. Each carries one or two lines for the user and the exit code of the process.
 
 PipelineError
 ├── BadInput           2   the source, the run folder or a file given by the user cannot be used

@@ -82,7 +82,7 @@ def disk_full(folder: Path, what: str) -> DiskFull:
     """The error that names the disk that is full and the space left on it."""
     there = next((path for path in (folder, *folder.parents) if path.is_dir()), Path("/"))
     free = shutil.disk_usage(there).free / 2**20
-    return DiskFull(f"{what}: no space (or quota) left in {there} ({free:.1f} MiB free). Make room and go on; what was published before is not lost.")
+    return DiskFull(f"{what}: no space (or quota) left in {there} ({free:.1f} MiB free). Free some space and go on; what was published before is not lost.")
 
 
 def cannot_write(path: Path, error: OSError) -> BadInput | StageFailed:

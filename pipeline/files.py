@@ -1,4 +1,4 @@
-"""The few operations on files that everything else is made of: atomic writes, bounded reads, canonical JSON, safe names.
+"""Basic operations on files: atomic writes, bounded reads, canonical JSON, safe names.
 
 What must survive a kill or a power cut goes through these functions and no others, so that tests can cut the power at each of them. `atomic` is the
 one writer of files that appear whole or not at all. Nothing is written or deleted through a link, and nothing but plain files is opened.
@@ -24,12 +24,12 @@ from typing import Any
 SafePoint = Callable[[], None]
 
 MAX_JSON = 32 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
-MAX_DEPTH = 100  # of nested JSON; whoever walks through a value by recursion stays far from Python's limit
+MAX_DEPTH = 100  # of nested JSON; recursion over a value stays far from Python's limit
 
 NOTHING_FREE = 2**16  # bytes of a disk that is full
 
 _CONTAINERS = 2**20  # lists and objects that a small file may hold; each takes about a hundred bytes of memory, and two in the file
-_RANDOM = 8  # bytes; nobody guesses the name of a temporary file
+_RANDOM = 8  # bytes; the names of temporary files cannot be guessed
 # Names that `atomic` and `discard` give now, and those with a process's number that they gave before release 0.2.
 _TEMPORARY = re.compile(r"\.(.+)\.(?:[0-9a-f]{16}|[0-9]{1,10})\.part", re.DOTALL)
 _TRASH = re.compile(r"trash-(?:[0-9a-f]{16}|[0-9]{1,10}-[0-9]{1,20})")
@@ -121,7 +121,7 @@ def read_json(path: Path, limit: int = MAX_JSON, *, follow: bool = True) -> Any:
 
 
 def json_value(data: bytes) -> Any:
-    """The value that a JSON text of anybody's holds, finite and not deeply nested. Raises Unreadable."""
+    """The value of an untrusted JSON text, finite and not deeply nested. Raises Unreadable."""
     if data.count(b"[") + data.count(b"{") > _CONTAINERS + len(data) // 64:
         raise Unreadable("it holds too many lists and objects")
     try:
@@ -216,7 +216,7 @@ def atomic_together(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _disk_full_behind(error: BaseException, path: Path) -> OSError | None:
-    """The error of a full disk where a library failed without the number of an error, as long as what it has written still fills the disk."""
+    """The full-disk error, for a library that failed without an error number, while what it wrote still fills the disk."""
     if not isinstance(error, Exception) or (isinstance(error, OSError) and error.errno is not None):
         return None
     with contextlib.suppress(OSError):
@@ -226,14 +226,14 @@ def _disk_full_behind(error: BaseException, path: Path) -> OSError | None:
 
 
 def _created_beside(path: Path) -> Path:
-    """A new, empty file in the same folder: whoever writes to it next finds this file, not a link that somebody put there."""
+    """A new, empty file in the same folder: the next writer finds this file, not a link that somebody put there."""
     temporary = path.with_name(f".{_repeated(path.name)}.{secrets.token_hex(_RANDOM)}.part")
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
     return temporary
 
 
 def _repeated(name: str) -> str:
-    """As much of a file's name as its temporary's has room for."""
+    """As much of a file's name as fits into its temporary's."""
     while len(os.fsencode(name)) > _LONGEST:
         name = name[:-1]
     return name
@@ -318,7 +318,7 @@ def sync_file(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Whatever it is, with all that is in it; a link goes, not what it points to."""
+    """Remove anything, with all that is in it; of a link, the link and not its target."""
     if not is_folder(path):
         path.unlink(missing_ok=True)
         return

@@ -56,7 +56,7 @@ class Hashes:
         self._entries: dict[str, Entry] = {} if path is None else _read(path)
 
     def digest(self, key: str, path: Path, *, anew: bool = False, follow: bool = True) -> str:
-        """Of the file at `path`, which is or will be at the place `key`. Raises OSError if it cannot be read.
+        """Digest of the file at `path`, to be at the place `key`. Raises OSError if it cannot be read.
 
         anew    read it whatever is remembered, and without a safe point: what a stage has just finished is not given up for a Ctrl-C
         follow  whether `path` itself may be a link; not so for files of a run

@@ -1,4 +1,4 @@
-"""What libraries say by themselves is for a log, and not for users: their warnings, `logging`, errors that nobody catches.
+"""Output of libraries goes to a log, not to users: their warnings, `logging`, uncaught errors.
 
 A warning is shown where its category has `for_users`: those are ours, from code that knows of no display.
 
@@ -51,7 +51,7 @@ def warnings_for_users(say: Say) -> Iterator[None]:
 
 @contextmanager
 def into_log(log: TextIO) -> Iterator[None]:
-    """While open, all that libraries say through Python goes to `log`."""
+    """While open, all output of libraries through Python goes to `log`."""
     former = warnings.showwarning, sys.unraisablehook, threading.excepthook
     root = logging.getLogger()
     handler = logging.StreamHandler(log)
@@ -75,7 +75,7 @@ def into_log(log: TextIO) -> Iterator[None]:
 def libraries_apart(*, show: bool) -> Iterator[TextIO | None]:
     """While open, nothing but what is written to the stream that it yields, the former `sys.stderr`, comes to the terminal.
 
-    show  whether to show in the end what libraries have said
+    show  whether to show the output of libraries in the end
     """
     former = sys.stderr
     with contextlib.suppress(OSError, ValueError, AttributeError):
@@ -127,7 +127,7 @@ def kept_in(run: Path) -> Iterator[None]:
 
 
 def _temporary() -> int:
-    """The descriptor of a file without a name; of nothing where there is no room for one."""
+    """The descriptor of a file without a name; of the null device where the disk has no space for one."""
     try:
         with tempfile.TemporaryFile(buffering=0) as file:
             return os.dup(file.fileno())
@@ -150,4 +150,4 @@ def _show(log: int, stream: TextIO | None) -> None:
     with contextlib.suppress(OSError, ValueError):
         said = os.pread(log, MOST_SHOWN, max(0, os.fstat(log).st_size - MOST_SHOWN)).decode("utf-8", "replace").splitlines()
         if said and stream is not None:
-            print("\n".join(["enerf: libraries said:", *map(printable, said)]), file=stream, flush=True)
+            print("\n".join(["enerf: libraries' output:", *map(printable, said)]), file=stream, flush=True)

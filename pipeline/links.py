@@ -1,4 +1,4 @@
-"""What no run holds: links, pipes, sockets and devices. A run that a stranger packed may hold them, and lead what opens its files elsewhere.
+"""Refuses runs with links, pipes, sockets or devices: a run that a stranger packed may hold them, to lead what opens its files elsewhere.
 
 The engine writes and deletes within a run, and stages append to files of their scratch folders. One rule makes that safe: under the names that the
 engine and its stages use, a run holds plain files and folders, and in its scratch folders no file has a second name (a hard link). Artifacts may have
@@ -39,7 +39,7 @@ def is_stage_name(name: str) -> bool:
 def refuse_links(run: Path, stages: Collection[str] | None = None) -> None:
     """Raise CorruptArtifact if a run holds what is neither a file nor a folder under a name that is used; see `failed` where it cannot be listed.
 
-    stages  names of the stages that the run may have; None: all that a stage could have. Other names are not looked at
+    stages  names of the stages that the run may have; None: all that a stage could have. Other names are not checked
 
     Takes no lock: what another process removes meanwhile is not there.
     """

@@ -1,4 +1,4 @@
-"""What made an artifact, and what it consists of: manifest.json, the last file written into an artifact's folder.
+"""The origin and files of an artifact: manifest.json, the last file written into an artifact's folder.
 
 request   stage, version, settings, digests of the inputs, digests of the source's files. Its SHA-256 names the work folder
 outputs   name -> SHA-256, size, and whether it depends on the clock (volatile)
@@ -180,7 +180,7 @@ def _plain_output(output: Output) -> dict[str, Any]:
 
 
 class _Document(msgspec.Struct):
-    """manifest.json, as anybody may have written it. Those of 2026 before release 0.1.0 have no cpu_seconds, cores and facts."""
+    """manifest.json, untrusted. Those of 2026 before release 0.1.0 have no cpu_seconds, cores and facts."""
 
     request: Request
     request_digest: Sha256

@@ -37,8 +37,8 @@ FORMAT = "enerf-run"
 VERSION = 1
 MOST_SOURCES = 100
 _CHANGEABLE = ("source", "also", "settings", "preset", "seed", "device", "memory")
-_ABANDONED = 24 * 3600.0  # seconds after which nobody is writing to a temporary file any more, such as that of a report
-# The fields of a run.json that anybody may have written. Settings are checked by the stages that have them.
+_ABANDONED = 24 * 3600.0  # seconds after which no process still writes to a temporary file, such as that of a report
+# The fields of an untrusted run.json. Settings are checked by the stages that have them.
 _Path = Annotated[str, msgspec.Meta(max_length=4096)]
 _FIELDS: dict[str, Any] = {
     "source": _Path | None,
@@ -53,13 +53,13 @@ _FIELDS: dict[str, Any] = {
 
 
 class ResumeText(Protocol):
-    """What messages say of how to go on with a run: a workflow gives the command, the engine knows none.
+    """How to resume a run, for messages: a workflow gives the command, the engine knows none.
 
     until        the last stage to run; None: all
     start        the first stage to run even if it is up to date; None: none
     only         the one stage to run
     force        whether that one is to run even if it is up to date
-    with_source  whether the source has to be named
+    with_source  whether the source has to be given
     """
 
     def __call__(
@@ -140,7 +140,7 @@ class Run:
         if not path.is_dir():
             raise BadInput(f"{path}: {'is not a folder' if files.exists(path) else 'no such folder'}. Give the folder of a run.")
         if not files.exists(path / NAME):
-            raise _no_run(path)  # and nothing in it is looked at
+            raise _no_run(path)  # and nothing in it is read
         refuse_links(path, stages)
         return cls(path, **_recorded(path), resume_text=resume_text, stages=stages)
 
@@ -218,7 +218,7 @@ class Run:
             raise RunLocked(f"{self.path}: no longer this process's to write: {why}. What is done is kept. Go on with: {self.how_to_resume()}")
 
     def _clear_temporaries(self) -> None:
-        """What kills left of writing files outside of artifacts; if they cannot be removed, they do no harm."""
+        """Remove files outside of artifacts that killed writers left; those that cannot be removed do no harm."""
         with contextlib.suppress(OSError):
             for path in (self.path / NAME, self.path / HOLDER, self.cache):
                 files.remove_temporaries(path)
@@ -252,7 +252,7 @@ class Run:
 
 
 def named(sources: Sequence[Path]) -> dict[str, Path]:
-    """Sources by the name that what they hold goes by: "" for one alone; else that of the folder or file, with a number where another has it."""
+    """Sources by name: "" for one alone; else the name of the folder or file, with a number where another has it."""
     if len(sources) == 1:
         return {"": sources[0]}
     found: dict[str, Path] = {}

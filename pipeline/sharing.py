@@ -1,6 +1,6 @@
-"""Artifacts that several runs share: the same request is the same artifact, so that one run makes it and others take it over.
+"""Artifacts that several runs share: the same request is the same artifact, so that one run makes it and others adopt it.
 
-Published files are replaced, never written in place: runs share them by hard links, and each is whole by itself. Where the file system has no hard
+Published files are replaced, never written in place: runs share them by hard links, and each is complete by itself. Where the file system has no hard
 links between the two, files are copied.
 """
 

@@ -1,4 +1,4 @@
-"""What a stage is, what it is handed when it runs, and the strict reading of its settings."""
+"""A stage, the job that it is handed when it runs, and the strict reading of its settings."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") -> T:
-    """An instance of the settings dataclass from plain values, as JSON or TOML give them; what is not named keeps its default.
+    """An instance of the settings dataclass from plain values, as JSON or TOML give them; fields that are missing keep their defaults.
 
     where  put before names in errors, e.g. "train": `train.iterations: ...`
 

@@ -31,7 +31,7 @@ class Name:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a stage leaves in a folder.
+    """The outputs of a stage.
 
     stage  its name, which is also that of its folder in a run
     """
@@ -145,7 +145,7 @@ class SplatsOutputs(Outputs):
     stage = "splats"
     ply = Name("splats.ply")  # as 3DGS writes it, the capture's frame
     spz = Name("splats.spz")  # the same, small, y up
-    preview = Name("preview.png")  # beside the asset
+    preview = Name("preview.png")  # next to the asset
     report = Name("report.json")  # how many, bytes, seconds
 
 

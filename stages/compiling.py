@@ -1,4 +1,4 @@
-"""A stage that says when it waits for kernels to be compiled, which no time budget counts."""
+"""Stages that report when kernels are compiled; no time budget counts that."""
 
 from __future__ import annotations
 

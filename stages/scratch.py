@@ -1,4 +1,4 @@
-"""What a stage leaves in its scratch folder for a later attempt: each piece with a note of the SHA-256 of its files.
+"""Pieces of work in a stage's scratch folder for a later attempt, each with a note of the SHA-256 of its files.
 
 Scratch is not synced: after a power cut a file may have its name and nothing, or half, of what was in it; and a run may come from someone else. A piece
 counts only where the note and all of its files are as they were written, and the note's value is of the type that is expected. Else the note is
@@ -45,7 +45,7 @@ def note(path: Path, value: Any, outputs: Sequence[Path] = ()) -> None:
 def noted(path: Path, kind: type[T], warn: Warn, check: Callable[[T, Collection[str]], object] | None = None) -> T | None:
     """The value of a note, of this type as msgspec decodes it; None where there is none that counts.
 
-    warn   is told of a note that does not count
+    warn   is called for a note that does not count
     check  is given the value and the names of the files, and raises where they are not what the stage needs
     """
     try:

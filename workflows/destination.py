@@ -1,6 +1,6 @@
-"""Files that a command is asked to write: outside of runs, not over what is read, and not over what is there unless that was asked for.
+"""Files that a command is asked to write: outside of runs, not over inputs, and not over existing files unless forced.
 
-Every file is written aside and renamed, so that it is there whole or not at all. What a rename would replace is a plain file or nothing: a link is
+Every file is written aside and renamed, so that it is complete or not there at all. What a rename would replace is a plain file or nothing: a link is
 neither followed nor replaced, a pipe or a device (/dev/stdout) cannot be written so.
 """
 

@@ -1,4 +1,4 @@
-"""What `enerf export` does: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras. 3D Gaussians:
+"""`enerf export`: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras. 3D Gaussians:
 `workflows.exporting_splats`."""
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Written = dict[str, Any]
 
 @dataclass(frozen=True)
 class Export:
-    """What is asked for.
+    """An export request.
 
     what       a run or an asset
     files      to write, by extension; those that are there only if `force`
@@ -55,7 +55,7 @@ class Export:
     as_splats  3D Gaussians instead of a mesh
     region, crop  of the asset; None: as the settings say
     texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
-    normal_map  beside the texture; None: as the settings say, where a file keeps it
+    normal_map  next to the texture; None: as the settings say, where a file keeps it
     picture    how textures are stored
     limit      of memory
     """
@@ -78,7 +78,7 @@ class Export:
 
     @property
     def table(self) -> dict[str, Format]:
-        """Of what is made of the asset beside volumes."""
+        """Of what is made of the asset besides volumes."""
         return SPLAT_EXPORTERS if self.as_splats else POINT_EXPORTERS if self.as_points else MESH_EXPORTERS
 
     def format(self, path: Path) -> Format:
@@ -145,7 +145,7 @@ def check(export: Export) -> None:
     if (export.picture != "png" and not export.keeps_textures) or (export.texture not in (None, "off") and not (export.is_coloured and not export.as_points)):
         raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
     if export.normal_map and (export.as_points or export.texture == "off" or not export.keeps_textures):
-        raise UsageError("None of the files keeps a normal map: it lies beside a texture. Give a .glb, .obj, .usdz or .usdc, and leave out --texture off.")
+        raise UsageError("None of the files keeps a normal map: it belongs to a texture. Give a .glb, .obj, .usdz or .usdc, and leave out --texture off.")
     for path in (*export.surfaces, *export.volumes):
         export.format(path).refuse_without_package(path)
     beside = [] if export.texture == "off" else [

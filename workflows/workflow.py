@@ -1,4 +1,4 @@
-"""What a command line works on: stages in order, presets, and forecasts."""
+"""A workflow of a command line: stages in order, presets, and forecasts."""
 
 from __future__ import annotations
 

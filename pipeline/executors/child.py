@@ -1,5 +1,4 @@
-"""Stages of runs in processes of their own: what takes one down (a crash in a library, the system's end of a process that takes too much memory) is then
-a failed stage and not the end of those that run beside it.
+"""Runs stages in child processes: a crash in a library, or the system ending a process that takes too much memory, fails one stage and not the others.
 
 A child works for one run (`pipeline.executors.serving` is its side) and is kept for the run's next stage: what it has imported and compiled is used again.
 One that prepares runs goes on to the next run, until a run whose stages begin takes it over; so does one whose run is done, unless it holds much memory.
@@ -36,7 +35,7 @@ Report = Callable[[Event], None]
 LAST_LINES = 20  # of standard error that are kept
 LONGEST_LINE = 500
 IDLE = 5.0  # seconds that a child without work is kept
-LITTLE = 2**30  # bytes that the child of a run which is done may hold to go on with another: small scenes, to which starting one is a part worth saving
+LITTLE = 2**30  # bytes that the child of a finished run may hold and be used again: for small scenes starting another takes a large part of the time
 GRACE = 20.0  # seconds that a child has to reach a safe point once it is asked to stop
 PREPARES = "prepares runs "
 _PR_SET_PDEATHSIG = 1  # prctl(2), Linux alone
@@ -284,7 +283,7 @@ class Children:
             return None if run in self._stopped or self._closed else found[1]
 
     def _excess(self) -> list[_Child]:
-        """Those without work that are too many beside one more, longest idle first; they are no longer kept."""
+        """Remove and return the idle children that exceed `most` once another is added, longest idle first."""
         kept = [each for each in self._children if not each.startswith(PREPARES)]
         idle = sorted((each for each in kept if each not in self._working), key=lambda each: self._children[each][1].idle_since or 0.0)
         return [self._children.pop(each)[1] for each in idle[: max(0, len(kept) + 1 - self.most)]]
@@ -298,7 +297,7 @@ class Children:
         return None if name is None else self._children.pop(name)
 
     def _release(self, run: str) -> None:
-        """The child of a run that is done is free for others."""
+        """The child of a finished run may be used by other runs."""
         with self._lock:
             if run in self._children:
                 taken = {*self._children, *self._working}

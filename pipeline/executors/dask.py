@@ -37,10 +37,10 @@ ABSENT_SECONDS = 2.0  # that a worker may be missing before its tasks are lost
 GONE_SECONDS = 60.0  # that the connection to Dask's scheduler may be cut
 CONNECT_SECONDS = 60.0
 SUBMIT_SECONDS = 120.0  # without a worker before jobs are asked of a queue again: those before have ended, by their time limit
-LOOK_SECONDS = 1.0  # between a worker's looks whether its task is still wanted
+LOOK_SECONDS = 1.0  # between a worker's checks whether its task is still wanted
 PROGRESS_SECONDS = 2.0  # between two reports of a task's progress: they pass through Dask's scheduler
-# Defaults for clusters that are started here, under what the user has configured: workers wait for children, of which what Dask looks at a hundred times a
-# second says nothing. A worker took 3.5 % of a core by it, and the process with the scheduler as much (docs/experiments/fleet.md).
+# Defaults for clusters that are started here; the user's configuration overrides them. Workers wait for children, of which Dask's profiler sees nothing:
+# it took 3.5 % of a core in each worker and as much in the scheduler's process (docs/experiments/fleet.md).
 CALM = {
     "distributed": {
         "worker": {"profile": {"enabled": False}, "memory": {"monitor-interval": "1s"}},
@@ -82,7 +82,7 @@ class DaskWorkers:
         self._client.subscribe_topic(self._topic, self._event)
 
     def alive(self) -> Sequence[Worker]:
-        """Also notes the tasks whose worker has gone: Dask would wait for it to come back."""
+        """Also reports tasks whose worker has gone as lost: Dask would wait for it to come back."""
         try:
             # Not scheduler_info(), whose answer others of the client's own questions may replace by a shorter one.
             found = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=CONNECT_SECONDS)["workers"]
@@ -198,7 +198,7 @@ def _work(task: dict[str, Any], topic: str, module: str) -> dict[str, Any]:
     over = threading.Event()
 
     def watch() -> None:
-        """Stop the stage where nobody waits for it any more: Dask does not end what runs."""
+        """Stop the stage once its task is not wanted: Dask does not end what runs."""
         while not over.wait(LOOK_SECONDS):
             state = worker.state.tasks.get(key)
             if state is None or state.state in ("cancelled", "resumed", "forgotten", "released"):

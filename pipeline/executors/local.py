@@ -1,7 +1,7 @@
 """Runs a stage in this process.
 
-An executor is a function (Stage, Job) -> Usage. It returns when job.out is complete and lets what the stage raises pass; all the rest
-(requests, publishing, locks, signals) is the runner's. One that sends stages elsewhere needs only the paths in the job and its two callables.
+An executor is a function (Stage, Job) -> Usage. It returns when job.out is complete; errors of the stage pass through. The runner does the rest
+(requests, publishing, locks, signals). An executor that sends stages elsewhere needs only the job's paths and its two callables.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ def execute(stage: Stage, job: Job) -> Usage:
 
 
 def execute_alone(stage: Stage, job: Job) -> Usage:
-    """`execute` in a process that is there for stages alone: what they leave (libraries, compiled kernels) is looked at once by the collector of garbage.
+    """`execute` in a process that runs stages alone: the garbage collector scans what they leave (libraries, compiled kernels) only once.
 
-    Else that takes up to a second as each stage begins, and again and again within. Garbage goes before; what is left stays to the end of the process.
+    Otherwise each scan takes up to a second, when a stage begins and during it. Garbage is freed before; the rest stays until the process ends.
     """
     give_back_freed()
     gc.freeze()
@@ -64,7 +64,7 @@ def cores() -> int:
 
 
 def _reset_peak() -> None:
-    """Linux can forget the peak of the stages before; elsewhere the peak is that of the whole process."""
+    """Linux can forget the peak of the stages before; elsewhere the peak is that of the process so far."""
     with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:
         file.write("5")
 

@@ -1,6 +1,6 @@
-"""How much memory a run may take: what `--memory` says, or what the machine and the limits on this process leave.
+"""How much memory a run may take: the value of `--memory`, or what the machine and this process's limits allow.
 
-Nothing here depends on what other programs take at the moment, `available_now` apart: the same limits give the same plan.
+Only `available_now` depends on the memory that other programs take: the same limits give the same plan.
 
     machine   all of its memory
     cgroup    the smallest limit of the process's control group and of those above it, version 1 or 2
@@ -22,7 +22,7 @@ from pipeline.errors import UsageError
 from pipeline.text import printable
 
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
-MOST = 2**60  # bytes; no limit that anybody means is larger, and version 1 of control groups says "none" by a number above it
+MOST = 2**60  # bytes; larger than any real limit; version 1 of control groups states "none" by a number above it
 KEPT_BACK = 0.1  # of the machine, or of the control group: for the system, page tables and buffers of files
 # Addresses that a process with torch and OpenCV reserves beyond what it uses, and for each thread its stack and the C library's arena.
 RESERVED, RESERVED_BY_THREAD = 1200 * 2**20, 72 * 2**20  # under RLIMIT_AS
@@ -47,9 +47,9 @@ def parse_size(text: str) -> int:
 
 
 def limit_for(asked: int | None, recorded: int | None, root: Path = Path("/")) -> Limit | None:
-    """What a run may take: what was asked for now, else the smaller of what its run.json says and what this machine has, else that.
+    """A run's limit: the value asked for now, else the smaller of run.json's and this machine's, else this machine's.
 
-    A run.json may come from anybody: it can lower the limit, and not lift it.
+    A run.json may be untrusted: it can lower the limit, not raise it.
     """
     here = usable_memory(root)
     if asked is not None:
@@ -77,7 +77,7 @@ def usable_memory(root: Path = Path("/"), cores: int | None = None) -> Limit | N
 
 
 def available_now(root: Path = Path("/")) -> int | None:
-    """Bytes that this process could have right now: its own, and what no other program uses; None where the system does not say.
+    """Bytes that this process could have now: its own and all unused ones; None where the system does not say.
 
     It changes from moment to moment. Only where data lie may depend on it, and warnings; never what is made, nor what is refused.
     """
@@ -130,7 +130,7 @@ def _cgroup_folders(root: Path) -> Iterator[tuple[Path, str]]:
     """(folder, name) of each control group of this process that memory is limited by, the innermost first.
 
     A line of /proc/self/cgroup is `number:controllers:/path`. In version 2 (number 0, no controllers) all are mounted at one place, /sys/fs/cgroup, or
-    `unified` in it beside version 1; in version 1 those of memory at `memory`. Within a container the path may be that of the host, and the
+    `unified` in it together with version 1; in version 1 those of memory at `memory`. Within a container the path may be that of the host, and the
     container's own group the root of the mount; so the root is always among them.
     """
     try:

@@ -1,4 +1,4 @@
-"""The child's side of `pipeline.executors.child`: it is told what to do on standard input, and answers on standard output."""
+"""The child's side of `pipeline.executors.child`: it reads requests from standard input, and answers on standard output."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from pipeline.text import printable
 
 
 class Program(Protocol):
-    """What a workflow knows and the engine does not.
+    """The workflow's part, unknown to the engine.
 
     stages  in order
     """
@@ -57,7 +57,7 @@ class Program(Protocol):
 
 
 class _Channel:
-    """The pipes to the parent, which nothing else uses from here on."""
+    """The pipes to the parent; nothing else uses them from here on."""
 
     def __init__(self) -> None:
         self._out = os.dup(1)
@@ -105,7 +105,7 @@ def serve(program: Program) -> None:
                 answer = {"ok": False, **_failure(error)}
         channel.send({"event": "result", **answer})
     sys.stderr.flush()
-    os._exit(0)  # libraries that take the process down while they are unloaded have no say
+    os._exit(0)  # libraries that crash while they are unloaded do no harm
 
 
 def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     name = request["stage"]
     stage = next(each for each in program.stages if each.name == name)
     if request.get("donor") and take_over(_opened(program, path), stage, Path(request["donor"])):
-        channel.send({"event": "message", "stage": name, "text": f"{name}: taken over from {Path(request['donor']).name}", "time": time.time()})
+        channel.send({"event": "message", "stage": name, "text": f"{name}: adopted from {Path(request['donor']).name}", "time": time.time()})
     memory = None if request["memory"] is None else Limit(request["memory"], "its share of the worker's memory")
     run = _opened(program, path)
     outcome = run_stages(run, program.stages, only=name, device=request["device"], memory=memory, report=channel.send, execute=execute_alone)[0]
@@ -135,7 +135,7 @@ def _opened(program: Program, path: Path) -> Run:
 
 
 def _estimates(program: Program, path: Path, surveyed: Sequence[dict[str, Any]], request: dict[str, Any], channel: _Channel) -> dict[str, Any]:
-    """What the next stage writes and takes: what it reads is there. One of which that cannot be told is admitted without: a word about it, no failure."""
+    """Estimated disk and memory of the next stage, whose inputs exist. Where the estimate fails, the stage is admitted without one, with a message."""
     name = next((found["name"] for found in surveyed if not found["fresh"]), None)
     if name is None:
         return {}
@@ -146,7 +146,7 @@ def _estimates(program: Program, path: Path, surveyed: Sequence[dict[str, Any]],
         memory = program.memory(path, name, facts["device"] if stage.uses_device else "cpu")
         found["memory"] = {} if memory is None else {name: memory}
     except Exception as error:
-        text = f"{name}: what it takes cannot be told before ({type(error).__name__}: {printable(str(error), 300)})"
+        text = f"{name}: its need cannot be estimated ({type(error).__name__}: {printable(str(error), 300)})"
         channel.send({"event": "message", "stage": name, "text": text, "time": time.time()})
     return found
 

@@ -1,9 +1,9 @@
-"""A fleet without workers: how long that lasts, and what is said of it."""
+"""A fleet without workers: how long it waits, and the messages about it."""
 
 from __future__ import annotations
 
 LONGEST = 300.0  # seconds that a fleet waits while it has no worker; for jobs of a queue as long as it takes
-REPORT_SECONDS = 30.0  # seconds before that is said
+REPORT_SECONDS = 30.0  # seconds before that is reported
 
 
 class Absence:
@@ -14,7 +14,7 @@ class Absence:
         self._since: float | None = None
 
     def note(self, *, anyone: bool, now: float) -> str | None:
-        """What to say now, if anything. now: seconds, of any clock."""
+        """The message that is due, if any. now: seconds, of any clock."""
         self._since = None if anyone else now if self._since is None else self._since
         if self._since is None or now - self._since < REPORT_SECONDS:
             return None

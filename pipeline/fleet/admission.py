@@ -1,8 +1,8 @@
-"""Which of the scenes that wait begin, and on which workers: where a stage fits into what those that run leave of memory, slots and devices.
+"""Which waiting scenes begin, and on which workers: a stage has to fit into the free memory, slots and devices.
 
     sum of what is admitted     at no time more than a worker's memory
-    what does not fit now       has a worker kept for it: what begins there meanwhile leaves room for it, so that it waits for nothing but what runs already
-    what fits nowhere           has the largest worker for itself; the caller lowers its demand to that
+    what does not fit now       has a worker reserved: stages that begin there meanwhile leave space for it, so that it waits only for those that run already
+    what fits nowhere           gets the largest worker alone; the caller lowers its demand to that
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class _Kept:
 
 
 class Admission:
-    """What of each worker is taken. Scenes ask in the order in which they may begin."""
+    """The used part of each worker. Scenes ask in the order in which they may begin."""
 
     def __init__(self) -> None:
         self._tasks: dict[str, dict[int, Task]] = defaultdict(dict)
@@ -49,21 +49,21 @@ class Admission:
         self._tasks[task.worker].pop(task.number, None)
 
     def look(self, workers: Sequence[Worker], waiting: Collection[int]) -> None:
-        """Begin a look at the scenes of these numbers. What was kept for others, or of workers that have gone, is kept no longer."""
+        """Begin a pass over the scenes of these numbers. Reservations for others, or of workers that have gone, end."""
         alive = {worker.name for worker in workers}
         self._workers = workers
         self._kept = {name: kept for name, kept in self._kept.items() if name in alive and kept.who in waiting}
         self._full, self._too_large = set(), {}
 
     def waited_for(self) -> set[int]:
-        """The numbers of the scenes that workers are kept for: they come first."""
+        """The numbers of the scenes that have a reserved worker: they come first."""
         return {kept.who for kept in self._kept.values()}
 
     def place(self, who: int, demand: Demand, *, avoided: Collection[str] = (), preferred: str | None = None) -> Place | None:
-        """Where a scene may begin; None where no worker has room for it now.
+        """Where a scene may begin; None where it fits on no worker now.
 
         avoided    workers that are taken where no other is large enough
-        preferred  the worker that is taken if it has room, else the one with least to do
+        preferred  the worker that is taken if the scene fits on it, else the one with least to do
         """
         if demand.uses_gpu in self._full or (demand.memory or 0) >= self._too_large.get(demand.uses_gpu, 2**63):
             return None
@@ -105,7 +105,7 @@ class Admission:
         return sum(task.memory or 0 for task in tasks if task.number >= kept.since) + memory + kept.memory <= worker.memory
 
     def _keep(self, who: int, demand: Demand, workers: Sequence[Worker]) -> None:
-        """Keep the one of these workers for a scene that has most to give; once kept, it stays so."""
+        """Reserve the worker with most free memory; a reservation stays."""
         for worker in self._workers:
             kept = self._kept.get(worker.name)
             if kept is not None and kept.who == who:

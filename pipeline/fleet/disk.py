@@ -1,4 +1,4 @@
-"""Room on the disk that a fleet lies on: stages are admitted by what they will write, so that those that run side by side do not fill it together."""
+"""Free space on a fleet's disk: stages are admitted by what they will write, so that concurrent stages do not fill it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def free_space(fleet: Path) -> int:
 
 
 def has_room(free: int, wanted: tuple[Path, int], running: Iterable[tuple[Path, int]], *, written: Callable[[Path], int] | None = None) -> bool:
-    """Whether a stage fits beside those that run.
+    """Whether a stage fits on the disk together with those that run.
 
     free     bytes
     wanted   its run, and the bytes that it writes in all

@@ -1,7 +1,7 @@
-"""What becomes of a scene whose stage failed: tried again, differently, or given up with the reason.
+"""Decides about a scene whose stage failed: try again, try differently, or give up with the reason.
 
 its process crashed                           once more, on another worker if there is one
-its worker died                               the same, and then failed: stages run in processes of their own, so that it says little of the scene
+its worker died                               the same, and then failed: stages run in child processes, so the scene is hardly the cause
 nothing more is heard of it                   again: the scheduler of Dask has gone
 memory ran out                                once more, in half of the memory; where that is too little to begin with, alone on the largest worker
 it needs more memory than it was given        once more, in what it needs, if a worker has that

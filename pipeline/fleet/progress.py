@@ -46,7 +46,7 @@ class Progress:
         return "prepare" if self.todo is None else self.todo[0] if self.todo else "finish"
 
     def bytes_needed(self) -> int | None:
-        """Bytes that it takes next; None where nobody knows: a worker's share."""
+        """Bytes that it takes next; None where unknown: a worker's share."""
         if self.attempts.memory is not None:
             return self.attempts.memory
         if not self.todo:
@@ -55,7 +55,7 @@ class Progress:
         return None if estimate is None else int(HEADROOM * estimate)
 
     def too_little(self, memory: int | None) -> str | None:
-        """A sentence where these bytes are less than its stage is estimated to take: then they are all of the largest worker's."""
+        """A warning where these bytes, all of the largest worker's, are less than the stage's estimate."""
         need = self.memory.get(self.what, 0)
         if memory is None or need <= memory or self.attempts.memory is not None:
             return None
@@ -69,7 +69,7 @@ class Progress:
         return True
 
     def record(self, result: Mapping[str, Any], known: Collection[str]) -> None:
-        """What an answer says of the run: what its stages took, of those that are known; what they made; and what the next takes."""
+        """Read an answer about the run: what its known stages took, what they made, and what the next takes."""
         for found in [*result.get("stages", []), *([result] if "fresh" in result else [])]:
             if found.get("name") not in known or not found.get("fresh"):
                 continue

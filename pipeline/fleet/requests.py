@@ -1,4 +1,4 @@
-"""What `enerf fleet retry` and `cancel` ask of the process that runs the fleet, on whatever machine that is: files in FLEET/.requests, taken in order."""
+"""Requests of `enerf fleet retry` and `cancel` to the process that runs the fleet, on any machine: files in FLEET/.requests, taken in order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.fleet.state import MOST_SCENES
 
 FOLDER = ".requests"
 MOST = 100  # that are taken at a time
-ANSWER_SECONDS = 30.0  # that who asks waits for the process that runs the fleet, which looks every second
+ANSWER_SECONDS = 30.0  # that the caller waits for the process that runs the fleet, which checks every second
 _LIMIT = 4 * 2**20  # bytes of one
 
 
@@ -39,7 +39,7 @@ def ask(fleet: Path, do: Literal["cancel", "retry"], scenes: Sequence[str] | Non
 
 
 def outcome(path: Path, is_running: Callable[[], bool], seconds: float | None = None) -> Literal["taken", "ended", "left"]:
-    """What becomes of a request: taken; ended: the fleet did first, and it is withdrawn; or left: nobody answered in this time, by default ANSWER_SECONDS."""
+    """What becomes of a request: taken; ended: the fleet did first, and it is withdrawn; or left: no answer in this time, by default ANSWER_SECONDS."""
     deadline = time.monotonic() + (ANSWER_SECONDS if seconds is None else seconds)
     look = time.monotonic() + 2.0
     while files.exists(path):
@@ -72,7 +72,7 @@ def take(fleet: Path) -> list[Request]:
 
 
 def left(fleet: Path) -> list[str]:
-    """Take the requests to a process that has ended: the scenes to try again. That one was to be cancelled concerns nobody any more."""
+    """Take the requests to a process that has ended: the scenes to try again. Cancellations no longer matter."""
     names: list[str] = []
     while found := take(fleet):
         names += [name for request in found if request.do == "retry" for name in request.scenes or ()]

@@ -1,6 +1,6 @@
-"""Runs the scenes of a fleet: the stages of each in order, those of different scenes side by side where there is room.
+"""Runs the scenes of a fleet: the stages of each in order, those of different scenes concurrently where resources allow.
 
-The truth about a scene is its run: what a stage has published is never done again, whatever happens to this process. fleet.json tells it to others.
+A scene's run is authoritative: published stages are never done again, whatever happens to this process. fleet.json reports the state to others.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Report = Callable[[dict[str, Any]], None]
 
 WRITE_SECONDS = 1.0  # between two writings of fleet.json, and WRITE_INTERVAL_RATIO as long as one takes
 WRITE_INTERVAL_RATIO = 20.0
-LOOK_SECONDS = 1.0  # between two looks for requests, and for workers that came or went
+LOOK_SECONDS = 1.0  # between two checks for requests, and for workers that came or went
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Scheduler:
     """One call of `enerf fleet`.
 
     fleet    its folder, whose lock is held
-    states   all scenes, as they were before: done ones are looked at again, quarantined ones left alone
+    states   all scenes, as they were before: done ones are checked again, quarantined ones left alone
     stages   of the workflow, in order
     device   "cpu" or "cuda"
     report   takes events, each with "scene": those of stages, and scene_done, scene_failed, scene_quarantined, retry
@@ -85,7 +85,7 @@ class Scheduler:
         ended = True
         try:
             while self._left() and (number := self._stop()) is None and not self._cancelled:
-                if self._look() or ended:  # progress makes no room
+                if self._look() or ended:  # progress frees no resources
                     self._admit()
                 ended = False
                 for message in self.workers.receive(0.5):
@@ -115,7 +115,7 @@ class Scheduler:
         return all(each.state.state == "done" for each in self._all.values())
 
     def _look(self) -> bool:
-        """Now and then: which workers there are, what was requested, whether the fleet is still ours. Returns whether it was looked at."""
+        """Now and then: which workers there are, what was requested, whether the fleet is still ours. Returns whether the check was due."""
         now = time.monotonic()
         if now < self._next_look:
             return False
@@ -131,7 +131,7 @@ class Scheduler:
         return True
 
     def _look_for_workers(self, now: float) -> None:
-        """Say it where there are none. Raises StageFailed where that has lasted too long."""
+        """Report a lack of workers. Raises StageFailed where it has lasted too long."""
         note = self._absence.note(anyone=bool(self._alive), now=now)
         if (why := self._absence.ends(now)) is not None and not self._tasks:  # one that takes no more tasks may still end those that it has
             raise StageFailed(f"{self.fleet}: {why} {len(self._open)} scenes wait. Start workers, and give the fleet's command again: what is done is kept.")
@@ -164,10 +164,10 @@ class Scheduler:
                     self._give_up(each, "failed", "cancelled.")
 
     def _admit(self) -> None:
-        """Start what there is room for: what has waited for room first, then stages that use a device, then scenes that have begun, in the manifest's order."""
+        """Start what fits: first what has waited for resources, then stages that use a device, then scenes that have begun, in the manifest's order."""
         now = time.monotonic()
         cramped: list[Progress] = []
-        too_much = math.inf  # bytes to write for which the disk has no room
+        too_much = math.inf  # bytes to write for which the disk has no space
         waiting = {each.number: each for each in self._open if each.task is None and each.not_before <= now and self._has_its_share(each)}
         self._admission.look(self._alive, waiting)
         first = self._admission.waited_for()
@@ -175,16 +175,16 @@ class Scheduler:
             place = self._admission.place(each.number, self._demand(each), avoided=each.attempts.lost_on, preferred=each.last_worker)
             need = each.space.get(each.what, 0)
             if place is not None and ((self._tasks and need >= too_much) or not self._has_disk(each, need)):
-                too_much = min(too_much, need)  # where nothing runs each is looked at: what it has written already counts
+                too_much = min(too_much, need)  # where nothing runs each is tried: what it has written already counts
                 cramped.append(each)
             elif place is not None:
                 self._start(each, *place)
         for each in cramped if not self._tasks else ():  # nothing that runs will give any of it back
             shown = f"{each.what}: writes about {size_text(each.space[each.what])}; {size_text(disk.free_space(self.fleet))} are free in {self.fleet}."
-            self._give_up(each, "failed", f"{shown} Make room, and go on.")
+            self._give_up(each, "failed", f"{shown} Free some space, and go on.")
 
     def _has_disk(self, each: Progress, need: int) -> bool:
-        """Whether the disk has room for so many bytes of its stage, beside what those that run will write."""
+        """Whether the disk has space for so many bytes of its stage, besides what running stages will write."""
         if not need:
             return True
         running = [(self.fleet / other.state.run, other.space.get(str(other.task.request.get("stage")), 0)) for other in self._tasks.values() if other.task]
@@ -196,7 +196,7 @@ class Scheduler:
         return not (uses and self.device == "cuda"), each.todo is None, each.number
 
     def _demand(self, each: Progress) -> Demand:
-        """What it waits for: what its stage takes, or all of the largest worker where that is less. The worker that had more may have gone."""
+        """The scene's demand: its stage's, or all of the largest worker where that is less: the worker that had more may have gone."""
         stage, memory = self.stages.get(each.what), each.bytes_needed()
         if memory is not None and self._largest is not None:
             memory = min(memory, self._largest)

@@ -1,10 +1,10 @@
 """The fleet folder, and FLEET/fleet.json: what became of each scene.
 
-    FLEET/fleet.json    the state, written whole whenever it changes; the contract with programs
+    FLEET/fleet.json    the state, rewritten atomically whenever it changes; the contract with programs
     FLEET/<scene>/      a run (pipeline/run.py)
     FLEET/.requests/    what `retry` and `cancel` ask of the process that runs the fleet
 
-A fleet.json may come from anybody: every value is checked and bounded when it is read, and a scene's run lies in the fleet's folder.
+A fleet.json may be untrusted: every value is checked and bounded when it is read, and a scene's run lies in the fleet's folder.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Scene:
     sources   absolute paths of its folders and videos
     settings  stage -> setting -> value, where they are not the preset's
     sweep     "stage.setting" -> value for a scene that a sweep made
-    shares    stage -> the scene before it that makes the same artifact: this one waits for it and takes it over
+    shares    stage -> the scene before it that makes the same artifact: this one waits for it and adopts it
     """
 
     name: str
@@ -89,7 +89,7 @@ class StageState:
 
 @dataclass
 class Verdict:
-    """What is to be thought of a scene's cameras, or of what was made of them."""
+    """The grade of a scene's cameras, or of its result."""
 
     grade: _Name
     summary: _Text
@@ -106,7 +106,7 @@ class SceneState:
     bytes       of its asset
     verdict     on its cameras; result: on what was made of them
     stage       that runs now
-    last_lines  of a failed or quarantined scene: the last that its stage said
+    last_lines  of a failed or quarantined scene: the last lines of its stage's output
     attempts    failures so far of the stage that it is at
     run         its folder, relative to the fleet's
     """
@@ -166,7 +166,7 @@ class Totals:
 
 @dataclass
 class FleetState:
-    """The whole fleet.
+    """A fleet.
 
     started, updated  ISO 8601, UTC
     forecast_seconds  until its end, None where nothing is known yet
@@ -216,7 +216,7 @@ def check_scenes(scenes: Sequence[Scene]) -> None:
 
 
 def write_fleet(fleet: Path, state: FleetState) -> None:
-    """Write FLEET/fleet.json whole. Raises PipelineError."""
+    """Write FLEET/fleet.json atomically. Raises PipelineError."""
     try:
         files.write_atomically(fleet / NAME, state.to_bytes())
     except OSError as error:
@@ -247,7 +247,7 @@ def read_fleet(fleet: Path) -> FleetState:
 
 
 def _check(path: Path, found: FleetState) -> None:
-    """What types alone do not say."""
+    """Checks beyond types."""
     try:
         check_scenes([scene.scene() for scene in found.scenes])
     except UsageError as error:

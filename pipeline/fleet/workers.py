@@ -1,4 +1,4 @@
-"""What stages of a fleet run on, as the scheduler sees it: workers with room, tasks for them, and what comes back."""
+"""The scheduler's view of its executor: workers with their capacity, tasks, and results."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Message:
-    """An event of a task, or its result: the last that is heard of it. "kind" is "lost" where its worker has gone, "unheard" where nobody knows."""
+    """An event of a task, or its result, which comes last. Its "kind" is "lost" where the worker has gone, "unheard" where that is unknown."""
 
     task: int
     kind: Literal["event", "result"]
@@ -87,10 +87,10 @@ class Workers(Protocol):
         """Begin with a task; its messages come by `receive`."""
 
     def stop(self, task: Task) -> None:
-        """Ask a task to stop at its next safe point; its result comes as ever."""
+        """Ask a task to stop at its next safe point; its result still comes."""
 
     def receive(self, timeout: float) -> list[Message]:
-        """What has come, after at most so many seconds if nothing has."""
+        """Messages that have come; waits at most so many seconds for one."""
 
     def close(self) -> None:
         """End all that still runs."""

@@ -3,11 +3,11 @@
     FOLDER/.lease/<number>   one file for each holder, its number one above that of the holder before; modified by its holder every BEAT seconds
 
 The highest number holds. It is free where it was not modified for EXPIRY seconds, by the clock of the file server alone: the clocks of machines differ.
-Whoever finds it free creates the next number, which exactly one can: a file is written aside and linked to its name, as is safe on NFS, or created with
-O_EXCL where there are no links. No number is ever given twice while a higher one is there, so that one who was slow to take over finds out. A holder
+Who finds it free creates the next number, which exactly one can: a file is written aside and linked to its name, as is safe on NFS, or created with
+O_EXCL where there are no links. No number is ever given twice while a higher one is there, so that a process that was slow finds out. A holder
 that finds a higher number than its own, or could not renew its own for EXPIRY seconds, has lost the lease and must write nothing more.
 
-Within one machine an operating system's lock decides (`pipeline.locks.lock`): who has that may take over at once from a process of the same machine.
+Within one machine an operating system's lock decides (`pipeline.locks.lock`): its holder may take over at once from a process of the same machine.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def age_of(folder: Path) -> float | None:
 
 @cache
 def machine() -> str:
-    """What no other machine has while this one runs."""
+    """A unique identifier of this machine, while it runs."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:

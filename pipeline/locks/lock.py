@@ -1,4 +1,4 @@
-"""One writer at a time: an operating system's lock on RUN/.lock, beside it who holds it, and a lease for other machines that share the folder.
+"""One writer at a time: an operating system's lock on RUN/.lock, a note of its holder, and a lease for other machines that share the folder.
 
 The lock ends with its process: a killed process never blocks a run on its own machine. On another the run is free once the lease has expired.
 """

@@ -1,4 +1,4 @@
-"""The codes of an asset in the layout `packed`: as good as bake.max_mib has room for.
+"""The codes of an asset in the layout `packed`: as fine as bake.max_mib allows.
 
 How many bytes codes take is known once they are coded. So codes are chosen at a rate, and then at the next one that follows from the file's size, until
 it is nearly filled. Where even the coarsest codes are too large, the voxels that weigh least are left out. Then the tables and palettes that codes stand for

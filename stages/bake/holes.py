@@ -1,4 +1,4 @@
-"""Holes of a whole scene: rays of training pixels on which the field is opaque and the tree is not; and the voxels there that were dropped wrongly.
+"""Holes of an unbounded scene: rays of training pixels on which the field is opaque and the tree is not; and the voxels there that were dropped wrongly.
 
 N voxels, P rays.
 """
@@ -14,13 +14,13 @@ from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 
 FIELD_OPACITY, TREE_OPACITY = 0.95, 0.5  # of a hole: the field's at least, the tree's at most
-RAYS = 2**19  # that are looked along, at most
+RAYS = 2**19  # that are checked, at most
 RAYS_PER_BLOCK = 2**15
 END_WEIGHT = 0.02  # of a sample that is part of the surface where a ray ends
 
 
 def find_holes(job: Job, tree: NerfTree, samples: FieldSamples) -> tuple[np.ndarray, float]:
-    """The rays, as places in `samples`, that end in holes; and their share of those that were looked along."""
+    """The rays, as places in `samples`, that end in holes; and their share of those that were checked."""
     every = np.arange(0, len(samples.pixel), max(1, -(-len(samples.pixel) // RAYS)))
     opaque = every[samples.opacity[every] > FIELD_OPACITY]
     found = []

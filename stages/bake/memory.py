@@ -1,4 +1,4 @@
-"""What baking takes: at most, before it begins; and once its voxels are known. docs/experiments/memory.md"""
+"""Memory of baking: at most, before it begins; and once its voxels are known. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, a
 PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, those in the order of the file or decoded, two in the refinement
 # Bytes. Of a voxel besides its values: coordinates and keys while it is sorted into the tree; of a coarse cell: its brick, its row while voxels are chosen,
 # its distance to the next one; of a brick's voxel: greatest weight, three times while they grow, and its number; of a training pixel that visibility is
-# measured on: its number, or of whole scenes the field's samples along its ray, twice while they are joined; of a ray of a refinement step: its records.
+# measured on: its number, or of unbounded scenes the field's samples of its ray, twice while they are joined; of a ray of a refinement step: its records.
 VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 400, 5000
 ERROR_CELL = 48  # bytes of a cell of the error map: two errors, chances, factors and numbers of tiles, and what is made of these
-# Bytes written: of a voxel in a checkpoint besides its values; of a ray, the field's samples of a whole scene. Voxels that a visibility ray shows, of which
+# Bytes written: of a voxel in a checkpoint besides its values; of a ray, the field's samples of an unbounded scene. Voxels that a visibility ray shows:
 # 4 to 6 were measured. Rays that are refined before a first checkpoint is written.
 WRITTEN, WRITTEN_RAY, SHOWN, SHORT = 24, 700, 8, 20 * 32768
 MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.contributions
@@ -54,7 +54,7 @@ def voxels_needed(voxels: int, harmonics: int, *, packed: bool = False) -> int:
 
 def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int, *, smooth: bool) -> int:
     """Bytes that such a tree takes on a device while it is refined there (`efficientnerf.asset.refinement.device`): values and means of squares in
-    float32, visits and stamps, sums of gradients in 64 bits; where there is a total variation (`smooth`) the six voxels beside each, and densities before a
+    float32, visits and stamps, sums of gradients in 64 bits; where there is a total variation (`smooth`) the six voxels next to each, and densities before a
     step; of bricks their voxels with a border; of the grid's cells three numbers while it is sent."""
     return (28 + 36 * harmonics + 28 * smooth) * voxels + 4 * (brick + 2) ** 3 * bricks + 12 * cells
 
@@ -67,14 +67,14 @@ def free_on_device(device: str) -> int:
 def needed(
     settings: BakeSettings, m: Model, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, whole: bool, device: str
 ) -> Need:
-    """What baking a model takes.
+    """Memory to bake a model.
 
     channels  of the pixels
     voxels    that are baked
     cells     coarse cells of the finest grids in question
     bricks    that are reached by samples, at most
     stored    whether the pixels are in a file
-    whole     whether a whole scene is baked
+    whole     whether the scene is unbounded
     """
     pixels, harmonics = pixels_needed(views, channels, stored=stored), (m.fine.degree + 1) ** 2
     rays = min(settings.visibility_rays, count_pixels(tuple(views)))
@@ -90,9 +90,9 @@ def needed(
 
 
 def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, whole: bool) -> PixelRows | None:
-    """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
+    """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit with the voxels.
 
-    How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
+    The number of voxels is not known yet: what would not fit without any is refused here, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     settings, channels = job.settings, channels_of(job.inputs["poses"], views)
     finest, voxels, at_most = most_needed(settings, m, s, views, channels, mib, whole, job.device)
@@ -100,15 +100,15 @@ def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: 
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
     if job.memory is not None and (most := at_most(voxels, stored=stored).total) > job.memory.bytes:
-        job.warn(f"an asset of {mib:g} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. Should it not fit, that is said"
-                 " once its voxels are counted, before they are baked; with a lower bake.max_mib it surely fits.")  # fmt: skip
+        job.warn(f"an asset of {mib:g} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. It is refused"
+                 " once its voxels are counted, before they are baked, if it does not fit; with a lower bake.max_mib it surely fits.")  # fmt: skip
     return rows
 
 
 def most_needed(
     settings: BakeSettings, m: Model, s: Scene, views: Sequence[View], channels: int, mib: float, whole: bool, device: str
 ) -> tuple[int, int, Callable[..., Need]]:
-    """What baking a model takes at most, before its voxels are counted.
+    """Most memory to bake a model, before its voxels are counted.
 
     mib      that the asset may have
     returns  voxels along the finest grid in question; how many are baked at most; and `needed` as a function of (voxels, stored=)
@@ -150,7 +150,7 @@ def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: P
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage bake takes at most, before its voxels are counted."""
+    """Most memory of the stage bake, before its voxels are counted."""
     return _before(known)[-1]
 
 
@@ -164,7 +164,7 @@ def space_needed(known: Known) -> int:
 
 
 def _before(known: Known) -> tuple[int, bool, float, int, int, Need]:
-    """(degree of the harmonics, whether a whole scene is baked, MiB of the asset, visibility rays, voxels, what these take of memory), each at most."""
+    """(degree of the harmonics, whether the scene is unbounded, MiB of the asset, visibility rays, voxels, what these take of memory), each at most."""
     own, inputs = known.settings["bake"], known.inputs(BakeInputs)
     m, s = load_renderer(inputs.train.folder).model, load_scene(inputs.poses.folder, inputs.train.folder)
     views, whole = views_of(s, "train"), constant_background(s) is None

@@ -1,4 +1,4 @@
-"""What is baked: the voxels of one grid, or of the cascades of a whole scene."""
+"""The voxels to bake: of one grid, or of the cascades of an unbounded scene."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Plan:
     """Voxels that are baked.
 
     space        the field's, in the frame that the voxels are cubes of
-    grids        nested, the innermost first; of others than whole scenes one
+    grids        nested, the innermost first; one unless the scene is unbounded
     indices      coordinates (N, 3) of the voxels in each of them
     bricks       coarse cells that hold a sample, of all grids
-    seen         of whole scenes, for each grid (N, 2) what rays saw of the voxels (`efficientnerf.asset.field_samples.seen_weights`)
-    samples      what the field shows along training rays, of whole scenes alone, as the next two
+    seen         of unbounded scenes, for each grid (N, 2) what rays saw of the voxels (`efficientnerf.asset.field_samples.seen_weights`)
+    samples      what the field shows along training rays, of unbounded scenes alone, as the next two
     region       the foreground
     environment  (H, 2 H, 3) what lies beyond all grids
     """

@@ -1,5 +1,5 @@
-"""Which voxels of a tree that is being refined are dropped: those that contribute to no pixel, and of the others those of least weight, as far as the asset's
-size demands. Of whole scenes, voxels without which a ray would end in a hole stay.
+"""Which voxels are dropped from a tree during refinement: those that contribute to no pixel, then those of least weight, as far as the asset's size
+demands. In unbounded scenes, voxels stay without which a ray would end in a hole.
 
 N voxels.
 """
@@ -30,7 +30,7 @@ RAYS_PER_VOXEL, NDC_RAYS_PER_VOXEL = 1.0, 0.25
 
 @dataclass(frozen=True)
 class Pruned:
-    """That voxels were dropped, and of whole scenes the shares of the rays that end in holes.
+    """How voxels were dropped: of unbounded scenes, the shares of the rays that end in holes.
 
     without   after voxels were dropped
     restored  after `voxels` of them were restored
@@ -47,10 +47,10 @@ class Pruned:
 def prune(
     job: Job, s: Scene, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None, baked: np.ndarray | None
 ) -> tuple[RefinementState, Pruned]:
-    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most. Of a whole scene,
-    voxels without which a ray would end in a hole stay. In normalised device coordinates the contributions of voxels that few images have in view count more.
+    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most. In an unbounded
+    scene, voxels stay without which a ray would end in a hole. In normalised device coordinates voxels that few images have in view count more.
 
-    baked  (N,) densities before the first step, of a whole scene
+    baked  (N,) densities before the first step, of an unbounded scene
     """
     state.to_host()
     greatest = greatest_weights(job, state, targets)
@@ -80,7 +80,7 @@ def prune(
 
 
 def count_rays(job: Job, ndc: bool, voxels: int, targets: Targets) -> int:
-    """Training rays that are rendered to see which of so many voxels show."""
+    """Training rays that are rendered to find which of so many voxels show."""
     per_voxel = NDC_RAYS_PER_VOXEL if ndc else RAYS_PER_VOXEL
     return min(max(job.settings.visibility_rays, int(per_voxel * voxels)), 4 * len(targets.pixels))
 
@@ -114,5 +114,5 @@ def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:
         keep = np.zeros(len(keep), bool)
         keep[order[:most]] = True
         left_out = float(greatest[order[most]])
-        job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib has room for {most:,}")
+        job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib allows {most:,}")
     return keep

@@ -1,8 +1,8 @@
 """The resolution of an asset: as fine as its size allows, and no finer than the training images resolve.
 
-The number of voxels at a resolution cannot be derived from the box. So visibility is computed once, on the finest grid in question; on coarser grids
-the same voxels are counted: first on two that are cheap, which give the exponent by which the number grows (2 for surfaces, 3 for what fills space),
-then on the one that follows from it. Nothing depends on the clock or on free memory.
+The number of voxels at a resolution cannot be derived from the box. Visibility is computed once, on the finest grid in question, and the same voxels are
+counted on coarser grids: first on two cheap ones, which give the exponent of growth (2 for surfaces, 3 for volumes), then on the one that follows
+from it. Nothing depends on the clock or on free memory.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from stages.bake.settings import BakeSettings
 from stages.io.scene import Scene
 
 MIN_RESOLUTION = 32  # voxels along the longest side
-# docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background, of a whole scene (in its innermost cascade), and in
+# docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background, of an unbounded scene (its innermost cascade), and in
 # normalised device coordinates (images hold noise that finer voxels would learn); voxels along the longest side, at most; MiB of an asset, at most
 VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
 MAX_RESOLUTION = 1024
 MAX_MIB = 38
-# Of whole scenes: cascades at most; the share of what the field shows that may lie beyond the last one, in the environment map; coarse cells of all of them.
+# Of unbounded scenes: most cascades; the share of what the field shows that may lie beyond the last, in the environment map; coarse cells of all of them.
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
 NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
-# With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of a whole scene takes
-# fewer rays. docs/experiments/tree-training.md
+# With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of an unbounded scene
+# takes fewer rays. docs/experiments/tree-training.md
 TIMED_MIB, SCENE_TIMED_MIB, MIN_TIMED_MIB = 0.115, 0.23, 2.0
 MIN_FILL = 0.93  # of the size that is used, at least
 MAX_TRIES = 4
@@ -96,8 +96,8 @@ def budget_of(s: Scene, stated: float | None, *, packed: bool = False) -> float:
 
 
 def refuse_without_room(settings: BakeSettings, mib: float, resolution: int, room: int, *, environment: bool) -> None:
-    """UsageError where an asset of so many MiB has no room for a single voxel beside its coarse cells at the least resolution in question, and, of a whole
-    scene, its environment map. Else the voxels would be dropped one and all, and the field be thought empty."""
+    """UsageError where an asset of so many MiB cannot hold one voxel besides its coarse cells at the least resolution in question, and, of an unbounded
+    scene, its environment map. Otherwise all voxels would be dropped, and the field would seem empty."""
     if room > 0:
         return
     beside, lower = f"the coarse cells of {resolution} voxels along the longest side", [] if resolution <= MIN_RESOLUTION else [
@@ -107,7 +107,7 @@ def refuse_without_room(settings: BakeSettings, mib: float, resolution: int, roo
         beside += f" and an environment map of {settings.environment_size} rows"
         lower.append(f"bake.environment_size ({settings.environment_size})")
     remedy = "Raise bake.max_mib (--target-mib)" + (f", or lower {' or '.join(lower)}" if lower else "")
-    raise UsageError(f"bake.max_mib={mib:.3g}: has no room for voxels beside {beside}. {remedy}.")
+    raise UsageError(f"bake.max_mib={mib:.3g}: has no space for voxels besides {beside}. {remedy}.")
 
 
 def timed_budget(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:

@@ -2,7 +2,7 @@
 
     asset.nerftree  see efficientnerf/asset/FORMAT.md
     report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the refinement, and of a packed
-                    asset as it is written; of a scene without a constant background, which is baked whole (`stages.bake.whole_scene`): its cascades, and
+                    asset as it is written; of a scene without a constant background, baked as unbounded (`stages.bake.whole_scene`): its cascades, and
                     the share of the rays that end in holes
     log.jsonl       a line every few steps of the refinement
     curve.png       PSNR over these steps
@@ -95,7 +95,7 @@ def run(job: Job) -> None:
 
 
 def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> float:
-    """MiB that voxels are chosen by; where the size is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other
+    """MiB that voxels are chosen by; where the size is left to us, no more than can be refined in bake.time_budget. Noted: another attempt may have other
     cores."""
     settings: BakeSettings = job.settings
     seconds = resolved(settings.time_budget)
@@ -112,7 +112,7 @@ def _size_limit(job: Job, s: Scene, *, whole: bool, discretise: int | None) -> f
 
 
 def _plan(job: Job, m: Model, s: Scene, pixels: Pixels, mib: float, *, whole: bool) -> Plan:
-    """The voxels to bake: cascades of a whole scene, or else one grid of what lies in the field's box."""
+    """The voxels to bake: cascades of an unbounded scene, or else one grid of what lies in the field's box."""
     space = voxel_space(job, m)
     if whole:
         return choose_scene_voxels(job, m, s, pixels, space, mib)

@@ -13,7 +13,7 @@ from stages.scratch import Warn, note, noted
 
 
 def write_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
-    """Write PATH_NAME.npy of each, then the note PATH.json that says they are whole."""
+    """Write PATH_NAME.npy of each, then the note PATH.json that says they are complete."""
     outputs = []
     for name, values in arrays.items():
         outputs.append(path.with_name(f"{path.name}_{name}.npy"))
@@ -30,7 +30,7 @@ def _write_array(values: np.ndarray, file: BinaryIO) -> None:
 
 
 def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]], warn: Warn) -> dict[str, np.ndarray] | None:
-    """What `write_arrays` wrote, mapped from the files; None where something is missing, or not as it was written.
+    """The arrays of `write_arrays`, mapped from the files; None where something is missing, or not as it was written.
 
     expected  type and number of dimensions of each by name
     """

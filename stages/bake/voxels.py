@@ -1,4 +1,4 @@
-"""Which voxels of one grid are baked: the resolution, and the voxels that training images show. Of whole scenes: `stages.bake.whole_scene`.
+"""Which voxels of one grid are baked: the resolution, and the voxels that training images show. Of unbounded scenes: `stages.bake.whole_scene`.
 
 N voxels.
 """
@@ -99,9 +99,9 @@ def choose_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Space, mi
 
 
 def by_views(job: Job, s: Scene, visibility: Visibility, shape: tuple[int, int, int], voxel: float, space: Space) -> Visibility:
-    """The visibility in normalised device coordinates with smaller weights where many training images have voxels in view; that of other spaces as it is.
+    """The visibility, in normalised device coordinates with smaller weights where many training images have voxels in view.
 
-    What the field shows faintly behind and before its surfaces the refinement drops: the room is worth more in finer voxels.
+    The refinement drops what the field shows faintly behind and before its surfaces: finer voxels use the space better.
     """
     if space.ndc is None:
         return visibility

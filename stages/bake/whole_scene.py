@@ -1,7 +1,7 @@
-"""Which voxels of which cascades hold a whole scene, its foreground region, and its environment map.
+"""The cascades of an unbounded scene and their voxels, its foreground region, and its environment map.
 
-The field is rendered along training rays once (`efficientnerf.asset.field_samples`). Where their light ends gives the foreground region, which the innermost
-cascade covers; there are as many others around it as hold nearly all that the photographs show, and the rest goes to the environment map. All voxels compete
+The field is rendered along training rays once (`efficientnerf.asset.field_samples`). Their end points give the foreground region, which the innermost
+cascade covers; the cascades around it hold nearly all that the photographs show, and the rest goes to the environment map. All voxels compete
 for the asset's size by the weight that they have in some pixel, wherever they are.
 
 N voxels, P rays.
@@ -81,7 +81,7 @@ def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Spa
     stated, discretise = resolved(settings.resolution), resolved(m.settings.discretise)
     fixed = stated or discretise
     least = fixed or MIN_RESOLUTION
-    # Before the field is rendered the region is not known: only that its longest side has so many voxels.
+    # The region is not known before the field is rendered: only that its longest side has so many voxels.
     line: Grid = ((-(-least // settings.brick_size), 1, 1), 1.0, np.zeros(3))
     refuse_without_room(settings, mib, least, room_of(settings, m, [line], mib), environment=True)
     samples = _samples(job, m, pixels)
@@ -124,7 +124,7 @@ def choose_scene_voxels(job: Job, m: Model, s: Scene, pixels: Pixels, space: Spa
 
 
 def room_of(settings: BakeSettings, m: Model, grids: Sequence[Grid], mib: float, *, environment: bool = True) -> int:
-    """How many voxels an asset of so many MiB holds, beside the cells of these grids and an environment map."""
+    """How many voxels an asset of so many MiB holds, besides the cells of these grids and an environment map."""
     cells = sum(math.prod(shape) for shape, _, _ in grids)
     rows = settings.environment_size if environment else 0
     return most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, (cells, 1, 1), settings.brick_size, environment=rows)
@@ -242,7 +242,7 @@ def _samples(job: Job, m: Model, pixels: Pixels) -> FieldSamples:
 
 
 def fits(samples: FieldSamples, pixels: Pixels) -> bool:
-    """Whether samples are of these pixels, and whole."""
+    """Whether samples are of these pixels, and complete."""
     rays, count = len(samples.pixel), len(samples.start)
     shapes = {
         "view": (rays,), "origin": pixels.centre.shape, "direction": (rays, 3), "opacity": (rays,), "behind": (rays, 3), "first": (rays + 1,),

@@ -23,9 +23,9 @@ OnRays = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedAsset:
-    """What is measured of an asset.
+    """An asset to be measured.
 
-    render   the whole of it, as `efficientnerf.asset.rendering.render`
+    render   all of it, as `efficientnerf.asset.rendering.render`
     inner    cascade 0 alone, where that lies in surroundings that the asset shows too; None: the asset shows what lies in its box, and no more
     box      (2, 3) of cascade 0; None: that of the field's space
     reach    (2, 3) of all cascades; None: the same
@@ -55,7 +55,7 @@ def evaluated(tree: NerfTree) -> EvaluatedAsset:
 def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The asset's image of a view (H, W, 3), and the opacity and the depth of its voxels (H, W).
 
-    seen    the field's rendering on every stride-th pixel: the surroundings of an asset that shows none in an unbounded scene; else it is not looked at
+    seen    the field's rendering on every stride-th pixel: the surroundings of an asset that shows none in an unbounded scene; else it is not used
     """
     background = constant_background(scene)
     if background is None and asset.inner is None:
@@ -65,7 +65,7 @@ def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, str
 
 
 def over_field(render_tree: RenderTree, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What lies in the field's box rendered from a tree, between what the field shows before and behind it: (H, W, 3), and the tree's opacity and depth (H, W).
+    """The tree rendered in the field's box, between the field's rendering before and behind it: (H, W, 3), and the tree's opacity and depth (H, W).
 
     before + (1 - before's alpha) (asset + (1 - asset's alpha) behind)
     """

@@ -3,14 +3,14 @@
 gap       asset minus network on the pixels that the network was rendered at: PSNR, SSIM, PSNR with fitted colours
 holes     share of those pixels where the asset's opacity is below HOLE and the network's above SOLID. Where the asset has cascades, the network's is that of
           what lies before the end of the last one: what is beyond has its place in the environment map
-floaters  opacity of the asset nearer than the network's surfaces, less a margin (`efficientnerf.evaluation.surfaces`), over its whole opacity: means over at
+floaters  opacity of the asset nearer than the network's surfaces, less a margin (`efficientnerf.evaluation.surfaces`), over its total opacity: means over at
           most FLOATER_RAYS pixels. The network's own figure, the same of itself, says how much of that is soft edges
 holes_excess_error, floaters_excess_error  the asset's squared error less the network's, of those pixels and weighed by that opacity, over what `holes` and
           `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there
 
-Where training learned vignetting and response of the camera, renders are compared as that camera would show them, exposed as on average. A held-back
-photograph has an exposure of its own, which nothing has learned: psnr_colour_fitted is the PSNR once the render's colours have had the affine change, twelve
-numbers a view, that fits the photograph best (`metrics.colour_fitted`).
+Where training learned vignetting and response of the camera, renders are compared as that camera would show them, at the mean exposure. The exposure of a
+held-back photograph is not learned: psnr_colour_fitted is the PSNR after the affine change of the render's colours, twelve numbers a view, that fits
+the photograph best (`metrics.colour_fitted`).
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def differences(
 
 
 def trivial(truth: GroundTruth) -> dict[str, Any] | None:
-    """What pictures of its mean colour and of its blurs would score; None where no pixel counts."""
+    """The scores of pictures of its mean colour and of its blurs; None where no pixel counts."""
     if truth.mask is not None and not truth.mask.any():
         return None
     return {"mean_colour": mean_colour_psnr(truth.colour, truth.mask), "blurred": blurred_psnrs(truth.colour, truth.mask)}

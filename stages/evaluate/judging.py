@@ -1,4 +1,4 @@
-"""The verdict of the evaluate stage: what it is made from beside the held-out views, written with its picture, and said."""
+"""The verdict of the evaluate stage: its inputs besides the held-out views, its file and picture, and its message."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job, taken: Taken
 
 
 def judge(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints | None, metrics: Mapping[str, Any], job: Job) -> ResultVerdict:
-    """Write the verdict on a result and the picture of its sparse points; say it, and warn of what stands against it."""
+    """Write the verdict on a result and the picture of its sparse points; report it, with a warning for each problem."""
     outputs = EvaluateOutputs(job.out)
     if points is not None:
         _draw(asset, scene, views, points, metrics, job)
@@ -87,7 +87,7 @@ def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: Re
 
 
 def refinement_of(bake: BakeOutputs) -> dict[str, int]:
-    """Steps that were taken, and the least that are usual for so many voxels and rays a step: a figure that is poor for want of steps asks for no other
+    """Steps that were taken, and the least that are usual for so many voxels and rays a step: a poor figure for want of steps needs no other
     remedy."""
     report = read_json(bake.report)
     last = json.loads(bake.log.read_text(encoding="utf-8").splitlines()[-1])

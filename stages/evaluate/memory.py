@@ -1,4 +1,4 @@
-"""What comparing renders with photographs takes, one view at a time. docs/experiments/memory.md"""
+"""Memory of comparing renders with photographs, one view at a time. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose 
 
 
 def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
-    """What the stage evaluate takes."""
+    """Memory of the stage evaluate."""
     cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
     scale = resolved(settings.field_image_scale)
     most = max(camera.width * camera.height for camera in cameras)
@@ -45,7 +45,7 @@ def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, d
 
 
 def memory_needed(known: Known) -> Need:
-    """`needed` for the whole asset."""
+    """`needed` for all of the asset."""
     return needed(asset_of(known), known.settings["evaluate"], known.inputs(EvaluateInputs), known.device)
 
 

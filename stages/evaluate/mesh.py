@@ -1,7 +1,7 @@
 """The mesh against the photographs: drawn from the held-back cameras in its own colours, unlit, before what of the asset is not in it.
 
 Behind the mesh is what is behind the asset in its own figures: a constant background, the asset without its foreground region (nearer parts of it hide the
-mesh), or what the field shows before and behind the box of an asset that holds no surroundings. So `psnr` is of whole photographs, and beside the asset's own.
+mesh), or what the field shows before and behind the box of an asset that holds no surroundings. So `psnr` is of whole photographs, as the asset's own.
 
 psnr_covered        over the pixels that the mesh covers by half or more; asset_psnr_covered: the asset's on the same
 covered             their share of the pixels that count
@@ -38,7 +38,7 @@ MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedMesh:
-    """What is measured of a mesh.
+    """A mesh to be measured.
 
     shader        of the mesh in the training frame
     surroundings  what of the asset is not in it, as `EvaluatedAsset.render`; None: nothing
@@ -66,7 +66,7 @@ def load_mesh(outputs: MeshOutputs, tree: NerfTree, region: str) -> EvaluatedMes
 
 
 def mesh_bytes(outputs: MeshOutputs) -> int:
-    """Of memory, that measuring a mesh takes beside the view itself: its arrays, and those of its texture."""
+    """Bytes that measuring a mesh takes besides the view itself: its arrays, and those of its texture."""
     texels = 0
     if outputs.texture.is_file():
         width, height = read_header(outputs.texture).size
@@ -81,7 +81,7 @@ def _size(path: Path) -> int:
 def mesh_image(mesh: EvaluatedMesh, asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The image of a view (H, W, 3) with the mesh in its texture, that with it in the colours of its vertices, and the mesh's share of each pixel (H, W).
 
-    seen  the field's rendering on every stride-th pixel, where the asset is composited with it; else it is not looked at
+    seen  the field's rendering on every stride-th pixel, where the asset is composited with it; else it is not used
     """
     textured, plain = mesh.shader.images(view.camera)
     background = constant_background(scene)

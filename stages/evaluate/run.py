@@ -13,9 +13,9 @@ The field is slow to render. Only some views are rendered with it, and of these 
 PSNR is an unbiased estimate of that at full size, which a comparison with downscaled photographs would not be. (SSIM is that of the subsampled
 images.) The asset is measured on every test view at the full working size, and against the network on the network's pixels.
 
-An asset with cascades is rendered by itself, surroundings and all. `asset_with_network_background` is what was measured before there were any: its cascade 0
-between what the field shows before and behind that box. An asset of one box in an unbounded scene has no other figure than that. In-box metrics leave out the
-pixels where less than half of the field's opacity lies in the box; on a constant background they are over the pixels that the photograph's alpha covers.
+An asset with cascades is rendered by itself, surroundings and all. `asset_with_network_background` is its cascade 0 between what the field shows before and
+behind that box, as was measured before there were cascades. An asset of one box in an unbounded scene has no other figure than that. In-box metrics leave out
+the pixels where less than half of the field's opacity lies in the box; on a constant background they are over the pixels that the photograph's alpha covers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Whether an asset is where structure from motion found points: its depth at the pixels of sparse points against theirs.
 
-A sparse point that three photographs see says twice what a picture cannot: that something is there, and that the way to it is free. Where the asset is
-nearer, something hangs before its surfaces; where it is farther, what the photographs show is missing, however right its colours are.
+A sparse point that three photographs see shows what a picture cannot: there is a surface, and nothing before it. Where the asset is nearer, it has
+a floater; where it is farther, a surface is missing, however right its colours are.
 
 nearer, agreeing, farther  shares of the points; subject_farther: the same of those in the scene bounds. A point agrees where the asset's depth is within
                            TOLERANCE of its own in a pixel or in one next to it: points are found at edges
@@ -23,7 +23,7 @@ from stages.framing.near_planes import reliable_points
 from stages.io.scene import Scene, read_points
 
 TOLERANCE = 0.05  # of a point's depth; docs/experiments/verdict.md
-FEW = 30  # points of all views together, below which nothing is said
+FEW = 30  # points of all views together, below which nothing is reported
 NEARER, AGREES, FARTHER = -1, 0, 1
 COUNTS = ("points", "nearer", "farther", "subject_points", "subject_farther")  # of a view
 COLOURS = {NEARER: (220, 40, 40), AGREES: (40, 170, 70), FARTHER: (40, 90, 230)}
@@ -54,7 +54,7 @@ class ReliablePoints:
 
 
 def observed_points(folder: Path, scene: Scene, reach: np.ndarray | None) -> ReliablePoints | None:
-    """Those of a scene; None where there are none, or nobody knows who sees them.
+    """Those of a scene; None where there are none, or their observers are unknown.
 
     reach  (2, 3) beyond which the asset has no density; None: the scene bounds, or of a forward-facing scene nothing
     """
@@ -74,7 +74,7 @@ def observed_points(folder: Path, scene: Scene, reach: np.ndarray | None) -> Rel
 
 
 def judged(points: ReliablePoints, view: int, camera: Camera, depth: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points that a view sees in pixels that count: (N, 2) their pixels, (N,) NEARER, AGREES or FARTHER, (N,) bool whether they are of the subject.
+    """The points that a view sees in pixels that count: (N, 2) their pixels, (N,) NEARER, AGREES or FARTHER, (N,) bool whether they are of the subject.
 
     view   its place in the scene
     depth  (H, W) of the asset along the view axis; not finite where nothing is hit
@@ -102,7 +102,7 @@ def counts_of(kinds: np.ndarray, subject: np.ndarray) -> dict[str, int]:
 
 
 def agreement(views: Sequence[Mapping[str, Any] | None]) -> dict[str, float | int] | None:
-    """Of all views together: how many points, and the shares of them; None of fewer than FEW. Those of the subject: None of fewer than FEW."""
+    """The number of points of all views together, and their shares; None of fewer than FEW. The subject's share is None of fewer than FEW."""
     total = {name: sum(view[name] for view in views if view is not None) for name in COUNTS}
     if total["points"] < FEW:
         return None

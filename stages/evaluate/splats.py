@@ -27,7 +27,7 @@ FIGURES = ("psnr", "ssim")
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedSplats:
-    """What is measured of Gaussians.
+    """Gaussians to be measured.
 
     draw   what a camera sees (H, W, 3) on a colour, or on black
     facts  that metrics.json repeats

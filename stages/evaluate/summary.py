@@ -2,7 +2,7 @@
 
 network, asset  means over their views of PSNR (in decibels, as published), SSIM and the rest; `scale`: of the pixel grid
 asset.on_network_views         those of the views that the network was rendered for
-asset_with_network_background  cascade 0 of a whole scene's asset between what the field shows before and behind its box; null for other assets
+asset_with_network_background  cascade 0 of an unbounded scene's asset between what the field shows before and behind its box; null for other assets
 mesh            means over the views of what `stages.evaluate.mesh` measures, and how many faces and texels the mesh has
 splats          the same of the 3D Gaussians (`stages.evaluate.splats`); null where there are none
 gap, holes, floaters and the excess error of both  means over the views that the network was rendered for (`stages.evaluate.comparison`)
@@ -10,7 +10,7 @@ train           the asset on some views that training saw (`stages.evaluate.judg
 trivial         means of what pictures of one colour and blurred photographs would score on the views (`stages.evaluate.trivial`)
 sparse_points   how the asset's depth agrees with the sparse points (`stages.evaluate.sparse_points`); null where there are too few
 refinement      of the asset: its steps, and how many are usual; null where that is not known
-strips          the views whose pictures stand beside, with the figures of these
+strips          the views that have picture strips, with their figures
 views           the metrics of each view
 """
 

@@ -1,6 +1,6 @@
-"""What pictures without anything of a scene's detail score: the photograph's mean colour everywhere, and the photograph itself, blurred.
+"""The scores of pictures without any detail: the photograph's mean colour everywhere, and the photograph itself, blurred.
 
-A PSNR by itself says little: 22 dB are much of leaves, and fog of a bare table. `equivalent_blur` states it as the blur of the photograph that costs as much:
+A PSNR by itself says little: 22 dB are good for leaves, and fog for a bare table. `equivalent_blur` gives the blur of the photograph that costs as much:
 docs/experiments/verdict.md.
 """
 

@@ -21,7 +21,7 @@ from stages.framing.camera_paths import turntable_cameras
 from stages.framing.captured import captured_of
 
 CAPTURED, ORBIT = 12, 12  # cameras
-FUSED = 24  # cameras beside these, whose depths are fused too
+FUSED = 24  # further cameras, whose depths are fused too
 LONGER_SIDE, PIXELS_PER_VOXEL = 400, 2  # of the images, pixels, at most; and for each voxel along the longest side
 WARNED = 0.03  # share of pixels missed or added, from which the stage says so
 PICTURED = 3  # views in the picture: those that agree least
@@ -78,7 +78,7 @@ def checked(mesh: Mesh, views: list[AssetView], tick: Callable[[], None]) -> tup
 
 
 def warning_of(report: dict[str, Any]) -> str | None:
-    """What to warn of, if anything."""
+    """The warning, if any."""
     if max(report["pixels_missed"], report["pixels_added"]) <= WARNED:
         return None
     shares = f"{100 * report['pixels_missed']:.1f} % of what the asset shows is missing from the mesh, {100 * report['pixels_added']:.1f} % of the mesh is"

@@ -95,7 +95,7 @@ def _read_texture(outputs: MeshOutputs, faces: np.ndarray, positions: np.ndarray
     except (ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
         _refuse(path, f"not as it was written ({type(error).__name__})")
     if not same:
-        _refuse(path, "its faces are not those of the PLY beside it")
+        _refuse(path, "its faces are not those of the PLY next to it")
     return Texture(at, _picture(outputs.texture), _picture(outputs.normal_map) if lit else None)
 
 

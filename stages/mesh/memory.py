@@ -1,4 +1,4 @@
-"""What extracting a surface takes. docs/experiments/memory.md"""
+"""Memory of extracting a surface. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stages.mesh.texture import largest_photograph
 from stages.train.data import count_pixels
 
 # Bytes. Of a stored voxel: vertices and faces while they are joined, cleaned and decimated, as many as a thin shell has; of a cell in which enclosed space
-# is found, and of a voxel of the bricks that these are made from; of a point with what its colour is looked up by.
+# is found, and of a voxel of the bricks that these are made from; of a point with the data to look up its colour.
 VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
 # Of a pixel of a view whose depth is fused, and of a voxel of a block that is fused at a time.
 PIXEL, BLOCK_VOXEL = 36, 120
@@ -32,7 +32,7 @@ WRITTEN_FACE, WRITTEN_TEXEL, SHEET, FACES, TEXELS = 180, 3, 3 * MIB // 4, 4, 4
 
 
 def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False) -> Need:
-    """What it takes to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
+    """Memory to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
     and with a normal map where `dense`."""
     views = CAPTURED + ORBIT + FUSED
     pool = pool_of(volume_of(tree))
@@ -50,13 +50,13 @@ def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: in
 
 
 def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
-    """What the stage mesh takes."""
+    """Memory of the stage mesh."""
     texture = 0 if settings.texture == "off" else settings.texture_size
     return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
 
 
 def memory_needed(known: Known) -> Need:
-    """`needed` for the whole asset."""
+    """`needed` for all of the asset."""
     return needed(asset_of(known), known.settings["mesh"], known.inputs(MeshInputs))
 
 

@@ -151,7 +151,7 @@ def preview_of(mesh: Mesh, metadata: Mapping[str, Any], *, clipped: bool) -> np.
 
 
 def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: SourceFrame, job: Job) -> None:
-    """The files of a mesh without faces, and a warning: what else a run makes of its asset does not depend on there being one."""
+    """The files of a mesh without faces, and a warning: the run's other outputs do not need a mesh."""
     write_empty_meshes(outputs, frame)
     agreed, picture = checked(mesh, seen, job.safe_point)
     for path in (outputs.preview, outputs.check):

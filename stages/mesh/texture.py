@@ -26,7 +26,7 @@ Progress = Callable[[int, int, str], None]
 
 
 def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, largest: int, progress: Progress) -> Mesh:
-    """A mesh of the training frame with a texture, the colours of its vertices from that, and what is known of it beside its facts.
+    """A mesh of the training frame with a texture, vertex colours from it, and further facts.
 
     choice    "photographs", "asset", "off", or "auto": photographs where the training views show any of the mesh, else the asset
     largest   texels along a side, at most

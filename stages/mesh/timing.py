@@ -21,7 +21,7 @@ class Stopwatch:
         self._spent: dict[str, float] = {}
 
     def lap(self, part: str) -> None:
-        """What has passed since the last lap was for this part."""
+        """Count the time since the last lap for this part."""
         now = self._clock()
         self._spent[part] = self._spent.get(part, 0.0) + now - self._at
         self._at, self._last = now, part

@@ -1,4 +1,4 @@
-"""What spreading points over the surface takes."""
+"""Memory of spreading points over the surface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ WRITTEN = 30  # bytes of a point
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage points takes for the whole asset."""
+    """Memory of the stage points for all of the asset."""
     return surface_needed(asset_of(known), known.settings["points"].num_points)
 
 

@@ -1,4 +1,4 @@
-"""What reading photographs takes, and finding their cameras. docs/experiments/memory.md"""
+"""Memory of reading photographs and finding their cameras. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from stages.video.reading import UnreadableVideo, opened
 # of its own (SIFT's first octave), four times as many where that is twice as large; of an image's descriptors while they are matched.
 DECODED, SIFT, DESCRIPTOR = 26, 80, 640
 NETWORK = 2400  # of a pixel of a picture in a network that detects features: ALIKED-T16 took 1,200, and the larger ones have twice its channels
-FRAME = 60  # of a pixel of a video: what its decoder keeps, 16 frames of 10 bits, and the frame that is looked at or written
+FRAME = 60  # of a pixel of a video: what its decoder keeps, 16 frames of 10 bits, and the frame that is checked or written
 COLMAP = 200 * MIB  # the process in which structure from motion runs
 # Bytes written. Of a pixel of a working image; of a feature with its matches. Times a photograph's file: what it takes as PNG.
 WRITTEN, FEATURE, AS_PNG = 2, 400, 8
@@ -41,17 +41,17 @@ REMEDY = "Lower poses.feature_image_size, or reduce the largest photographs."
 
 
 def decoding_needed(sizes: Sequence[tuple[int, int]], threads: int = 1) -> Need:
-    """What it takes to read photographs of these sizes, one at a time on each thread."""
+    """Memory to read photographs of these sizes, one at a time on each thread."""
     return Need({"a photograph": DECODED * threads * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
 
 
 def video_needed(sizes: Sequence[tuple[int, int]]) -> Need:
-    """What it takes to decode videos of these sizes, one at a time."""
+    """Memory to decode videos of these sizes, one at a time."""
     return Need({"frames of a video": FRAME * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
 
 
 def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int, *, networks: bool = False) -> Need:
-    """What it takes to find the cameras of photographs of these sizes.
+    """Memory to find the cameras of photographs of these sizes.
 
     max_side  of the photographs in which features are detected, pixels
     features  of a photograph, at most
@@ -137,7 +137,7 @@ def _films(sources: Sequence[Path]) -> list[tuple[int, int]]:
 
 
 def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
-    """Whether structure from motion has to find them, as far as can be told before."""
+    """Whether structure from motion has to find them, as far as is known before."""
     if own.format != "auto" or len(sources) != 1:
         return own.format in ("auto", "photographs")
     with contextlib.suppress(PipelineError, OSError):  # the stage says so

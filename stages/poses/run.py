@@ -139,7 +139,7 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
 
 def _formats(job: Job, settings: PosesSettings) -> list[str]:
-    """What the source can be read as, the one to choose first; of several sources photographs alone. Raises BadInput."""
+    """The formats that the source can be read as, best first; of several sources photographs alone. Raises BadInput."""
     found: list[str] = []
     for path in job.sources.values():
         found = importers.candidates(path, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else [settings.format]

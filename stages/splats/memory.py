@@ -1,4 +1,4 @@
-"""What making 3D Gaussians takes."""
+"""Memory of making 3D Gaussians."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def parameters_of(settings: SplatsSettings) -> int:
 
 
 def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None) -> Need:
-    """What it takes to make Gaussians of a tree and to fit them to pictures; `captured` as for `pixels_of`."""
+    """Memory to make Gaussians of a tree and to fit them to pictures; `captured` as for `pixels_of`."""
     pixels = pixels_of(tree, settings, captured)
     return Need({
         "Gaussians": PARAMETER * parameters_of(settings) * most_gaussians(settings, pixels),
@@ -56,7 +56,7 @@ def pixels_of(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Pa
 
 
 def memory_needed(known: Known) -> Need:
-    """`needed` for the whole asset."""
+    """`needed` for all of the asset."""
     if known.settings["splats"].make == "off":
         return Need({"libraries": libraries()})
     inputs = known.inputs(SplatsInputs)

@@ -1,4 +1,4 @@
-"""What 3D Gaussians are fitted to: training photographs, or the asset's own renders."""
+"""Targets of 3D Gaussians: training photographs, or the asset's own renders."""
 
 from __future__ import annotations
 

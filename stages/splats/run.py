@@ -1,4 +1,4 @@
-"""The splats stage: the asset as 3D Gaussians, which the programs of others render in real time; as PLY and SPZ, with a preview and a report.
+"""The splats stage: the asset as 3D Gaussians, which other programs render in real time; as PLY and SPZ, with a preview and a report.
 
 Where splats.make is off, or auto and none can be made, the report says so, and there is no more.
 """
@@ -62,7 +62,7 @@ def gaussians_of(
 
 
 def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
-    """What Gaussians are made and fitted with, for pictures of so many pixels each."""
+    """The budget of Gaussians, for pictures of so many pixels each."""
     steps = resolved(settings.iterations)
     if steps is None:
         steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, MOST_STEPS))
@@ -82,7 +82,7 @@ def run(job: Job) -> None:
     outputs, settings = SplatsOutputs(job.out), job.settings
     if settings.make == "off":
         write_json(outputs.report, {"gaussians": 0, "made": False})
-        job.say("none are asked for (splats.make=off)", gaussians=0)
+        job.say("none are made (splats.make=off)", gaussians=0)
         return
     try:
         _make(job, outputs, settings)

@@ -16,7 +16,7 @@ ReadView = Callable[[View], tuple[np.ndarray, np.ndarray | None]]  # (H, W, 3 or
 
 
 def averaged_views(folder: Path, trained: Path) -> ReadView:
-    """What reads a view and its mask: where exposure was learned, as it would be with the average exposure, and without what it shows clipped.
+    """A reader of views and their masks: where exposure was learned, with the average exposure, and without clipped pixels.
 
     folder   of the scene
     trained  of the stage train
@@ -36,7 +36,7 @@ def averaged_views(folder: Path, trained: Path) -> ReadView:
 
 
 def as_taken(trained: Path) -> Taken | None:
-    """What shows a render (H, W, 3) of every stride-th pixel of a view as the view's camera would, by what the train stage in `trained` learned of it; None: it
+    """A function that shows a render (H, W, 3) of every stride-th pixel of a view as its camera would, by what the train stage in `trained` learned; None: it
     learned nothing. Held-back views are exposed as on average."""
     known = exposures_of(trained)
     if known is None:

@@ -1,8 +1,8 @@
 """A wall-clock budget for training: a schedule whose number of iterations is set by timing steps.
 
 The first steps, in which the learning rate is held, do not depend on the number of iterations: they are timed, and the number that fits into the
-rest of the budget follows. Steps become cheaper or dearer while a scene takes shape, and other work comes and goes, so the number is set again at
-some fractions of the budget, by the time of the steps since the last time, and steps end where the budget does. The schedule goes on from where it is. It is
+rest of the budget follows. The cost of a step changes while a scene takes shape, and with other load, so the number is set again at some fractions
+of the budget, by the time of the steps since the last time, and steps end where the budget does. The schedule goes on from where it is. It is
 written down each time: a resumed run reads it, and the schedule that a run ended with (`report.json`, field.safetensors) gives the same bytes again when
 `efficientnerf.training.loop.train` is given it, on any machine with the same number of threads.
 """
@@ -135,7 +135,7 @@ def training_budget(
     settings  as given; train.iterations is ignored
     work      scratch folder, where the schedule is written down
     spent     seconds that earlier attempts trained for
-    warn      is told of a schedule that can't be used; the number of its iterations is timed again
+    warn      is called for a schedule that can't be used; the number of iterations is then timed again
     """
     path, warmup = work / FILE, settings.occupancy_warmup_steps
     found = noted(path, _State, warn)

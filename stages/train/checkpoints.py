@@ -21,7 +21,7 @@ MAX_SECONDS = 1e10  # three centuries
 
 
 class _About(msgspec.Struct):
-    """What a checkpoint says of itself."""
+    """A checkpoint's metadata."""
 
     step: Annotated[int, msgspec.Meta(ge=1)]
     seconds: Annotated[float, msgspec.Meta(ge=0, le=MAX_SECONDS)]

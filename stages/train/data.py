@@ -1,4 +1,4 @@
-"""What a scene gives training: pixels with their rays, near and far planes, and sparse depth."""
+"""The training data of a scene: pixels with their rays, near and far planes, and sparse depth."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from stages.train.settings import refuse_planes_out_of_order
 MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
 MOST_OBSERVATIONS = 2**20  # of sparse points that are used; of more, those of points drawn at random
 POINTS_AT_ONCE = 2**16  # observed by equally many, whose cameras are compared
-CUT_SHARE = 0.25  # of a view's range that stated planes leave out, from which that is said: the corners of the scene bounds are mostly empty
-GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their whole parts, fill an interval evenly
+CUT_SHARE = 0.25  # of a view's range that stated planes leave out, from which a warning says so: the corners of the scene bounds are mostly empty
+GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their integer parts, fill an interval evenly
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
 
 
@@ -34,7 +34,7 @@ def with_camera_refinement(settings: TrainSettings) -> TrainSettings:
 
 
 def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None, trained: Path | None = None) -> Pixels:
-    """All pixels of some views of a scene, as bytes; one image at a time is held beside them.
+    """All pixels of some views of a scene, as bytes; one image at a time is held besides them.
 
     rows     where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
     trained  of the stage train, where it learned the photographs' exposure: they are as if all had been exposed alike; None: as they are
@@ -61,7 +61,7 @@ def channels_of(folder: Path, views: tuple[View, ...]) -> int:
 def depth_range(s: Scene, pixels: Pixels, settings: TrainSettings, warn: Warn = lambda text: None) -> tuple[float, float]:
     """Nearest and farthest of all views along their axes; where the settings state planes these, which are set for the pixels too.
 
-    warn  is told where the planes that are stated cut into most views' range
+    warn  is called where the stated planes cut into most views' range
     """
     if (settings.near_plane, settings.far_plane) != ("auto", "auto"):
         near, far = stated_planes(s, settings)

@@ -23,7 +23,7 @@ BORDER = 1  # pixels round that of an observation whose mean is taken
 
 
 def observed_light(folder: Path, s: Scene, pixels: Pixels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What the training photographs show of sparse points: logarithms of linear light (O, 3), the point (O,), the photograph (O,), and r^2 (O,) in it."""
+    """Sparse points in the training photographs: logarithms of linear light (O, 3), the point (O,), the photograph (O,), and r^2 (O,) in it."""
     xyz, counts, observers = scene.read_observations(folder)
     number = np.cumsum([view.split == "train" for view in s.views]) - 1
     in_training = np.array([view.split == "train" for view in s.views])
@@ -58,10 +58,10 @@ def observed_light(folder: Path, s: Scene, pixels: Pixels) -> tuple[np.ndarray, 
 def begin_exposure(
     folder: Path, s: Scene, pixels: Pixels, choice: str, device: str, say: Callable[[str], None] = lambda text: None
 ) -> Exposure | None:
-    """What is learned of the training photographs' exposure, as it begins: as sparse points show it, where there are any. None: nothing is learned.
+    """The initial exposure of the training photographs: from sparse points, where there are any. None: no exposure is learned.
 
     choice  train.exposure
-    say     is told where it is learned
+    say     is called where it is learned
     """
     if choice == "off" or s.background is not None or (choice == "auto" and not s.points):
         return None
@@ -88,7 +88,7 @@ def stops_apart(fit: ExposureFit) -> float:
 
 
 def saved_exposure(e: Exposure | None, s: Scene) -> tuple[list[str], Exposure] | None:
-    """What is kept of it: the images of the scene's views, and the exposure of each. That of held-back views is the mean, in the camera that took them; where
+    """The exposure to save: the images of the scene's views, and the exposure of each. Held-back views have the mean, in the camera that took them; where
     that took no training photograph, they have none."""
     if e is None:
         return None

@@ -22,7 +22,7 @@ RECENT = 50  # lines whose steps say how long those to come take, previews and c
 
 
 class _Line(msgspec.Struct):
-    """What has to hold of a line that is read again."""
+    """The schema of a line that is read again."""
 
     step: Annotated[int, msgspec.Meta(ge=0, le=2**53)]
     psnr: Annotated[float, msgspec.Meta(ge=-1000, le=1000)] | None

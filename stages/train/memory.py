@@ -1,4 +1,4 @@
-"""What training takes. docs/experiments/memory.md"""
+"""Memory of training. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def samples_of(settings: TrainSettings, intervals: int) -> int:
 
 
 def sample_bytes(settings: TrainSettings) -> int:
-    """Of a sample while a step is taken: what is kept for the way back. Kernels of hash grids keep features and outputs; other fields keep each layer."""
+    """Bytes of a sample in a step, kept for the backward pass. Kernels of hash grids keep features and outputs; other fields keep each layer."""
     outputs = 1 + 3 * (settings.sh_degree + 1) ** 2
     if settings.field == "hash":
         return 4 * (4 * settings.num_levels + 6 * outputs + 32)
@@ -84,7 +84,7 @@ def sample_bytes(settings: TrainSettings) -> int:
 
 
 def needed(settings: TrainSettings, views: Sequence[View], channels: int, space: Space, *, stored: bool, device: str = "cpu", points: int = 0) -> Need:
-    """What training takes.
+    """Memory of training.
 
     settings  with numbers for what is "auto" (`stages.train.hash_resolution`)
     channels  of the pixels
@@ -116,7 +116,7 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
         return None
     pixels = count_pixels(tuple(views))
     job.warn(
-        f"the training pixels, {size_text(pixels * channels)}, are kept in a file, for they do not fit into memory beside the rest: reading them takes longer."
+        f"the training pixels, {size_text(pixels * channels)}, are kept in a file, for they do not fit into memory with the rest: reading them takes longer."
         " Give more by --memory, or lower poses.max_image_size."
     )
     return PixelFile(pixels, channels, job.work)
@@ -133,14 +133,14 @@ def rows_for_training(job: Job, folder: Path, views: tuple[View, ...], settings:
 
 
 def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space, *, stored: bool, device: str) -> Need:
-    """What the stage train takes, `folder` being the scene's; the rest as for `needed`."""
+    """Memory of the stage train, `folder` being the scene's; the rest as for `needed`."""
     file = PosesOutputs(folder).points
     points = file.stat().st_size if file.is_file() else 0
     return needed(settings, views, channels_of(folder, views), space, stored=stored, device=device, points=points)
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage train takes."""
+    """Memory of the stage train."""
     return training_needed(known.inputs(TrainInputs).poses.folder, *_before(known), stored=False, device=known.device)
 
 
@@ -155,7 +155,7 @@ def space_needed(known: Known) -> int:
 
 
 def _before(known: Known) -> tuple[tuple[View, ...], TrainSettings, Space]:
-    """Views that are trained on, settings without "auto" as for `needed`, and the field's space."""
+    """Training views, settings without "auto" as for `needed`, and the field's space."""
     s = load(known.inputs(TrainInputs).poses.folder)
     views = views_of(s, "train")
     return views, with_auto_sizes(known.settings["train"], s, count_pixels(views)), space_of(s)
@@ -165,7 +165,7 @@ FIELD_SAMPLES = 300  # bytes of a ray in which a first training's subject is loo
 
 
 def first_training_needed(count: int, side: int, settings: TrainSettings, rays: int) -> Need:
-    """What a first quick training of so many photographs takes, from which silhouettes are made.
+    """Memory of a first quick training of so many photographs, from which silhouettes are made.
 
     side      of the photographs at most, pixels
     settings  without "auto" where `stages.train.hash_resolution` has numbers

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-UNSUPPORTED = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)  # of file systems that cannot reserve room
+UNSUPPORTED = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)  # of file systems that cannot reserve space
 
 
 class PixelFile:
@@ -22,7 +22,7 @@ class PixelFile:
     """
 
     def __init__(self, count: int, channels: int, folder: Path) -> None:
-        """Makes room for all rows at once, so that a full disk shows before an image is read. Raises OSError."""
+        """Reserves space for all rows at once, so that a full disk shows before an image is read. Raises OSError."""
         self.shape = (count, channels)
         with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
             self._number = os.dup(file.fileno())
@@ -82,5 +82,5 @@ class PixelFile:
         return found
 
     def close(self) -> None:
-        """Give the room on the disk back."""
+        """Free the space on the disk."""
         self._closed()

@@ -1,4 +1,4 @@
-"""Renders of one view now and then, beside its photograph."""
+"""Renders of one view now and then, next to its photograph."""
 
 from __future__ import annotations
 

@@ -2,10 +2,10 @@
 
     min_views    what fewer than `train.min_views` views show could be at any depth
     near_planes  what lies before the near planes, and close to the cameras, is empty
-    masks        what no view shows by a pixel that its mask keeps is not asked for
+    masks        what no view shows in a pixel that its mask keeps is left out
 
 Reliable sparse points (`stages.framing.near_planes`) are evidence that space is filled. The first two are dropped where they contradict more than
-MAX_CONTRADICTED of them; masks are the word of the user, or of a stage that has judged them. All rules of the program: docs/priors.md.
+MAX_CONTRADICTED of them; masks are given by the user, or by a stage that has checked them. All rules of the program: docs/priors.md.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MIN_VIEWS, NEAR_PLANES, MASKS = "min_views", "near_planes", "masks"
 
 @dataclass(frozen=True)
 class Prior:
-    """What a prior would mask.
+    """The effect of a prior.
 
     masked        share of the density voxels
     contradicted  share of the reliable sparse points that lie in them

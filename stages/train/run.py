@@ -117,7 +117,7 @@ def colours_seen(renderer: FieldRenderer, camera: Camera) -> np.ndarray:
 
 
 def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> SparseDepthRays | None:
-    """Rays to sparse points. It is said where there are points and none of them can be used."""
+    """Rays to sparse points. A message says where there are points and none can be used."""
     found = sparse_depth_of(folder, s, settings.seed)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
         job.say("no sparse point lies before enough of the training cameras that observe it: train.sparse_depth_loss_weight has no effect")
@@ -134,7 +134,7 @@ def begin_budget(job: Job, t: Trainer, spent: float) -> Budget | None:
 
 
 def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
-    """Take over the budget's schedule where a step has changed it."""
+    """Adopt the budget's schedule where a step has changed it."""
     before, known = budget.schedule.iterations, budget.known
     if budget.after(t.step):
         t.schedule = budget.schedule
@@ -143,14 +143,14 @@ def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
 
 
 def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
-    """The training cameras, where they were refined or replaced, the views that were left out, and what these two show; `folder` is the scene's."""
+    """The training cameras, where they were refined or replaced, the views that were left out, and pictures of both; `folder` is the scene's."""
     if (cameras := cameras_of(t)) is not None:
         refined_cameras.write(views, cameras, outputs.cameras, left_out_of(t, views))
         draw_wrong_views(outputs.wrong_views, t, views, folder, renderer)
 
 
 def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[str, Any], priors: Sequence[Prior]) -> None:
-    """What was reached; the seconds differ from run to run.
+    """The report; its seconds differ from run to run.
 
     found  figures of the last preview, and what the checks found
     """

@@ -1,4 +1,4 @@
-"""What rendering and writing frames of an asset takes, one at a time. docs/experiments/memory.md"""
+"""Memory of rendering and writing frames of an asset, one at a time. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from stages.memory.tree import asset_of, tree_bytes
 
 FRAME = 116  # bytes of a pixel of a frame with all its channels while it is written as EXR
 BAND = 160 * MIB  # rays at a time where each is rendered on its own
-VIDEO_PIXEL = 1  # written byte of a pixel of a frame, beside a byte for each of its channels as PNG
+VIDEO_PIXEL = 1  # written byte of a pixel of a frame, besides a byte for each of its channels as PNG
 EXR_PIXEL = 4 * (4 + 1 + 3 + 3)  # float32: colour with alpha, depth, normal, position
 
 
 def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
-    """What it takes to render and write frames of so many pixels."""
+    """Memory to render and write frames of so many pixels."""
     return Need({
         "a frame": pixels * FRAME + (0 if tree.ndc is None and tree.lookup == "trilinear" else BAND),
         "the asset": tree_bytes(tree),
@@ -23,7 +23,7 @@ def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
 
 
 def memory_needed(known: Known) -> Need:
-    """What the stage turntable takes for the whole asset."""
+    """Memory of the stage turntable for all of the asset."""
     own = known.settings["turntable"]
     return frames_needed(asset_of(known), own.width * own.height, known.device)
 

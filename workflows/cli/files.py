@@ -196,7 +196,7 @@ def render(
 def _restricted_with_cameras(
     whole: NerfTree, settings: TurntableSettings, crop: Crop, camera_path: Path | None, width: int | None, height: int | None
 ) -> tuple[NerfTree, list[Camera], int]:
-    """What of an asset is rendered, the cameras, and the frames per second."""
+    """The part of an asset that is rendered, the cameras, and the frame rate."""
     tree = restricted(whole, settings.region, crop)
     if camera_path is None:
         return tree, cameras_of(whole if crop is None else with_region(tree), settings), settings.fps

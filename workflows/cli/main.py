@@ -1,6 +1,6 @@
 """The command `enerf`.
 
-The module of a command is imported when the command is asked for, so that `--help` answers at once.
+The module of a command is imported when the command is used, so that `--help` answers at once.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ crop_option = click.option(
 
 
 class PathOfAnything(click.Path):
-    """A path as it was given; what is at it is looked at later."""
+    """A path as it was given; its target is checked later."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if "\0" in str(value):
@@ -41,7 +41,7 @@ folder_type = PathOfAnything(path_type=Path)
 
 
 def memory_limit(text: str | None) -> Limit | None:
-    """What --memory says, or what the machine has where it is "auto" or not given. Raises UsageError."""
+    """The value of --memory, or the machine's limit where it is "auto" or not given. Raises UsageError."""
     return limit_for(None if text in (None, "auto") else parse_size(text), None)
 
 

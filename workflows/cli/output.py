@@ -1,7 +1,7 @@
-"""Standard output and standard error while a command runs: output that cannot be written ends nothing, and is not forgotten.
+"""Standard output and standard error while a command runs: a failed write ends nothing, but is reported.
 
-The result of a command decides its exit code. What goes to standard error, and the closing words of a command that makes files, is at most lost. What the
-command is for (a listing, anything with --json) is missed: a command that went well then ends with UNWRITTEN. A reader that closes the pipe of a
+The result of a command decides its exit code. Failed writes to standard error, or of the closing words of a command that makes files, are ignored. Where the
+command's output proper (a listing, anything with --json) fails, a command that went well ends with UNWRITTEN. A reader that closes the pipe of a
 plain listing (`| head`) has had enough, which is no failure.
 """
 
@@ -19,7 +19,7 @@ from typing import Any, TextIO, cast
 from pipeline.library_output import libraries_apart
 from pipeline.text import printable
 
-UNWRITTEN = 3  # exit code: what was asked for on standard output could not be written
+UNWRITTEN = 3  # exit code: the requested output could not be written
 DEEPEST = 64  # levels of a value in JSON; a document that nests deeper was made to
 _LARGEST = 2**64  # readers of JSON know no larger integers
 
@@ -96,7 +96,7 @@ class Stream:
             self.failure = error if isinstance(error, OSError) else OSError(errno.EBADF, os.strerror(errno.EBADF))
 
     def settle(self) -> None:
-        """Leave nothing in the buffer that Python would stumble over when it flushes at exit, and answer with exit code 120."""
+        """Empty the buffer: Python flushes it at exit, and a failure there would give exit code 120."""
         self.flush()
         if self.stream is None:
             return
@@ -157,7 +157,7 @@ def listing(*lines: str) -> None:
 
 
 def closing(*lines: str) -> None:
-    """What a command did, on standard output: lost where that cannot be written."""
+    """Print what a command did on standard output; lost where that fails."""
     stream = sys.stdout
     with stream.unimportant() if isinstance(stream, Stream) else contextlib.nullcontext():
         listing(*lines)

@@ -49,7 +49,7 @@ def size(count: float) -> str:
 
 
 def facts(event: Event) -> str:
-    """Facts of an event beside its text, as `loss 0.0123, psnr 24.1`."""
+    """Facts of an event besides its text, as `loss 0.0123, psnr 24.1`."""
     known = {"event", "stage", "time", "done", "total", "text", "left"}
     shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in event.items() if name not in known]
     return ", ".join(shown)

@@ -22,7 +22,7 @@ from workflows.cli.resolve import Config, Settings, Table, read_config, read_pre
 from workflows.cli.target import open_run, resume_command
 from workflows.workflow import Workflow
 
-# Bytes of a process beside what stages say: docs/experiments/memory.md
+# Bytes of a process besides the needs of its stages: docs/experiments/memory.md
 COMPILING, PAGES = 1600 * 2**20, 300 * 2**20
 
 
@@ -77,7 +77,7 @@ class Plan:
 
     @contextmanager
     def written(self) -> Iterator[Run]:
-        """Create the run, or update the existing one, and hold its lock: nobody changes its settings while its stages run.
+        """Create the run, or update the existing one, and hold its lock: its settings do not change while its stages run.
 
         The settings that the options change are those that run.json holds under the lock, whatever it held before.
         """
@@ -152,7 +152,7 @@ STEPS = (("train", "iterations"), ("bake", "refine_steps"))  # settings that a t
 
 
 def _without_effect(settings: Settings, config: Config, options: Options) -> list[str]:
-    """A warning for each number of steps that was named although a time budget decides it."""
+    """A warning for each number of steps that was set although a time budget decides it."""
     set_here = {text.partition("=")[0].strip() for text in options.sets}
     found = []
     for stage, name in STEPS:

@@ -22,7 +22,7 @@ from stages.settings import SettingInfo, describe_settings
 from workflows.asset import WORKFLOW
 
 Table = Mapping[str, Mapping[str, Any]]
-# Beside the tables of the stages, a configuration file may hold what the dedicated options say.
+# Besides the tables of the stages, a configuration file may hold the values of the dedicated options.
 CONFIG_OPTIONS = ("preset", "device", "seed")
 MAX_TOML = 2**16  # bytes; all settings together are a tenth of it
 MAX_SHOWN = 200  # characters of a value in a message
@@ -49,7 +49,7 @@ class Preset:
 
 @dataclass(frozen=True)
 class Config:
-    """A configuration file, read: the tables of the stages and the options named in CONFIG_OPTIONS."""
+    """A configuration file, read: the tables of the stages and the options in CONFIG_OPTIONS."""
 
     table: Table
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -117,7 +117,7 @@ def read_toml(option: str, path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, limit: int = MAX_TOML) -> dict[str, Any]:
-    """A TOML document of anybody. Raises ValueError, UnicodeDecodeError and tomllib.TOMLDecodeError being such."""
+    """An untrusted TOML document. Raises ValueError, UnicodeDecodeError and tomllib.TOMLDecodeError being such."""
     if len(text) > limit:
         raise ValueError(f"larger than {limit} bytes")
     if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):

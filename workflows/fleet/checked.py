@@ -22,7 +22,7 @@ Table = dict[str, dict[str, Any]]
 
 DEFAULT_PRESET = "preview"  # where none is stated, and which settings are chosen by the device makes no difference
 MOST_SHOWN = 50  # mistakes
-OPTIONS = ("preset", "as", "seed", "budget")  # what a manifest says beside settings, by the names of the options of `enerf run`
+OPTIONS = ("preset", "as", "seed", "budget")  # what a manifest has besides settings, by the names of the options of `enerf run`
 # Settings that no manifest decides, for they lead out of its folder: the operator does.
 GIVEN_BY_HAND = ("poses.allow_outside", "poses.mask_model", "poses.features_model", "poses.matcher_model")
 
@@ -33,7 +33,7 @@ class Text(str):
 
 @dataclass
 class Choice:
-    """What was chosen for a scene, or for all: settings that are not the preset's, and options."""
+    """The choices for a scene, or for all: settings that are not the preset's, and options."""
 
     settings: Table = field(default_factory=dict)
     preset: str | None = None
@@ -41,7 +41,7 @@ class Choice:
     budget: float | None = None
 
     def over(self, other: Choice) -> Choice:
-        """This one where it says something, the other elsewhere."""
+        """This one where it has a value, else the other."""
         settings = {stage: {**other.settings.get(stage, {}), **self.settings.get(stage, {})} for stage in {**other.settings, **self.settings}}
         return Choice(
             settings,

@@ -1,4 +1,4 @@
-"""What a fleet says while it runs: a live table on a terminal, else a line for each stage that ends; JSON lines; or only what goes wrong."""
+"""Displays of a running fleet: a live table on a terminal, else a line for each stage that ends; JSON lines; or only what goes wrong."""
 
 from __future__ import annotations
 

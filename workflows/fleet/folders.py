@@ -19,7 +19,7 @@ from stages.formats.importers.source import images_in
 
 Found = list[tuple[str, str]]
 
-_ENTRIES = 200_000  # of a folder, or paths that a pattern fits, that are looked at
+_ENTRIES = 200_000  # of a folder, or paths that a pattern fits, that are read
 _WILD = re.compile(r"[*?\[]")
 
 
@@ -45,7 +45,7 @@ def folder_entries(given: str, fleet: Path) -> tuple[Found, Path | None]:
 
 
 def _format_of(folder: Path) -> str | None:
-    """What a folder is where it is a scene by itself: a data set, or photographs. Videos in it are scenes each."""
+    """The kind of a folder that is one scene: a data set, or photographs. Videos in it are scenes each."""
     for name, importer in IMPORTERS.items():
         if name != "photographs" and importer.recognises(folder):
             return name
@@ -53,7 +53,7 @@ def _format_of(folder: Path) -> str | None:
 
 
 def glob_entries(pattern: str) -> tuple[Found, Path | None]:
-    """What a pattern fits, each named by the parts of its path that the pattern leaves open: of `shoots/*/photos/` by the folder between."""
+    """Paths that match a pattern, each named by the parts that its wildcards match: of `shoots/*/photos/` by the folder between."""
     if "**" in pattern or "\0" in pattern:
         raise UsageError(f"{printable(pattern, 300)}: found '**', expected a pattern of *, ? and [...], as 'shoots/*/'.")
     parts = Path(pattern).parts
@@ -71,7 +71,7 @@ def glob_entries(pattern: str) -> tuple[Found, Path | None]:
 def listed_entries(given: Sequence[str]) -> tuple[Found, Path | None]:
     """Folders and videos that were given one by one, as by a shell that expands a pattern; named by their last part, or by what differs."""
     if any(each.lower().endswith((".toml", ".csv")) for each in given):
-        raise UsageError("several manifests, or a manifest beside sources; expected one manifest, or sources alone.")
+        raise UsageError("several manifests, or a manifest together with sources; expected one manifest, or sources alone.")
     if len(given) > MOST_SCENES:
         raise UsageError(f"found {len(given)} sources, expected at most {MOST_SCENES}.")
     paths = [Path(os.path.abspath(each)) for each in given]

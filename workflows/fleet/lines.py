@@ -1,4 +1,4 @@
-"""Where a key stands in a TOML file: tomllib does not say."""
+"""Lines of keys in a TOML file: tomllib has none."""
 
 from __future__ import annotations
 

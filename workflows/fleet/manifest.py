@@ -10,8 +10,8 @@
 
 A CSV has a scene a line and the same keys as columns: name, source (which may stand several times), preset, as, seed, budget, and stage.setting.
 
-A manifest may come from anybody. It is small, its names name folders, and its sources lie in its own folder or in one that the operator named.
-All mistakes are told at once, before anything runs.
+A manifest may be untrusted. It is small, its names name folders, and its sources lie in its own folder or in one that the operator gave.
+All mistakes are reported at once, before anything runs.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
 
     given  a manifest, a folder of scenes, a glob, or several folders and videos
     fleet  the fleet's folder: what it has begun may have lost its sources
-    over   what the command line says for all scenes, over the manifest; its values may be Text
-    roots  folders beside the manifest's own that its sources may lie in
+    over   what the command line sets for all scenes, over the manifest; its values may be Text
+    roots  folders besides the manifest's own that its sources may lie in
     """
     checker = Checker(workflow, given[0] if len(given) == 1 else f"{len(given)} sources")
     inside: list[Path] | None = None
@@ -110,7 +110,7 @@ def _text(path: Path) -> str:
 
 
 def _toml(text: str, checker: Checker) -> tuple[Choice, list[Entry]]:
-    """What holds for all scenes, and the scenes."""
+    """The choices for all scenes, and the scenes."""
     try:
         content = parse_toml(text, MAX_BYTES)
     except ValueError as error:
@@ -226,7 +226,7 @@ class _Reader:
     """Makes scenes of entries.
 
     base    what relative sources are relative to
-    inside  folders that sources may lie in; None: anywhere, the operator named each
+    inside  folders that sources may lie in; None: anywhere, the operator gave each
     """
 
     checker: Checker

@@ -1,4 +1,4 @@
-"""What the command line of a fleet says for all scenes."""
+"""Command-line options for all scenes of a fleet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the engine of fleets does not know of a workflow: how a scene becomes a run, what is shown of it, its pages."""
+"""The workflow's part of a fleet, unknown to the engine: how a scene becomes a run, what is shown of it, its pages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fleet from its scenes to its end: the folder and its lock, the workers, the scheduler, and what is written beside fleet.json."""
+"""A fleet from its scenes to its end: the folder and its lock, the workers, the scheduler, and what is written next to fleet.json."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _OWN = (NAME, LOCK, HOLDER, LEASE, requests.FOLDER)
 class Placement:
     """Where the stages of a fleet run.
 
-    jobs             stages at a time on each worker, beside those that have a device
+    jobs             stages at a time on each worker, besides those that have a device
     scheduler        address of a Dask scheduler; None and no cluster: this machine, without Dask
     cluster          kind of the Dask cluster to start
     cluster_options  of the cluster's class
@@ -104,7 +104,7 @@ def run_fleet(
 ) -> FleetState:
     """Run what of a fleet is not done, and return its state. Raises RunLocked where it is being run, Interrupted after a signal, PipelineError.
 
-    scenes   None: those that fleet.json names
+    scenes   None: those of fleet.json
     retry    names of failed or quarantined scenes to try again
     written  called after each writing of fleet.json
     """

@@ -1,6 +1,6 @@
 """Sweeps: `--sweep train.iterations=2000,4000 --sweep bake.max_mib=8,24` makes of each scene one for each combination of values.
 
-What scenes have in common is made once: a stage whose settings, and those of all before it, are equal for the same sources is the same request, and so the
+Scenes share common stages: a stage whose settings, and those of all before it, are equal for the same sources is the same request, and so the
 same artifact (`pipeline.sharing`). `shared` says of which scene each stage is taken.
 """
 

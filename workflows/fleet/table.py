@@ -23,7 +23,7 @@ _BELOW_AND_ABOVE = 5  # lines of the terminal that rows do not take
 
 
 class LiveTable:
-    """Takes the scheduler's events, and the state whenever it was written. While it is open, lines that are said stand above it."""
+    """Takes the scheduler's events, and the state whenever it was written. While it is open, messages are printed above it."""
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True, highlight=False)
@@ -58,7 +58,7 @@ class LiveTable:
         self.console.print(printable(line), style="yellow", markup=False, soft_wrap=True)
 
     def table(self) -> Table:
-        """As many rows as the terminal has room for: what runs first, then what ended last."""
+        """As many rows as fit on the terminal: what runs first, then what ended last."""
         made = Table(expand=True, box=None, pad_edge=False, caption=Text(overview(self.state)), caption_justify="left")
         for title in ("scene", "state", "stage", "time", "result", "PSNR", "size"):
             made.add_column(title, justify="right" if title in ("time", "PSNR", "size") else "left", no_wrap=True, overflow="ellipsis")

@@ -1,4 +1,4 @@
-"""What `enerf check` tells of photographs before a run of them."""
+"""`enerf check`: the verdict on photographs before a run."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
 
 
 def _nothing(*values: object) -> None:
-    """Who is told of progress and warnings, where nobody is."""
+    """Takes progress and warnings, and drops them."""
 
 
 def in_words(found: dict[str, Any]) -> list[str]:
@@ -68,12 +68,12 @@ def in_words(found: dict[str, Any]) -> list[str]:
     about = found["forecast"]
     sizes = found["sizes"]
     what = f"{found['photographs']} photographs, {', '.join(sizes[:3])}{' ...' if len(sizes) > 3 else ''}, read as {found['format']}"
-    what += f"; {found['looked_at']} of them were looked at" if found["looked_at"] < found["photographs"] else ""
+    what += f"; {found['looked_at']} of them were checked" if found["looked_at"] < found["photographs"] else ""
     lines = [printable(f"{found['source']}: {found['grade']}; {what}", 400)]
     for problem in found["problems"]:
         lines.append(printable(f"  {problem['sentence']} {problem['remedy']}", 600))
     if not found["problems"]:
-        lines.append("  Nothing stands against them.")
+        lines.append("  No problems found.")
     lines += [printable(f"  {sentence}", 600) for sentence in found["left_aside"]]
     compared = f", {about['pairs']} pairs compared" if about["pairs"] else ""
     longer = f", up to {duration(about['poses_seconds_at_most'])} where photographs match badly" if about["pairs"] else ""

@@ -113,7 +113,7 @@ def _lines(found: dict[str, Any], indent: str) -> list[str]:
 
 
 def _cascades(found: list[dict[str, Any]]) -> list[str]:
-    """The grids of a whole scene, a line for each."""
+    """The grids of an asset, a line for each."""
     first = f"{len(found)}, each with voxels twice as large as the one before" if len(found) > 1 else "1"
     rows = [f"voxels of {_shown(one['voxel_side'])}, {_shown(one['resolution'])} of them, {_box(one['bounds']['min'], one['bounds']['max'])}" for one in found]
     return [first, *(f"{n}: {row}" for n, row in enumerate(rows))]

@@ -1,4 +1,4 @@
-"""The states of a run's stages, as `enerf status --json` and the live page tell them."""
+"""The states of a run's stages, as `enerf status --json` and the live page report them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`enerf paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, beside the paper's figures.
+"""`enerf paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, next to the paper's figures.
 
     OUT/table_N.md     for people
     OUT/table_N.json   {"table", "title", "scale", "columns", "rows", "notes", "hardware", "versions"}
@@ -97,7 +97,7 @@ def shown(value: Any) -> str:
 
 
 def hardware(device: str) -> dict[str, Any]:
-    """What the figures were measured on."""
+    """The hardware of the measurement."""
     name = platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

@@ -186,7 +186,7 @@ def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], device: str) -> dict[str, Any]:
-    """PSNR, SSIM and shares of the network on test views; cached beside the run until the field or the views change."""
+    """PSNR, SSIM and shares of the network on test views; cached next to the run until the field or the views change."""
     kept = run.path / "network.json"
     key = {"field": digest, "views": settings["evaluate"]["field_views"]}
     if kept.exists() and (found := json.loads(kept.read_text(encoding="utf-8")))["of"] == key:

@@ -1,6 +1,6 @@
 """The documents of a run that the page and the summary read: metrics.json and the stages' reports, each checked against its schema.
 
-A run may come from anybody, or be damaged: a document that is not as it is written here is left out, and named.
+A run may be untrusted or damaged: a document that does not follow its schema is left out, and reported.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class PosesReport(msgspec.Struct):
 
 
 class ResultProblem(msgspec.Struct):
-    """Something that stands against a result: what it comes from, what to do, and the picture in the run that shows it."""
+    """A problem of a result: its cause, what to do, and the picture in the run that shows it."""
 
     grade: str = ""
     sentence: str = ""
@@ -122,7 +122,7 @@ class ResultVerdict(msgspec.Struct):
 
 
 class CameraProblem(msgspec.Struct):
-    """Something that stands against the cameras, and what to do."""
+    """A problem of the cameras, and what to do."""
 
     sentence: str = ""
     remedy: str = ""

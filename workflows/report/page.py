@@ -53,7 +53,7 @@ DOWNLOADS = (
     (EVALUATE.verdict, "the verdict on the result"),
 )
 TEMPLATE = "report.html.j2"
-# The pictures that a verdict on a result refers to: no other path of a file that may come from anybody is a link.
+# The pictures that a verdict on a result refers to: no other path of an untrusted file is a link.
 SHOWN = (EVALUATE.strip_worst, EVALUATE.strip_median, EVALUATE.contact_sheet, EVALUATE.sparse_points, MESH.check, SPLATS.preview, POSES.cameras)
 ATTEMPTS = 5  # to find no stage replaced while the page was made
 LONGEST = 1000  # characters of a text that is shown
@@ -78,7 +78,7 @@ def write_report(run: Run, stages: Sequence[Stage]) -> Path:
 
 
 def _published(run: Run, stages: Sequence[Stage]) -> list[tuple[int, int] | None]:
-    """What tells the artifact of each stage from one that replaces it: a stage is published by a rename of its folder."""
+    """Identifiers of the artifacts, which change with a replacement: a stage is published by a rename of its folder."""
     found: list[tuple[int, int] | None] = []
     for stage in stages:
         try:

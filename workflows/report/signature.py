@@ -1,7 +1,7 @@
-"""Whether a page of a run is one that this program wrote, and wrote here: a page is a program that a browser runs, and a run may come from anybody.
+"""Whether a page of a run was written by this program, and here: a page is a program that a browser runs, and a run may be untrusted.
 
 A page's last line is a comment with the SHA-256 of all before it, and with an HMAC of that by a key which the user alone can read. By the first `verify`
-knows a page that was altered; by the second it is known before it is opened whether who wrote it has the key. One that does not is made again.
+finds a page that was altered; by the second a page is known, before it is opened, to be by a holder of the key. Others are made again.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _signature(digest: str) -> str:
 
 @functools.cache
 def _key() -> bytes:
-    """32 random bytes, the same ones for all that a user does on a machine; where they cannot be kept, for all that this process does."""
+    """32 random bytes, one key for each user of a machine; where it cannot be kept, one for this process."""
     try:
         folder = first_private([cache_folder() / "pages"], "key")[0]
         if folder is None:
@@ -86,12 +86,12 @@ def _key() -> bytes:
         if not path.is_file() or path.stat().st_size != KEY:
             files.write_atomically(path, secrets.token_bytes(KEY))
         return path.read_bytes()
-    except (OSError, RuntimeError):  # no home, no room
+    except (OSError, RuntimeError):  # no home, no space
         return secrets.token_bytes(KEY)
 
 
 def viewer_is_missing(run: Run) -> bool:
-    """Whether the run has no viewer though its asset is one that gets a page: it could not be read, or nobody has written the page yet."""
+    """Whether the run has no viewer though its asset is one that gets a page: it could not be read, or the page is not written yet."""
     size = size_of(BakeOutputs.of_run(run.path).asset)
     return size is not None and size <= LARGEST and not os.path.lexists(run.path / VIEWER)
 

@@ -114,7 +114,7 @@ def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def problem_in_words(found: ResultProblem) -> str:
-    """What stands against the result, what it comes from, what to do, and where to look."""
+    """A problem of the result, its cause, what to do, and the picture that shows it."""
     return printable(f"{found.grade}: {found.sentence} {found.cause} {found.remedy} ({found.picture})", 1000)
 
 

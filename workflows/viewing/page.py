@@ -26,7 +26,7 @@ def present_page(what: Path, asset: Path) -> Path | None:
 
 
 def make_page(what: Path, asset: Path, target: Path) -> None:
-    """Write the page of a run's asset, with the cameras and photographs of the run, or of an asset file; whole or not at all.
+    """Write the page of a run's asset, with the cameras and photographs of the run, or of an asset file; atomically.
 
     Raises CorruptArtifact for a damaged asset, DiskFull, and BadInput where it cannot be written.
     """

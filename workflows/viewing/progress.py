@@ -1,4 +1,4 @@
-"""What a run has come to: the states of its stages, the curves of their logs, and the previews, of finished stages and of what is being made."""
+"""The progress of a run: the states of its stages, the curves of their logs, and the previews, of finished stages and of what is being made."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ TRAINED = (TrainOutputs, BakeOutputs)  # the stages that have a log and previews
 PREVIEW = re.compile(r"preview_([0-9]{6,12})\.png")
 MOST_PREVIEWS, MOST_POINTS = 100, 300
 LARGEST_LOG = 2**25  # bytes
-PAUSE = 1.0  # seconds at least between two looks at a run,
-SHARE = 0.1  # of which looking takes at most this share, whoever asks and however often
+PAUSE = 1.0  # seconds at least between two readings of a run,
+SHARE = 0.1  # of which reading takes at most this share, however many requests come
 _Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
 
 class _Line(msgspec.Struct):
-    """What is shown of a line of a log."""
+    """The shown part of a log line."""
 
     step: Annotated[int, msgspec.Meta(ge=0, le=2**53)]
     seconds: _Number | None = None
@@ -44,7 +44,7 @@ class _Line(msgspec.Struct):
 
 
 class Progress:
-    """A run that others write, looked at now and then."""
+    """A run that others write, read now and then."""
 
     def __init__(self, path: Path, stages: Sequence[Stage], clock: Callable[[], float] = time.monotonic) -> None:
         self.path, self.stages, self.clock = path, stages, clock
@@ -56,7 +56,7 @@ class Progress:
 
     def state(self) -> dict[str, Any]:
         """As `enerf status --json` gives, with `training`: steps, curves and previews by stage; `asset`: what tells the present asset from another, or None;
-        `error`: why the run could not be looked at now, or None. What was seen last is given again where it is too early to look."""
+        `error`: why the run could not be read now, or None. Where it is too early to read again, the last state is returned."""
         with self._lock:
             began = self.clock()
             if began >= self._due:
@@ -80,7 +80,7 @@ class Progress:
 
 
 def asset_identity(run: Path) -> str | None:
-    """What tells the asset of a run from one that replaces it; None where there is none."""
+    """An identifier of a run's asset, which changes when it is replaced; None: no asset."""
     try:
         status = os.lstat(BakeOutputs.of_run(run).asset)
     except OSError:

@@ -1,8 +1,8 @@
 """A server of a few pages for one browser: it reads, and answers GET and HEAD for the names that its site lists, and nothing else.
 
-Whoever runs on this machine may ask it, a page of another site in this machine's browser too. Hence: it listens on the loopback interface unless told
+Any program on this machine may ask it, a page of another site in this machine's browser too. Hence: it listens on the loopback interface unless asked
 otherwise; requests must name it by that (a name that was made to point here, DNS rebinding, is refused); no other site may embed or read its answers; no
-part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; who is slow keeps nobody else waiting.
+part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; slow clients delay no others.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pipeline.errors import UsageError
 LOOPBACK = "127.0.0.1"
 READING = 10.0  # seconds that a request may take to come
 SENDING, SLOWEST = 20.0, 2**15  # seconds, and bytes a second, that its answer may take to go
-MOST_AT_ONCE, MOST_OF_A_PEER = 32, 16  # connections; a browser opens six. Who comes then takes the place of the oldest
+MOST_AT_ONCE, MOST_OF_A_PEER = 32, 16  # connections; a browser opens six. A new one takes the place of the oldest
 MOST_THREADS = 2 * MOST_AT_ONCE  # those that are hung up on may still be at work on an answer
 HEADERS = {
     "Cache-Control": "no-store",
@@ -45,7 +45,7 @@ NOTHING = "default-src 'none'; frame-ancestors 'none'"
 
 @dataclass(frozen=True)
 class Answer:
-    """What is sent: bytes, or an open file, which whoever sends it closes.
+    """An answer: bytes, or an open file, which the sender closes.
 
     kind    content type
     policy  content security policy
@@ -98,7 +98,7 @@ class Server(ThreadingHTTPServer):
         return f"http://{host}:{self.server_address[1]}/"
 
     def server_bind(self) -> None:
-        """As the class above it, which would look up the name of this machine."""
+        """As the base class, which would look up the name of this machine."""
         if self.allow_reuse_address:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
@@ -130,7 +130,7 @@ class Server(ThreadingHTTPServer):
         self.slots.release()
 
     def _make_room(self, peer: str) -> None:
-        """Hang up on the oldest connection of a peer that has as many as it may, or of who has most where there are as many as may be."""
+        """Close the oldest connection of a peer at its limit, or, at the total limit, of the peer that has most."""
         peers = Counter(each.peer for each in self._open.values())
         if peers[peer] < MOST_OF_A_PEER:
             if len(self._open) < MOST_AT_ONCE:
@@ -139,7 +139,7 @@ class Server(ThreadingHTTPServer):
         self._hang_up(next(request for request, each in self._open.items() if each.peer == peer))
 
     def _hang_up(self, request: socket.socket) -> None:
-        """What its thread reads ends, and what it writes fails."""
+        """Its thread's reads end, and its writes fail."""
         del self._open[request]
         with suppress(OSError):
             request.shutdown(socket.SHUT_RDWR)
@@ -193,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             answer = self.server.site(self.path)
-        except Exception:  # whatever it is, it is told where the command runs, not here
+        except Exception:  # any error is reported where the command runs, not here
             self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR)
             return
         if answer is None:
@@ -239,7 +239,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def open_inside(folder: Path, name: str, most: int) -> int | None:
-    """A descriptor of a plain file of at most `most` bytes, opened from the folder downwards through no link; None where there is none such.
+    """A descriptor of a plain file of at most `most` bytes, opened from the folder downwards through no link; None where there is none.
 
     name  relative, of our own making
     """

@@ -21,7 +21,7 @@ from workflows.viewing.page import make_page, present_page
 from workflows.viewing.server import LOOPBACK, Server
 from workflows.viewing.sites import AssetSite, RunSite
 
-POLL_SECONDS = 0.2  # seconds between two looks whether a signal came
+POLL_SECONDS = 0.2  # seconds between two checks whether a signal came
 
 
 def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
@@ -61,7 +61,7 @@ def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, r
     """Serve a run, finished or not, or an asset file, until a signal comes. Raises as `asset_of` and `Server` do.
 
     address  None: this machine alone
-    ready    is told the URL
+    ready    is called with the URL
     """
     with tempfile.TemporaryDirectory(prefix="enerf-view-") as name, stopping() as stop:
         folder = Path(name)

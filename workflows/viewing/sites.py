@@ -1,4 +1,4 @@
-"""What there is to be served: of a run its live page, its progress, its previews and its viewer; of an asset file the viewer alone."""
+"""Sites to serve: of a run its live page, its progress, its previews and its viewer; of an asset file the viewer alone."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class AssetSite:
 class RunSite:
     """A run that may still be made. Nothing is written into it.
 
-    folder  takes the viewer page: what the run holds under its name may be anybody's
+    folder  takes the viewer page: the run's own page may be untrusted
     """
 
     def __init__(self, run: Path, stages: Sequence[Stage], folder: Path) -> None:

@@ -35,7 +35,7 @@ _Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e10)]
 
 
 class _About(msgspec.Struct, forbid_unknown_fields=True):
-    """What a checkpoint says of itself: `Point` without the state."""
+    """The metadata of a checkpoint: `Point` without the state."""
 
     step: Annotated[int, msgspec.Meta(ge=0, le=2**40)]
     phase: Annotated[int, msgspec.Meta(ge=0, le=1)]
@@ -83,7 +83,7 @@ def save(job: Job, point: Point) -> None:
 
 
 def about_of(point: Point) -> np.ndarray:
-    """What the checkpoint says of itself, as bytes of JSON."""
+    """The checkpoint's metadata, as bytes of JSON."""
     times = (point.seconds, point.began, point.allotted)
     about = _About(point.state.step, point.phase, point.pruned, point.schedule.state(), *times)
     return np.frombuffer(msgspec.json.encode(about), np.uint8)
@@ -163,7 +163,7 @@ def _cascades(found: Mapping[str, np.ndarray]) -> np.ndarray:
 def check(
     found: Mapping[str, np.ndarray], tree: NerfTree, stated: RefinementSchedule, hold: int | None = None
 ) -> tuple[_About, RefinementSchedule, np.ndarray]:
-    """What the checkpoint says of itself; the schedule; and the places in the tree of the state's voxels. ValueError where the tensors
+    """The checkpoint's metadata; the schedule; and the places in the tree of the state's voxels. ValueError where the tensors
     are no state of a refinement of this tree, or a step in it is out of range."""
     kinds = {"density": "float32", "sh": "float32", "square_density": "float32", "square_sh": "float32", "visits": "int32"}
     count = len(found["density"]) if "density" in found and found["density"].ndim else 0

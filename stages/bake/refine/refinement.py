@@ -63,8 +63,8 @@ class Refinement:
     capacity  voxels that the asset holds
     budget    seconds of the stage up to the end of the last step, or None
     per_ray   seconds that measuring the error of a ray took
-    samples   of the field, for whole scenes: what was dropped wrongly is restored by them
-    baked     (N,) of whole scenes the densities before the first step
+    samples   of the field, for unbounded scenes: they restore what was dropped wrongly
+    baked     (N,) of unbounded scenes the densities before the first step
     """
 
     job: Job
@@ -105,7 +105,7 @@ class Refinement:
         point.schedule = point.schedule.with_phase(point.phase, timed_schedule())
 
     def _pruning_seconds(self) -> float:
-        """About how many seconds will go into which voxels show."""
+        """About how many seconds it takes to find which voxels show."""
         state = self.point.state
         return pruning.count_rays(self.job, state.tree.ndc is not None, len(state.density), self.targets) * self.per_ray * WEIGHT_SECONDS
 
@@ -172,7 +172,7 @@ def refined(
 ) -> tuple[NerfTree, dict[str, Any]]:
     """The refined tree of at most `capacity` voxels, and the entries of the report; the log, the curve and the previews are written.
 
-    samples  of the field, for whole scenes: what was dropped wrongly is restored by them
+    samples  of the field, for unbounded scenes: they restore what was dropped wrongly
     """
     settings = job.settings
     most = min(len(tree.density_values), capacity)
@@ -215,7 +215,7 @@ def refined(
 
 
 def _unrefined(taken: int, usual: int) -> str:
-    """What a time budget that was too short has come to, and what to do."""
+    """The warning about a time budget that was too short, and what to do."""
     done = f"bake.time_budget left time for {taken} step{'' if taken == 1 else 's'} of the refinement, where {usual:,} are usual"
     return f"{done}: the asset is hardly better than it was baked. Give more time (--budget) or fewer voxels (bake.max_mib), or run it while nothing else does."
 
@@ -254,7 +254,7 @@ def _publish(job: Job, log: RefinementLog) -> None:
 
 
 def _holes(job: Job, tree: NerfTree, samples: FieldSamples, pruned: Pruned) -> dict[str, Any]:
-    """The entry of the report about holes, which is said too."""
+    """The entry of the report about holes, which is also a message."""
     holes = {**pruned.report(), "refined": round(find_holes(job, tree, samples)[1], 6)}
     job.say(f"holes, where the field is opaque and the asset is not: {holes['pruned']:.2%} of the rays after voxels were dropped,"
             f" {holes['restored']:.2%} with {pruned.voxels:,} voxels restored, {holes['refined']:.2%} at the end")  # fmt: skip
@@ -279,7 +279,7 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
 
 
 def _is_whole(tree: NerfTree) -> bool:
-    """Whether it is of a whole scene, in contracted space."""
+    """Whether the scene is unbounded, in contracted space."""
     return tree.background is None and tree.ndc is None
 
 
@@ -293,7 +293,7 @@ def refinement_steps(settings: BakeSettings, voxels: int, pixels: int | None) ->
 def usual_steps(voxels: int, rays: int, pixels: int | None) -> int:
     """Steps of so many rays where nothing is stated.
 
-    pixels  of all training images of a whole scene, whose few photographs are soon overfitted: a ray for each, between 6 and 15 for each voxel; None: another
+    pixels  of all training images of an unbounded scene, which are soon overfitted: a ray for each, between 6 and 15 for each voxel; None: of another
             scene, 15 for each voxel
     """
     least, most = SCENE_STEP_RAYS_PER_VOXEL

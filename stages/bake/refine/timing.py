@@ -1,4 +1,4 @@
-"""Where the time of a bake goes: how much of bake.time_budget each phase of the refinement may take."""
+"""The shares of bake.time_budget that the phases of the refinement may take."""
 
 from __future__ import annotations
 

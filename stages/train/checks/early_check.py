@@ -24,7 +24,7 @@ from stages.evaluate.views import evenly_spaced, ground_truth, subsample_camera
 from stages.io.scene import Scene, View, views_of
 
 FRACTION = 0.1  # of the steps
-MIN_STEP = 256  # before the warm-up of the density voxels ends nothing is expected
+MIN_STEP = 256  # nothing is expected before the warm-up of the density voxels ends
 VIEWS = 5  # that are rendered
 SIDE = 48  # px, their longest side
 MARGIN = 3  # px round the subject
@@ -74,7 +74,7 @@ class EarlyResult:
 
 
 def check_step(iterations: int) -> int | None:
-    """The step after which is looked; None: the run is too short to be judged before its second half."""
+    """The step after which the check runs; None: the run is too short for a check before its second half."""
     step = max(MIN_STEP, math.ceil(FRACTION * iterations))
     return step if 2 * step <= iterations else None
 

@@ -1,8 +1,8 @@
-"""Second chances: what is known to rescue captures, tried by short trainings where a run learns nothing.
+"""Second chances: where a run learns nothing, short trainings try changes that have rescued other captures.
 
-Each trial leaves out one of the priors that keep density away, or lets training correct what photographs and cameras have wrong. All begin from nothing, draw
-the same pixels, and are compared on the same pixels of the same held-out views. A trial is small enough that one which a kill cut short is done again; those
-that are finished are not. docs/experiments/early-check.md
+Each trial leaves out one of the priors that keep density away, or lets training correct errors of photographs and cameras. All begin from nothing, draw
+the same pixels, and are compared on the same pixels of the same held-out views. A trial that a kill cut short is done again; finished
+ones are not. docs/experiments/early-check.md
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ AS_STATED = "as stated"
 
 @dataclass(frozen=True)
 class Trial:
-    """What a short training with other choices came to."""
+    """The result of a short training with other choices."""
 
     name: str
     choices: TrainingChoices
@@ -50,7 +50,7 @@ class Trial:
 
 
 def candidates(s: Scene, settings: TrainSettings) -> dict[str, TrainingChoices]:
-    """The choices that would change anything, by what a user reads of them; first what is stated."""
+    """The choices that would change anything, by their names in messages; first the stated ones."""
     own = TrainingChoices()
     found, priors = {AS_STATED: own}, own
     if s.forward is None and settings.near_plane == "auto":
@@ -113,7 +113,7 @@ def best_of(trials: Sequence[Trial]) -> Trial | None:
 def _train(
     job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView], depth: SparseDepthRays | None, name: str
 ) -> EarlyResult | None:
-    """A short training on a scene, and what it comes to; None where no pixel can be compared, or masks leave none to train on."""
+    """The result of a short training on a scene; None where no pixel can be compared, or masks leave none to train on."""
     views, small = views_of(s, "train"), _small(settings)
     own = _with_views(pixels, views)
     near, far = depth_range(s, own, small)
@@ -127,7 +127,7 @@ def _train(
 
 
 def _small(settings: TrainSettings) -> TrainSettings:
-    """The settings of a trial: of those that are given the ones that say what is learned, not how much of it."""
+    """The settings of a trial: the given ones for what is learned, not for how much."""
     kept = ("seed", "near_plane", "far_plane", "min_views", "exposure", "camera_refinement", "background_color")
     return replace(SMALL, **{name: getattr(settings, name) for name in kept})
 

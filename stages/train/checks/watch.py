@@ -1,7 +1,7 @@
-"""What follows where the early check finds that nothing is learned: `train.on_failure`.
+"""What happens when the early check finds that nothing is learned: `train.on_failure`.
 
-What was found and decided is noted in the scratch folder, so that a run that is killed anywhere ends with the same bytes: the check's result, each trial's, and
-last what was chosen. The checkpoints of the training that failed are removed before that is noted.
+Results and decisions are noted in the scratch folder, so that a run that is killed anywhere ends with the same bytes: the check's result, each trial's, and
+last the choice. The checkpoints of the training that failed are removed before that is noted.
 """
 
 from __future__ import annotations

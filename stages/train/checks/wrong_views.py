@@ -1,4 +1,4 @@
-"""Training views whose cameras turn out to be wrong: the checks between the steps, and what is written and shown of them."""
+"""Training views with wrong cameras: the checks between the steps, and what is written and shown of them."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def cameras_of(t: Trainer) -> list[Camera] | None:
 
 
 def findings_of(t: Trainer, views: tuple[View, ...]) -> list[dict[str, Any]]:
-    """What was found of each view that was left out at some time: errors are shares of the photograph's variance inside tiles."""
+    """The findings on each view that was left out at some time: errors are shares of the photograph's variance inside tiles."""
     if t.checks is None:
         return []
     found = []

@@ -69,12 +69,12 @@ def filled(template: str, script: str | None = None, *, title: str, facts: Any =
 
 @functools.cache
 def _environment() -> jinja2.Environment:
-    """One: it keeps compiled templates, and pages are written again and again."""
+    """Cached: it keeps compiled templates, and pages are written often."""
     return jinja2.Environment(loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 
 def _scene(scene: SceneState, picture: int | None, *, reported: bool) -> dict[str, Any]:
-    """What the page's script knows of a scene."""
+    """Data on a scene for the page's script."""
     quality, place = quality_of(scene), quote(scene.run)
     made = {name for name, stage in scene.stages.items() if stage.state == "done"}
     return {

@@ -1,4 +1,4 @@
-"""Pages of a fleet that goes on: written whole, now and then, and at its end."""
+"""Pages of a running fleet: each written atomically, now and then, and at the end."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Pages:
         write_atomically(self.fleet / spreadsheet.NAME, spreadsheet.fleet_csv(state).encode("utf-8"), durable=ended)
 
     def _reports_of(self, state: FleetState) -> set[str]:
-        """Scenes with a report of our own, of whatever state: what was made before a scene failed is still there to read. One without a stage has none."""
+        """Scenes with a report of our own, in any state: the outputs of a failed scene can still be read. A scene without a stage has none."""
         begun = (scene for scene in state.scenes if scene.name not in self._reports and any(stage.state == "done" for stage in scene.stages.values()))
         self._reports |= {scene.name for scene in begun if is_own(self.fleet / scene.run / REPORT)}
         return self._reports

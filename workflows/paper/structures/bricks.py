@@ -1,6 +1,6 @@
 """NerfTree: coarse dense voxels over sparse bricks of 4^3 voxels (EfficientNeRF, section 3.5).
 
-BrickTree stores occupied voxels only, located by 64-bit masks (x slowest), each beside the index of its first set bit: records of 16 bytes, which do not
+BrickTree stores occupied voxels only, located by 64-bit masks (x slowest), each next to the index of its first set bit: records of 16 bytes, which do not
 straddle cache lines. The coarse level is one bit per coarse cell, in a record for each block of 4^3 cells; an occupied cell has a record of its 64 voxels.
 A query reads the record of a block (1/256 byte per voxel: it stays in the cache) and ends there if the cell is empty, reads the cell's record and ends there if
 the voxel is empty, and reads the value.

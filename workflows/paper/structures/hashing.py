@@ -1,8 +1,8 @@
 """Sparse tensor: a hash map from coordinates to values.
 
 Open addressing with linear probing over 64-bit keys, murmur3's finaliser as the hash, and a load factor of at most one half, as in MinkowskiEngine
-(concurrent_unordered_map, hashtable_occupancy 50) and spconv (tensorview's LinearHashTable). Those keep the row of the feature matrix beside the key; here the
-four values lie there, which take as much room as the row and its alignment, and save the second memory access.
+(concurrent_unordered_map, hashtable_occupancy 50) and spconv (tensorview's LinearHashTable). Those keep the row of the feature matrix next to the key; here the
+four values are stored there, which take as much space as the row and its alignment, and save the second memory access.
 """
 
 from __future__ import annotations
