@@ -12,5 +12,5 @@ from tests.workflows.torment import torment
 @pytest.mark.slow
 @pytest.mark.timeout(1800)  # three minutes of a core, on a machine that may be very busy
 def test_failing_operations_lose_nothing(tmp_path: Path) -> None:
-    result = torment(tmp_path, "benchmarks.torture.faults", "--sources", "blender", "--share", "20")
+    result = torment(tmp_path, "benchmarks.torture.faults", "--sources", "blender", "--share", "15")
     assert result["cases"] >= 50
