@@ -38,11 +38,11 @@ import platformdirs
 
 from efficientnerf.backends import Notice
 
-PACKAGE = Path(__file__).resolve().parent.parent
-KERNELS = ("backends/numba", "structures")  # folders of the package that hold kernels
-CONSTANTS = (  # modules that these import: numbers among them are part of the compiled code
-    "backends/layout.py", "geometry/cameras.py", "geometry/ndc.py", "geometry/spaces.py", "rendering/compositing.py", "rendering/harmonics.py",
-    "sampling/samples.py",
+ROOT = Path(__file__).resolve().parents[2]  # where the packages lie
+KERNELS = ("efficientnerf/backends/numba", "workflows/paper/structures")  # folders that hold kernels
+CONSTANTS = (  # modules whose constants these import: numbers among them are part of the compiled code
+    "efficientnerf/backends/layout.py", "efficientnerf/geometry/cameras.py", "efficientnerf/geometry/ndc.py", "efficientnerf/geometry/spaces.py",
+    "efficientnerf/rendering/compositing.py", "efficientnerf/rendering/harmonics.py", "efficientnerf/sampling/samples.py",
 )  # fmt: skip
 KEPT, UNUSED_DAYS = 8, 30  # folders of other keys: so many, unless used within a day; none that was not used for so many days
 DAY = 86400.0
@@ -51,19 +51,19 @@ USUAL = 150  # functions that a run on the CPU compiles: 173 to 178 of three run
 
 @functools.cache
 def key() -> str:
-    """`key_of` this package."""
-    return key_of(PACKAGE)
+    """`key_of` these packages."""
+    return key_of(ROOT)
 
 
-def key_of(package: Path) -> str:
-    """16 hexadecimal digits that stand for the kernels' sources in a package and for what compiles them."""
+def key_of(root: Path) -> str:
+    """16 hexadecimal digits that stand for the kernels' sources below a folder and for what compiles them."""
     digest = hashlib.sha256()
     versions = (version("numba"), version("llvmlite"), version("numpy"), sys.implementation.cache_tag or sys.version, platform.machine())
     digest.update("\n".join(versions).encode())
-    paths = [path for folder in KERNELS for path in sorted((package / folder).rglob("*.py"))]
-    for path in (*paths, *(package / name for name in CONSTANTS)):
+    paths = [path for folder in KERNELS for path in sorted((root / folder).rglob("*.py"))]
+    for path in (*paths, *(root / name for name in CONSTANTS)):
         content = path.read_bytes()
-        digest.update(f"\n{path.relative_to(package).as_posix()} {len(content)}\n".encode() + content)
+        digest.update(f"\n{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
     return digest.hexdigest()[:16]
 
 
