@@ -20,10 +20,10 @@ def usage(tmp_path: Path, work: Callable[[Job], None]) -> local.Usage:
 
 
 def test_time_and_memory_are_those_of_the_process_and_its_children(tmp_path: Path) -> None:
-    size = 2 * local.peak_memory()
+    size = 2**30
     own = usage(tmp_path, lambda job: exec(GROWN.format(size=1)))
     child = usage(tmp_path, lambda job: subprocess.run([sys.executable, "-c", GROWN.format(size=size // 256)], check=True) and None)  # type: ignore[func-returns-value]
     idle = usage(tmp_path, lambda job: time.sleep(0.2))
-    assert all(0.14 <= each.cpu_seconds < 1.5 and each.cores >= 1 for each in (own, child))
+    assert all(0.14 <= each.cpu_seconds < 3 and each.cores >= 1 for each in (own, child))
     assert child.peak_memory > size
     assert idle.cpu_seconds < 0.15 < idle.seconds
