@@ -72,7 +72,7 @@ def test_options_are_read_in_the_type_of_the_setting(option: str, expected: obje
         ("toy.steps", UsageError, "stage.name=value"),
         ("toy.steps=many", UsageError, "whole number"),
         ("toy.steps=101", UsageError, "at most 100"),
-        ("toy.rate=inf", UsageError, "finite"),
+        ("toy.rate=inf", UsageError, "at most"),
         ("toy.kind=fancier", UsageError, "plain, fancy"),
     ],
 )
