@@ -95,7 +95,7 @@ def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Pat
     directions = rays(camera)[1] @ camera.world_from_camera[:3, :3]
     x = (directions[:, 0] / directions[:, 2]).reshape(side, side)
     write_png(np.repeat((128 + 127 * np.sin(30 * x)).astype(np.uint8)[..., None], 3, axis=2), folder / view.image)
-    (tmp_path / "small.jpg").write_bytes(photograph(scene, folder, replace(view, camera=camera), (1, 1, 1)))
+    (tmp_path / "small.jpg").write_bytes(photograph(folder, replace(view, camera=camera), (1, 1, 1)))
     with opened(tmp_path / "small.jpg") as image:
         found = np.asarray(image.convert("L"), np.float64)
     assert found.shape == (SIDE, SIDE)
