@@ -75,7 +75,7 @@ def test_slurm_is_asked_for_what_the_template_says() -> None:
     jobqueue = pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed")
     options = read_toml("--cluster-options", EXAMPLES / "slurm.toml")
     assert options.pop("jobs") == 8
-    cluster = jobqueue.SLURMCluster(**options, scheduler_options={"dashboard_address": None, "host": "127.0.0.1"})
+    cluster = jobqueue.SLURMCluster(**options, scheduler_options={"dashboard_address": ":0", "host": "127.0.0.1"})
     try:
         script = cluster.job_script().splitlines()
     finally:
