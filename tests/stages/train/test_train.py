@@ -28,6 +28,7 @@ from stages.train import run as train
 from stages.train.averaged import as_taken
 from stages.train.data import depth_range, pixels_of, sparse_depth_of
 from stages.train.exposure import begin_exposure
+from stages.train.settings import STAGE
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -255,13 +256,13 @@ def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, di
 def test_planes_are_stated_both_and_in_order_and_not_of_a_contracted_scene(scene: Path, tmp_path: Path) -> None:
     for planes in ({"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}):
         chosen = settings(**QUICK, **planes)
-        for refused in (lambda chosen=chosen: train.STAGE.check({"train": chosen}), lambda chosen=chosen: train.run(job(tmp_path, chosen, poses=scene))):
+        for refused in (lambda chosen=chosen: STAGE.check({"train": chosen}), lambda chosen=chosen: train.run(job(tmp_path, chosen, poses=scene))):
             with pytest.raises(UsageError, match=r"train\.near_plane=.*, train\.far_plane="):
                 refused()
     chosen = settings(**QUICK, near_plane=2.0, far_plane=6.0)
     with pytest.raises(UsageError, match=r"poses\.space=contracted"):
-        train.STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
-    train.STAGE.check({"train": chosen, "poses": PosesSettings()})
+        STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
+    STAGE.check({"train": chosen, "poses": PosesSettings()})
 
 
 def test_planes_that_miss_the_scene_are_refused(scene: Path) -> None:
