@@ -134,9 +134,9 @@ def step(
     voxels = len(moments.visits)
     if h.total_variation > 0:
         neighbours.density.copy_(values[0])
-    numbers = (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))
-    numbers = (*numbers, min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy, MIN_THICKNESS, MAX_THICKNESS)
-    rule = Rule(*map(float, numbers), MAX_VISITS)
+    rates = (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))
+    weights = (min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy)
+    rule = Rule._make([*map(float, (*rates, *weights, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS])
     _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
         values, sums, moments, neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, min(h.terms, g.terms), 1 / fixed_point_scale(rays), rule,
         CASCADES=len(g.cascades.first), MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
