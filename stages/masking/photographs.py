@@ -23,10 +23,11 @@ from stages.masking.made import made_masks, masks_by_network
 from stages.masking.polarity import INVERTED_NOTICE, kept_white
 from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
+from stages.sfm.attempts import ENOUGH
+from stages.sfm.cameras import find_cameras
 from stages.sfm.gps import STATED, with_gps, with_stated_cameras
-from stages.sfm.ladder import ENOUGH, features_for
 from stages.sfm.learned.networks import given_networks
-from stages.sfm.reconstruction import find_cameras
+from stages.sfm.pairs import features_for
 
 Find = Callable[[str, Mapping[str, Path | None]], Capture]
 

@@ -31,6 +31,7 @@ _BLOBS = {"F": 72, "E": 72, "H": 72, "qvec": 32, "tvec": 24}  # bytes, where the
 MAX_IMAGES = 2147483647  # COLMAP's
 _MAX_KEYPOINTS = 2**20
 FISHEYE_FOCAL = 0.4  # of the longest side: 180 degrees along the diagonal of a picture of 4:3
+OVERLAPPING = 30  # verified matches, from which two photographs count as overlapping
 HOMOGRAPHIES = (4, 5, 6)  # of COLMAP's two-view geometries: planar, panoramic, either of them
 
 Row = dict[str, Any]
@@ -40,11 +41,7 @@ def database_path(work: Path) -> Path:
     return work / "database.db"
 
 
-def remove_database(work: Path) -> None:
-    _remove(database_path(work))
-
-
-def _remove(path: Path) -> None:
+def remove_database(path: Path) -> None:
     for suffix in _WRITTEN:
         remove(Path(str(path) + suffix))
 
@@ -55,7 +52,7 @@ def open_database(work: Path, images: Sequence[WorkImage], warn: Warn) -> bool:
     returns  whether any are
     """
     aside = work / "database.part"
-    _remove(aside)
+    remove_database(aside)
     # The database appears by rename: a kill while the images are being listed leaves none.
     _list_images(aside, work, images)
     kept = False
@@ -64,7 +61,7 @@ def open_database(work: Path, images: Sequence[WorkImage], warn: Warn) -> bool:
             kept = _copy_rows(work, fresh, images, once(warn))
         fresh.commit()
         fresh.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    remove_database(work)
+    remove_database(database_path(work))
     rename(aside, database_path(work))
     return kept
 
@@ -144,7 +141,7 @@ def insert_features(path: Path, image: int, rows: Sequence[Row]) -> bool:
 
 def copy_database(work: Path, place: Path) -> None:
     """A copy of the database in another scratch folder, in the place of what is there."""
-    remove_database(place)
+    remove_database(database_path(place))
     with contextlib.closing(sqlite3.connect(database_path(work))) as old, contextlib.closing(sqlite3.connect(database_path(place))) as fresh:
         old.backup(fresh)
 
@@ -152,7 +149,7 @@ def copy_database(work: Path, place: Path) -> None:
 def copy_with_own_cameras(work: Path, place: Path, images: Sequence[WorkImage]) -> None:
     """Replace the database of another scratch folder by one of the same images, features and matches, but with a camera for each image, of the first
     guess."""
-    remove_database(place)
+    remove_database(database_path(place))
     _list_images(database_path(place), place, [replace(image, camera_key=image.file) for image in images])
     with contextlib.closing(attached(place, work)) as connection, connection:
         for table, _ in (*FEATURES, *PAIRS):
@@ -279,16 +276,20 @@ def _size(row: Row) -> int:
     return len(row["data"] or b"")
 
 
-def verified_pairs(path: Path) -> list[tuple[int, int]]:
-    """Image ids of each pair in the table of two-view geometries, in order."""
-    with contextlib.closing(sqlite3.connect(path)) as connection:
-        return [image_ids_of_pair(row[0]) for row in connection.execute("SELECT pair_id FROM two_view_geometries ORDER BY pair_id")]
-
-
 def inlier_counts(path: Path) -> dict[tuple[int, int], int]:
     """Verified matches of each pair of image ids that was compared, in order."""
     with contextlib.closing(sqlite3.connect(path)) as connection:
         return {image_ids_of_pair(row[0]): int(row[1]) for row in connection.execute("SELECT pair_id, rows FROM two_view_geometries ORDER BY pair_id")}
+
+
+def neighbours(work: Path, count: int) -> dict[int, set[int]]:
+    """The positions of the photographs that each of `count` overlaps with."""
+    found: dict[int, set[int]] = {i: set() for i in range(count)}
+    for (i, j), inliers in inlier_counts(database_path(work)).items():
+        if inliers >= OVERLAPPING:
+            found[i - 1].add(j - 1)
+            found[j - 1].add(i - 1)
+    return found
 
 
 def planar_share(path: Path) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -72,31 +72,28 @@ def _sha256(path: Path) -> str:
 
 
 def prepare_images(
-    folder: Path,
-    names: Sequence[str],
+    paths: Mapping[str, Path],
     *,
     max_side: int,
     features: int,
     seed: int,
     masks: Masks,
     lens: str = "auto",
-    paths: Mapping[str, Path] | None = None,
     threads: int = 1,
     work: Path,
     **callables: Unpack[Callables],
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
     """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
+    paths    the file of each photograph, by name
     masks    of some or all names; None: the photograph as a whole, whatever its alpha channel says
     lens     "fisheye", "perspective", or "auto": fisheye where EXIF data say so
-    paths    of some or all names: the file that is read, where it is not the name below the folder
     threads  on which photographs are read
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 
     What an earlier, killed call with the same photographs and settings left in `work` is kept, anything else there is removed.
     """
     safe_point, warn = callables["safe_point"], callables["warn"]
-    paths = {name: folder / name for name in names} | dict(paths or {})
     request: dict[str, object] = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "lens": lens}
     request["photographs"] = _digests(paths, masks, safe_point)
     _begin(work, json.dumps(request, indent=1, sort_keys=True).encode())

@@ -40,7 +40,7 @@ def photographs(tmp_path: Path) -> Path:
 def opened(photographs: Path, work: Path, **changes: Any) -> list[WorkImage]:
     names = sorted(path.name for path in photographs.iterdir())
     how: dict[str, Any] = {"max_side": 256, "features": 200, "seed": 0, "masks": {}, "work": work, "warn": print, **QUIET, **changes}
-    images, _ = prepare_images(photographs, names, **how)
+    images, _ = prepare_images({name: photographs / name for name in names}, **how)
     open_database(work, images, print)
     return images
 
