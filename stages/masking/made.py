@@ -82,7 +82,7 @@ def _by_network(model: Path) -> Callable[[Path, Path], bool]:
     network = MaskNetwork(model)
 
     def make(photograph: Path, target: Path) -> bool:
-        photo = _read(photograph, MASK_SIDE)
+        photo = read_photo(photograph, MASK_SIDE)
         mask = network.mask(photo.rgb)
         if mask is not None:
             write_mask(sharpened(mask, photo.rgb), (photo.width, photo.height), target)
@@ -95,7 +95,7 @@ def _by_key(how: str) -> Callable[[Path, Path], bool]:
     key = key_of(how)
 
     def make(photograph: Path, target: Path) -> bool:
-        photo = _read(photograph, MASK_SIDE)
+        photo = read_photo(photograph, MASK_SIDE)
         mask = keyed(photo.rgb, key)
         if mask is not None:
             write_mask(mask, (photo.width, photo.height), target)
@@ -109,7 +109,7 @@ def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Calla
     for name in names:
         safe_point()
         try:
-            small[paths[name]] = _read(paths[name], SIDE).rgb
+            small[paths[name]] = read_photo(paths[name], SIDE).rgb
         except UnreadableImage:
             continue
     shapes = [each.shape for each in small.values()]
@@ -117,7 +117,7 @@ def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Calla
     still = StillBackground(np.stack([each for each in small.values() if each.shape == usual]) if usual else np.zeros((0, 1, 1, 3), np.uint8))
 
     def make(photograph: Path, target: Path) -> bool:
-        photo = _read(photograph, MASK_SIDE)
+        photo = read_photo(photograph, MASK_SIDE)
         if small[photograph].shape != usual:
             return False
         mask = still.mask(small[photograph])
@@ -127,10 +127,6 @@ def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Calla
         return True
 
     return make
-
-
-def _read(path: Path, side: int) -> Any:
-    return read_photo(path, side)
 
 
 def write_mask(mask: np.ndarray, size: tuple[int, int], target: Path) -> None:

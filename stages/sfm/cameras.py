@@ -37,6 +37,7 @@ def find_cameras(
     lens: str = "auto",
     networks: tuple[Path, Path] | None = None,
     work: Path,
+    copies: Path | None = None,
     **callables: Unpack[Callables],
 ) -> Capture:
     """Find the pose and the intrinsics of each photograph's camera.
@@ -50,6 +51,7 @@ def find_cameras(
     lens            "fisheye", "perspective", or "auto": fisheye where EXIF data say so
     networks        files of a detector and a matcher (`stages.sfm.learned.networks`), for photographs that SIFT leaves without a camera
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
+    copies          folder in which the stage keeps photographs that were decoded; None: one in the scratch folder
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
 
     It is done in a process of its own (`stages.sfm.process`), whose callables are called here.
@@ -57,7 +59,7 @@ def find_cameras(
     Raises BadInput where fewer than 3 or less than half of the photographs are registered, StageFailed where the process aborts.
     """
     paths = dict(names) if isinstance(names, Mapping) else {name: folder / name for name in names}
-    request = Request(folder, paths, work, max_side, features or features_for(len(paths)), matching, seed, threads, dict(masks or {}), lens, networks)
+    request = Request(folder, paths, work, max_side, features or features_for(len(paths)), matching, seed, threads, dict(masks or {}), lens, networks, copies)
     resumed = database_path(work).exists()
     try:
         return msgspec.convert(process.run(_plain(request), **callables), Capture, dec_hook=_from_plain)

@@ -69,6 +69,7 @@ class Request:
     masks: dict[str, Path | None] = field(default_factory=dict)
     lens: str = "auto"
     networks: tuple[Path, Path] | None = None
+    copies: Path | None = None
 
 
 def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
@@ -77,7 +78,8 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
 
     # Copies of the photographs at working size, with their masks.
     images, unreadable = prepare_images(
-        r.paths, max_side=r.max_side, features=r.features, seed=r.seed, masks=r.masks, lens=r.lens, threads=threads, work=r.work, **callables
+        r.paths, max_side=r.max_side, features=r.features, seed=r.seed, masks=r.masks, lens=r.lens, threads=threads, work=r.work, copies=r.copies,
+        **callables,
     )  # fmt: skip
     if len(images) < mapping.MIN_MODEL_SIZE:
         raise result.too_few(r.folder, images, unreadable)

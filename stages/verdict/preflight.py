@@ -25,6 +25,7 @@ from stages.formats.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.capture import FOREGROUND
 from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
+from stages.io.reader import PhotoReader
 from stages.masking.first_training import FIRST, RAYS
 from stages.masking.first_training import SIDE as SIDE_OF_FIRST
 from stages.masking.turning import masks_of_turning_subject
@@ -252,7 +253,7 @@ def _with_turning(problems: Sequence[Problem], files: Mapping[str, Path]) -> lis
     if not any(each.what == "stands still" for each in problems):
         return list(problems)
     with tempfile.TemporaryDirectory() as folder:
-        turns = masks_of_turning_subject(files, Path(folder), safe_point=lambda: None, progress=lambda *_: None)
+        turns = masks_of_turning_subject(files, Path(folder), PhotoReader(), safe_point=lambda: None, progress=lambda *_: None)
     return [TURNING if turns and each.what == "stands still" else each for each in problems]
 
 
