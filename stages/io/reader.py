@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import cv2
@@ -21,23 +21,29 @@ from stages.scratch import note, noted
 SMALL = 160  # px, longest side
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KeptPhoto:
     """A photograph in the scratch folder.
 
     image   PNG of its pixels, 8 bits sRGB, after EXIF rotation, at working size
     opaque  PNG that is black where the file's alpha is below one half; None without transparent pixels
+    decoded its pixels, where it has just been decoded
     """
 
     details: PhotoDetails
     image: Path
     opaque: Path | None
+    decoded: np.ndarray | None = None
+
+    def rgb(self) -> np.ndarray:
+        """(h, w, 3) uint8 sRGB."""
+        return read_png(self.image) if self.decoded is None else self.decoded
 
 
 @dataclass
 class PhotoReader:
     """
-    folder  in the stage's scratch, for photographs at working sizes; None: they are decoded each time
+    folder  in the stage's scratch, for photographs at working sizes; None where masks alone are read
 
     Alpha channels and masks are (h, w) uint8, upright, longest side at most `SMALL`, the highest of each block; pixels up to `TRANSPARENT` are 0. None where
     a photograph has none, or it cannot be read, which is reported where it is needed.
@@ -47,25 +53,23 @@ class PhotoReader:
     _alpha: dict[Path, np.ndarray | None] = field(default_factory=dict)
     _masks: dict[tuple[Path, str, str], np.ndarray | None] = field(default_factory=dict)
 
-    def rgb(self, path: Path, max_side: int) -> np.ndarray:
-        """(h, w, 3) uint8 sRGB, longest side at most `max_side`. Raises UnreadableImage."""
-        return read_photo(path, max_side).rgb if self.folder is None else read_png(self.photo(path, max_side).image)
-
     def photo(self, path: Path, max_side: int) -> KeptPhoto:
-        """The photograph as a file, longest side at most `max_side`. Raises UnreadableImage."""
+        """The photograph, longest side at most `max_side`. Raises UnreadableImage."""
         assert self.folder is not None
         place = self.folder / _key(path, max_side)
         image, mask, record = (place.with_suffix(suffix) for suffix in (".png", ".opaque.png", ".json"))
         found = noted(record, _Note, lambda text: None)  # what is damaged is decoded again
-        if found is None:
-            photo = read_photo(path, max_side)
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_png(photo.rgb, image, compress_level=FAST, durable=False)
-            if photo.opaque is not None:
-                write_png(np.where(photo.opaque, np.uint8(255), np.uint8(0)), mask, compress_level=FAST, durable=False)
-            found = _Note(PhotoDetails(**{each.name: getattr(photo, each.name) for each in fields(PhotoDetails)}), photo.opaque is not None)
-            note(record, msgspec.to_builtins(found), [image, mask] if found.transparent else [image])
-        return KeptPhoto(found.details, image, mask if found.transparent else None)
+        if found is not None:
+            return KeptPhoto(found.details, image, mask if found.transparent else None)
+        photo = read_photo(path, max_side)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        kept = KeptPhoto(PhotoDetails(**{each.name: getattr(photo, each.name) for each in fields(PhotoDetails)}), image, None, photo.rgb)
+        write_png(photo.rgb, image, compress_level=FAST, durable=False)
+        if photo.opaque is not None:
+            kept = replace(kept, opaque=mask)
+            write_png(np.where(photo.opaque, np.uint8(255), np.uint8(0)), mask, compress_level=FAST, durable=False)
+        note(record, msgspec.to_builtins(_Note(kept.details, kept.opaque is not None)), [each for each in (image, kept.opaque) if each])
+        return kept
 
     def alpha(self, photo: Photo) -> np.ndarray | None:
         if photo.image not in self._alpha:

@@ -51,7 +51,7 @@ def stands_still(photos: Sequence[Photo], kind: Silhouettes, reader: PhotoReader
         for photo in photos[index : index + 2]:
             mask = reader.mask(photo) if kind.masks else reader.alpha(photo)
             try:
-                grey = reader.rgb(photo.image, SMALL).astype(np.float32).mean(2)
+                grey = reader.photo(photo.image, SMALL).rgb().astype(np.float32).mean(2)
             except UnreadableImage:
                 continue
             if mask is None:

@@ -66,7 +66,7 @@ def border_stands_still(paths: Mapping[str, Path], reader: PhotoReader, safe_poi
     for index in np.linspace(0, len(chosen) - 1, COMPARED).astype(int):
         safe_point()
         try:
-            grey = reader.rgb(paths[chosen[index]], SIDE).astype(np.float32).mean(2)
+            grey = reader.photo(paths[chosen[index]], SIDE).rgb().astype(np.float32).mean(2)
         except UnreadableImage:
             return False
         texture = (grey - cv2.GaussianBlur(grey, (0, 0), FINE))[border_of(grey.shape)]

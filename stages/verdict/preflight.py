@@ -253,7 +253,7 @@ def _with_turning(problems: Sequence[Problem], files: Mapping[str, Path]) -> lis
     if not any(each.what == "stands still" for each in problems):
         return list(problems)
     with tempfile.TemporaryDirectory() as folder:
-        turns = masks_of_turning_subject(files, Path(folder), PhotoReader(), safe_point=lambda: None, progress=lambda *_: None)
+        turns = masks_of_turning_subject(files, Path(folder), PhotoReader(Path(folder) / "photographs"), safe_point=lambda: None, progress=lambda *_: None)
     return [TURNING if turns and each.what == "stands still" else each for each in problems]
 
 

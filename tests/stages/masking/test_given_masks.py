@@ -99,9 +99,9 @@ def test_cameras_show_whether_black_is_one_thing(tmp_path: Path, draw: Any, surr
     job = job_in(tmp_path, events)
     if draw is wandering and not surroundings:
         with pytest.raises(BadInput, match="no cameras"):
-            photographs.cameras_of_photographs(job, PhotoReader(), lambda *_, **__: None)
+            photographs.cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
         return
-    capture = photographs.cameras_of_photographs(job, PhotoReader(), lambda *_, **__: None)
+    capture = photographs.cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
     assert any("keep what is black" in event.get("text", "") for event in events) == (draw is drawn)
     for index, photo in enumerate(capture.photos):
         assert photo.mask is not None

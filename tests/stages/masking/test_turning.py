@@ -42,7 +42,7 @@ def turntable(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Came
 
 
 def found_in(paths: dict[str, Path], work: Path) -> dict[str, Path]:
-    return masks_of_turning_subject(paths, work, PhotoReader(), safe_point=lambda: None, progress=lambda *_: None)
+    return masks_of_turning_subject(paths, work, PhotoReader(work / "photographs"), safe_point=lambda: None, progress=lambda *_: None)
 
 
 def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
@@ -69,14 +69,14 @@ def test_what_moves_or_has_no_texture_is_no_standing_background(turntable: tuple
     plain = [turntables.picture(camera, number, wall=np.full((240, 320, 3), 200.0)) for number, camera in enumerate(cameras)]
     few = dict(list({path.name: path for path in sorted(turntable[0].iterdir())}.items())[:7])
     for name, paths in (("moving", written(tmp_path / "moving", moving)), ("plain", written(tmp_path / "plain", plain)), ("few", few)):
-        assert not border_stands_still(paths, PhotoReader(), lambda: None), name
+        assert not border_stands_still(paths, PhotoReader(tmp_path / "photographs"), lambda: None), name
         assert not found_in(paths, tmp_path / f"{name} masks"), name
 
 
 def test_nothing_is_left_out_where_nothing_moves_or_all_inside_a_frame_does(tmp_path: Path) -> None:
     camera = turntables.cameras(1)[0]
     same = written(tmp_path / "same", [turntables.picture(camera, number) for number in range(9)])
-    assert border_stands_still(same, PhotoReader(), lambda: None)
+    assert border_stands_still(same, PhotoReader(tmp_path / "photographs"), lambda: None)
     assert not found_in(same, tmp_path / "same masks")
     rng = np.random.default_rng(0)
     frame = turntables.wall_picture()

@@ -136,7 +136,7 @@ def test_a_missing_file_package_or_second_network_is_a_usage_error(tmp_path: Pat
         given_networks(other, path)
     job = Job(settings=PosesSettings(features_model=path), out=tmp_path / "out", work=tmp_path / "work", source=STILL_LIFE)
     with pytest.raises(UsageError):  # before cameras are looked for
-        cameras_of_photographs(job, PhotoReader(), lambda *_, **__: None)
+        cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[rembg\]'"):
         given_networks(path, other)
