@@ -152,7 +152,7 @@ def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: 
         return None, str(error)
     details, file = photo.details, f"{index:05d}.png"
     _link(photo.image, work / "images" / file)
-    mask, remark = photo.opaque and read_png(photo.opaque) > 0, ""
+    mask, remark = None if photo.opaque is None else read_png(photo.opaque) > 0, ""
     if (mask_path := masks.get(name)) is None:
         mask = None if name in masks else mask
     else:
