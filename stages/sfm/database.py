@@ -46,24 +46,19 @@ def remove_database(path: Path) -> None:
         remove(Path(str(path) + suffix))
 
 
-def open_database(work: Path, images: Sequence[WorkImage], warn: Warn) -> bool:
-    """Make a database of exactly `images`, each with its camera, and with the features and matches of an earlier call that are as they were written.
-
-    returns  whether any are
-    """
+def open_database(work: Path, images: Sequence[WorkImage], warn: Warn) -> None:
+    """Make a database of exactly `images`, each with its camera, and with the features and matches of an earlier call that are as they were written."""
     aside = work / "database.part"
     remove_database(aside)
     # The database appears by rename: a kill while the images are being listed leaves none.
     _list_images(aside, work, images)
-    kept = False
     with contextlib.closing(sqlite3.connect(aside)) as fresh:
         if database_path(work).exists():
-            kept = _copy_rows(work, fresh, images, once(warn))
+            _copy_rows(work, fresh, images, once(warn))
         fresh.commit()
         fresh.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     remove_database(database_path(work))
     rename(aside, database_path(work))
-    return kept
 
 
 def _list_images(aside: Path, work: Path, images: Sequence[WorkImage]) -> None:
@@ -200,9 +195,8 @@ def _digest(rows: Sequence[Row]) -> str:
     return digest.hexdigest()
 
 
-def _copy_rows(work: Path, fresh: sqlite3.Connection, images: Sequence[WorkImage], warn: Warn) -> bool:
-    """Copy the rows of the database of an earlier call that are as noted; whether there are any."""
-    kept = False
+def _copy_rows(work: Path, fresh: sqlite3.Connection, images: Sequence[WorkImage], warn: Warn) -> None:
+    """Copy the rows of the database of an earlier call that are as noted."""
     try:
         opened(database_path(work)).close()
         with contextlib.closing(sqlite3.connect(database_path(work))) as old:
@@ -212,14 +206,12 @@ def _copy_rows(work: Path, fresh: sqlite3.Connection, images: Sequence[WorkImage
             for key, rows in _noted_rows(work, old, "features_*.json", FEATURES, warn):
                 features[key] = _check_features(key, rows, len(images))
                 _insert(fresh, FEATURES, rows)
-                kept = True
             counts = dict(fresh.execute("SELECT image_id, rows FROM keypoints"))
             for key, rows in _noted_rows(work, old, "pairs_*.json", PAIRS, warn):
                 _check_pair(key, rows, counts)
                 _insert(fresh, PAIRS, rows)
     except (sqlite3.Error, OSError, ValueError, TypeError, KeyError) as error:
         warn(unusable(database_path(work), error))
-    return kept
 
 
 def _definition(connection: sqlite3.Connection, table: str) -> list[tuple[str, str]]:
