@@ -14,8 +14,8 @@ from typing import Any
 from efficientnerf.geometry.cameras import Similarity
 from pipeline.files import SafePoint
 from stages.sfm import mapping, matches, merging, pairs
-from stages.sfm.database import FEATURES, PAIRS, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, neighbours, pair_id_of
-from stages.sfm.images import Progress, WorkImage
+from stages.sfm.database import FEATURES, PAIRS, WorkImage, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, neighbours, pair_id_of
+from stages.sfm.images import Progress
 from stages.sfm.intrinsics import zoom
 from stages.sfm.learned.matches import add_matches, pairs_of
 from stages.verdict.verdict import DOUBTFUL

@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from pipeline.errors import StageFailed
 from pipeline.files import remove, rename
 from stages.scratch import Warn, note, noted, once, opened, unusable
 from stages.sfm.colmap import import_pycolmap, quiet_pycolmap
-from stages.sfm.images import WorkImage, images_of
 
 # Tables of which a row each belongs to an image, or to a pair of them, and the column that names it.
 FEATURES = ("keypoints", "image_id"), ("descriptors", "image_id")
@@ -35,6 +34,36 @@ OVERLAPPING = 30  # verified matches, from which two photographs count as overla
 HOMOGRAPHIES = (4, 5, 6)  # of COLMAP's two-view geometries: planar, panoramic, either of them
 
 Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class WorkImage:
+    """The copy of one photograph after EXIF rotation.
+
+    name            of the photograph
+    file            of the copy: numbers in sorted order of name
+    width, height   of the photograph after EXIF rotation, pixels
+    work_width, work_height  of the copy
+    focal           pixels of the photograph, from its EXIF data, or None
+    camera_key      photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
+    fisheye         whether it was taken through a fisheye lens
+    """
+
+    name: str
+    file: str
+    width: int
+    height: int
+    work_width: int
+    work_height: int
+    focal: float | None
+    camera_key: str
+    fisheye: bool = False
+
+
+def images_of(work: Path) -> Path:
+    """The folder of the copies; for a step's own scratch folder, that of its parent."""
+    here = work / "images"
+    return here if here.is_dir() else work.parent / "images"
 
 
 def database_path(work: Path) -> Path:

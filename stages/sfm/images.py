@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TypedDict, Unpack
 
@@ -20,6 +19,7 @@ from stages.io.pictures import UnreadableImage
 from stages.io.png import FAST, read_png, write_png
 from stages.io.reader import PhotoReader
 from stages.scratch import opened
+from stages.sfm.database import WorkImage
 
 LAYOUT = 6  # of the work folder; raise it when what is written there changes meaning
 
@@ -36,30 +36,6 @@ class Callables(TypedDict):
 
 Masks = Mapping[str, Path | None]  # file of the mask of each photograph that has one; None: what is transparent is used, too
 WHOLE = "whole"  # in the place of the digest of a mask
-
-
-@dataclass(frozen=True)
-class WorkImage:
-    """The copy of one photograph after EXIF rotation.
-
-    name            of the photograph
-    file            of the copy: numbers in sorted order of name
-    width, height   of the photograph after EXIF rotation, pixels
-    work_width, work_height  of the copy
-    focal           pixels of the photograph, from its EXIF data, or None
-    camera_key      photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
-    fisheye         whether it was taken through a fisheye lens
-    """
-
-    name: str
-    file: str
-    width: int
-    height: int
-    work_width: int
-    work_height: int
-    focal: float | None
-    camera_key: str
-    fisheye: bool = False
 
 
 def _sha256(path: Path) -> str:
@@ -136,12 +112,6 @@ def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> 
         mask = masks.get(name)
         rows.append([name, _sha256(paths[name]), _sha256(mask) if mask is not None else WHOLE if name in masks else None])
     return rows
-
-
-def images_of(work: Path) -> Path:
-    """The folder of the copies; for a step's own scratch folder, that of its parent."""
-    here = work / "images"
-    return here if here.is_dir() else work.parent / "images"
 
 
 def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: str, work: Path, reader: PhotoReader) -> tuple[WorkImage | None, str]:

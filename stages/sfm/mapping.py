@@ -16,8 +16,8 @@ from efficientnerf.capture.moving_parts import moving_parts
 from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
 from pipeline.files import SafePoint, remove
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
-from stages.sfm.database import database_path, inlier_counts
-from stages.sfm.images import Progress, WorkImage, images_of
+from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts
+from stages.sfm.images import Progress
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras

@@ -13,8 +13,8 @@ from stages.cores import count_cores
 from stages.io.png import FAST, write_png
 from stages.sfm import feature_cache, pair_workers, pairs
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, database_path, inlier_counts, neighbours, pair_id_of, record
-from stages.sfm.images import Progress, WorkImage, images_of
+from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, images_of, inlier_counts, neighbours, pair_id_of, record
+from stages.sfm.images import Progress
 from stages.sfm.pairs import Pair, aggregated, in_blocks, likeness_of, ordered
 
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md

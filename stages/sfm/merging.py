@@ -17,8 +17,7 @@ from efficientnerf.geometry.cameras import Similarity, closest_similarity, rays
 from pipeline.files import SafePoint, remove
 from stages.sfm import mapping
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
-from stages.sfm.database import database_path, inlier_counts
-from stages.sfm.images import WorkImage, images_of
+from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts
 
 LEAST, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
 TOLERANCE = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart

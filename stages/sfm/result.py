@@ -13,13 +13,14 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
 from pipeline.files import write_json
+from stages.formats.importers.source import abbreviated
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import mapping
 from stages.sfm.attempts import CROPPED as OWN_PRINCIPAL_POINT
 from stages.sfm.attempts import EACH, Search
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import database_path, inlier_counts, neighbours, planar_share
-from stages.sfm.images import Masks, WorkImage
+from stages.sfm.database import WorkImage, database_path, inlier_counts, neighbours, planar_share
+from stages.sfm.images import Masks
 from stages.sfm.pairs import components
 from stages.verdict.looks import look_at_all
 from stages.verdict.parallax import parallax
@@ -53,7 +54,8 @@ def capture_of(search: Search, model: Any, paths: Mapping[str, Path], masks: Mas
     }
     warnings = _model_warnings(photos, points, agreement, [source.focal for source in sources])
     if rejected:
-        warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} not registered: {abbreviated([name for name, _ in rejected])}.")
+        which = abbreviated([name for name, _ in rejected], MAX_NAMES)
+        warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} not registered: {which}.")
     return Capture(
         kind="photographs",
         photos=photos,
@@ -84,7 +86,7 @@ def too_few(folder: Path, images: Sequence[WorkImage], unreadable: Rejected) -> 
     """The error where fewer photographs can be read than a model has at least."""
     return BadInput(
         f"{folder}: {len(images)} readable photographs; at least {mapping.MIN_MODEL_SIZE} are needed, and 20 or more all round a subject are better."
-        + (f" Unreadable: {abbreviated([name for name, _ in unreadable])}." if unreadable else "")
+        + (f" Unreadable: {abbreviated([name for name, _ in unreadable], MAX_NAMES)}." if unreadable else "")
     )
 
 
@@ -102,13 +104,9 @@ def not_found(folder: Path, paths: Mapping[str, Path], search: Search, rejected:
     write_json(search.base / VERDICT, {"source": str(folder), **verdict.document()})
     also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")
     return BadInput(
-        f"{folder}: {what} Not registered: {abbreviated(list(worst))} ({next(iter(worst.values()), 'no model')}).{also and ' '}{also}"
+        f"{folder}: {what} Not registered: {abbreviated(list(worst), MAX_NAMES)} ({next(iter(worst.values()), 'no model')}).{also and ' '}{also}"
         f" Try {'; '.join(hints)}. Of each photograph: {search.base / VERDICT}"
     )
-
-
-def abbreviated(names: Sequence[str]) -> str:
-    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
 
 
 def unregistered(search: Search) -> list[tuple[str, str]]:

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from stages.sfm import feature_cache, matches
-from stages.sfm.database import FEATURES, database_path, open_database, rows_of
-from stages.sfm.images import WorkImage, prepare_images
+from stages.sfm.database import FEATURES, WorkImage, database_path, open_database, rows_of
+from stages.sfm.images import prepare_images
 
 QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
 

@@ -14,7 +14,8 @@ from benchmarks.scenes import room as rooms
 from efficientnerf.geometry.cameras import Camera, rays
 from stages.io.photo import read_photo
 from stages.sfm.cameras import find_cameras
-from stages.sfm.images import WorkImage, prepare_images
+from stages.sfm.database import WorkImage
+from stages.sfm.images import prepare_images
 
 WIDTH, HEIGHT = 400, 300
 LENS = (132.0, 132.4, 200.0, 150.0, 0.03, -0.008, 0.002, -0.0005)  # 174 degrees from left to right

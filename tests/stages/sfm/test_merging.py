@@ -14,8 +14,7 @@ from efficientnerf.geometry.cameras import Similarity
 from stages.sfm import attempts, mapping, matches, merging
 from stages.sfm.attempts import Search
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import PAIRS, forget, pair_id_of
-from stages.sfm.images import WorkImage
+from stages.sfm.database import PAIRS, WorkImage, forget, pair_id_of
 from stages.sfm.merging import Sights
 from stages.sfm.reconstruction import find_models
 from tests.stages.sfm.made_matches import COUNT, QUIET, cameras, matched, off, registered

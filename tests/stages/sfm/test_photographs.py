@@ -21,8 +21,8 @@ from stages.io.capture import Capture
 from stages.sfm import mapping, matches, pair_workers, pairs
 from stages.sfm.cameras import find_cameras
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, database_path, open_database, record
-from stages.sfm.images import WorkImage, prepare_images
+from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, open_database, record
+from stages.sfm.images import prepare_images
 from stages.sfm.pairs import all_pairs
 from stages.sfm.reconstruction import Request, reconstruct
 from tests.stages.spoilers import SPOILERS

@@ -13,8 +13,7 @@ import pytest
 from stages.sfm import attempts, mapping
 from stages.sfm.attempts import Search
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, copy_with_own_cameras, database_path
-from stages.sfm.images import WorkImage
+from stages.sfm.database import FEATURES, PAIRS, WorkImage, copy_with_own_cameras, database_path
 from stages.sfm.intrinsics import zoom
 from stages.sfm.reconstruction import find_models
 from stages.verdict.verdict import DOUBTFUL

@@ -15,7 +15,7 @@ from pipeline.errors import BadInput
 from stages.sfm import attempts, mapping, matches, merging, pairs
 from stages.sfm.attempts import Search
 from stages.sfm.cameras import find_cameras
-from stages.sfm.images import WorkImage
+from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics import zoom
 from stages.sfm.reconstruction import find_models
 
