@@ -46,9 +46,9 @@ class Search:
     threads   on which features are detected, and processes in which pairs are matched
     networks  files of a detector and a matcher, for photographs that are left without a camera
     place     the scratch folder whose matches are used: `base`, or one in it
-    models, rung, work  of the best attempt: its sub-models, its name, and the scratch folder whose database they are of
+    models, best, work  of the best attempt: its sub-models, its name, and the scratch folder whose database they are of
     agreement share of the matches that agrees with it
-    rungs     what was tried: its name, the number of photographs that had a camera then, and the share of matches that agreed
+    tried     all attempts: the name, the number of photographs that had a camera then, and the share of matches that agreed
     others    sub-models of the mapper's first run that are not merged
     own       sub-models with a camera for each photograph, once they were looked for
     """
@@ -62,9 +62,9 @@ class Search:
     safe_point: SafePoint
     networks: tuple[Path, Path] | None = None
     models: Models = field(default_factory=list)
-    rung: str = ""
+    best: str = ""
     agreement: float = 0.0
-    rungs: list[dict[str, object]] = field(default_factory=list)
+    tried: list[dict[str, object]] = field(default_factory=list)
     others: Models = field(default_factory=list)
     own: Models | None = None
     _score: float = 0.0
@@ -73,15 +73,15 @@ class Search:
         self.place = self.work = self.base
         self.quiet: dict[str, Any] = {"progress": self.progress, "safe_point": self.safe_point}
 
-    def keep(self, rung: str, models: Models, *, least: float = 0.0, better: float = BETTER) -> None:
+    def keep(self, name: str, models: Models, *, least: float = 0.0, better: float = BETTER) -> None:
         """Keep an attempt's result where its score, the number of photographs with a camera times the share of the matches that agree, is `better` times
         the best, and at least the share `least` agrees."""
         agreement, count = mapping.match_agreement(self.place, models[0]) if models else 0.0, mapping.num_registered(models)
-        self.rungs.append({"rung": rung, "registered": count, "agreeing": round(agreement, 4)})
+        self.tried.append({"rung": name, "registered": count, "agreeing": round(agreement, 4)})
         if count * agreement > better * self._score and agreement >= least:
             self._score, self.agreement = count * agreement, agreement
-            self.models, self.rung, self.work = models, rung, self.place
-            if rung == MERGED:
+            self.models, self.best, self.work = models, name, self.place
+            if name == MERGED:
                 self.others = models[1:]
 
     def begin(self, options: mapping.Options) -> Models:
@@ -89,8 +89,9 @@ class Search:
         return mapping.sub_models(self.place, self.images, self.seed, options, **self.quiet)
 
     def go_on(self, model: Any = None) -> Models:
-        """The mapper's sub-models from a model, the best without one, with fewer matches to a photograph."""
-        return mapping.continued(self.place, self.images, model or self.models[0], self.seed, **self.quiet)
+        """The mapper's sub-models from a model, else the best, else from the beginning; with fewer matches to a photograph."""
+        model = next(iter(self.models), None) if model is None else model
+        return self.begin(mapping.RELAXED) if model is None else mapping.continued(self.place, self.images, model, self.seed, **self.quiet)
 
     @property
     def missing(self) -> list[int]:
@@ -106,12 +107,12 @@ class Search:
     def enough(self) -> bool:
         return mapping.num_registered(self.models) >= ENOUGH * len(self.images) and self.agreement >= AGREEING
 
-    def was_last(self, rung: str) -> bool:
-        return self.rungs[-1]["rung"] == rung
+    def was_last(self, name: str) -> bool:
+        return self.tried[-1]["rung"] == name
 
     def begun_anew(self) -> bool:
         """Whether the mapper has begun anew from these matches."""
-        return self.place == self.base and any(rung["rung"] == BEGIN_ANEW for rung in self.rungs)
+        return self.place == self.base and any(attempt["rung"] == BEGIN_ANEW for attempt in self.tried)
 
 
 @dataclass(frozen=True)
@@ -151,14 +152,14 @@ def match_more(search: Search) -> Models:
     """Photographs without a camera are matched with more of the others, and along the geometry of the first matches."""
     search.place = _with_database_of(search.base, search.base / MATCHED_AGAIN)
     match_again(search, "wider_")
-    return search.go_on() if search.models else search.begin(mapping.RELAXED)
+    return search.go_on()
 
 
 def detect_more(search: Search) -> Models:
     """More features, of less contrast, in the place of those of photographs without a camera, which are matched again."""
     find_features_again(search)
     match_again(search, "more_")
-    return search.go_on() if search.models else search.begin(mapping.RELAXED)
+    return search.go_on()
 
 
 def _with_database_of(work: Path, place: Path) -> Path:
@@ -216,7 +217,7 @@ def cropped(search: Search) -> bool:
     """Whether single photographs of one lens would have another principal point; of fisheye lenses none are looked for."""
     lenses = {(image.focal, round(image.work_width / image.width, 2)) for image in search.images}  # or reduced by different factors
     of_one = len(lenses) == 1 and not any(image.fisheye for image in search.images)
-    return bool(search.models) and search.rung != EACH and of_one and zoom.principal_point_spread(search.models[0]) > APART
+    return bool(search.models) and search.best != EACH and of_one and zoom.principal_point_spread(search.models[0]) > APART
 
 
 def with_own_cameras(search: Search) -> Models:

@@ -28,7 +28,12 @@ from stages.sfm.mapping import DEFAULTS, FORWARD, RELAXED
 from stages.sfm.pairs import matching_for
 from stages.verdict.verdict import MOVING, OWN_INTRINSICS
 
-# After the mapper's first run, in order. A result is kept where it is better than those before it.
+# What is tried after the mapper's first run, in order, where its condition holds; a result is kept where it is better than those before it.
+#
+#     sub-models are merged where the points that they share fit; the mapper goes on with fewer matches to a photograph, or begins anew from another pair
+#     photographs without a camera are matched again, with more of the others and along the first geometry; then with more features, of less contrast
+#     they are matched by networks, where the user has given them
+#     each photograph gets a focal length or a principal point of its own, where single photographs would have another, as zoomed or cropped ones have
 ATTEMPTS = (
     Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.KEPT),
     Attempt("fewer matches", lambda s: s.models and s.missing, lambda s: s.go_on()),
@@ -98,9 +103,9 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
 
     # Bundle adjustment with a robust loss; then intrinsics for each photograph, where they explain what they were not fitted to.
     model = search.models[0]
-    if search.rung != CROPPED:
+    if search.best != CROPPED:
         model = mapping.bundle_adjusted(search.work, images, model, safe_point)
-    if search.rung not in (EACH, CROPPED):
+    if search.best not in (EACH, CROPPED):
         model, facts[OWN_INTRINSICS] = with_own_intrinsics(images, model, safe_point)
 
     if moving := mapping.moving_shares(search.work, images, model, safe_point):

@@ -76,9 +76,9 @@ def facts_of_matching(search: Search, matching: str) -> dict[str, object]:
         "matching": matching,
         "components": [len(part) for part in components(neighbours(search.work, len(search.images)))],
         "models": [len(part) for part in parts if part is parts[0] or part - parts[0]],
-        "rungs": search.rungs,
+        "rungs": search.tried,
         "planar_pairs": planar_share(database_path(search.work)),
-        **({LENS: OWN_LENSES[search.rung]} if search.rung in OWN_LENSES else {}),
+        **({LENS: OWN_LENSES[search.best]} if search.best in OWN_LENSES else {}),
     }
 
 

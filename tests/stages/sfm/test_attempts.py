@@ -27,7 +27,7 @@ IMAGES = [WorkImage(f"{k}.jpg", f"{k:05d}.png", 64, 48, 64, 48, None, "a") for k
 
 
 class Rig:
-    """Stands for COLMAP: each rung registers as many photographs, with such a share of matches that agrees."""
+    """Stands for COLMAP: each attempt registers as many photographs, with such a share of matches that agrees."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, outcomes: dict[str, tuple[int, float]]) -> None:
         self.outcomes, self.tried, self.weak = outcomes, list[str](), list[list[int]]()
@@ -82,16 +82,16 @@ def test_nothing_more_is_tried_where_every_photograph_has_a_camera(monkeypatch: 
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.95)})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive"]
-    assert found.rungs == [{"rung": "exhaustive", "registered": 20, "agreeing": 0.95}]
+    assert found.tried == [{"rung": "exhaustive", "registered": 20, "agreeing": 0.95}]
     assert found.work == tmp_path
     assert not (tmp_path / "rungs").exists()
 
 
-def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_attempts_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", "fewer matches", *ANEW, "wider matching", "more features", attempts.EACH]
-    assert [rung["registered"] for rung in found.rungs] == [8, 9, 0, 0, 11, 19, 0]
+    assert [rung["registered"] for rung in found.tried] == [8, 9, 0, 0, 11, 19, 0]
     assert rig.weak == [list(range(9, 20)), list(range(11, 20)), list(range(11, 20))]
     assert (found.models[0].rung, found.work) == ("more features", tmp_path / "rungs")
 
@@ -100,7 +100,7 @@ def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypat
     rig = Rig(monkeypatch, {"exhaustive": (12, 0.95), "more features": (20, 0.4), "another beginning": (14, 0.9)})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles", attempts.EACH]
-    assert found.models[0].rung == found.rung == "another beginning"
+    assert found.models[0].rung == found.best == "another beginning"
 
 
 @pytest.mark.parametrize(("each", "kept"), [((20, 0.97), True), ((20, 0.92), False), ((10, 0.99), False)])
@@ -110,8 +110,8 @@ def test_own_focal_lengths_are_kept_where_they_explain_disagreement(
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), attempts.EACH: each})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", attempts.EACH]
-    assert found.rungs[-1] == {"rung": attempts.EACH, "registered": each[0], "agreeing": each[1]}
-    assert (found.rung, found.work) == ((attempts.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
+    assert found.tried[-1] == {"rung": attempts.EACH, "registered": each[0], "agreeing": each[1]}
+    assert (found.best, found.work) == ((attempts.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
 
 
 def test_a_way_straight_ahead_begins_with_small_angles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -119,19 +119,19 @@ def test_a_way_straight_ahead_begins_with_small_angles(monkeypatch: pytest.Monke
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", *ANEW]
     assert rig.weak == []
-    assert (found.rung, found.work) == ("small angles", tmp_path)
+    assert (found.best, found.work) == ("small angles", tmp_path)
     again = Rig(monkeypatch, {"exhaustive": (9, 0.5), "wider matching": (20, 0.7)})
     found = climbed(again, tmp_path)
-    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", "fewer matches", *ANEW, "wider matching", *ANEW, attempts.EACH]
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", "fewer matches", *ANEW, "wider matching", *ANEW, attempts.EACH]
 
 
 def test_focal_lengths_that_differ_are_looked_at_though_the_matches_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.EACH: (20, 0.999)})
-    assert climbed(rig, tmp_path).rung == "exhaustive"
+    assert climbed(rig, tmp_path).best == "exhaustive"
     rig.spread = 1.2
-    assert climbed(rig, tmp_path).rung == attempts.EACH
+    assert climbed(rig, tmp_path).best == attempts.EACH
     rig.outcomes[attempts.EACH] = (20, 0.984)  # not worth so many more parameters
-    assert climbed(rig, tmp_path).rung == "exhaustive"
+    assert climbed(rig, tmp_path).best == "exhaustive"
 
 
 @pytest.mark.parametrize(("cropped", "kept"), [((20, 0.979), True), ((20, 0.96), False), ((19, 0.98), False)])
@@ -139,8 +139,8 @@ def test_own_principal_points_are_kept_where_points_lie_closer(monkeypatch: pyte
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.EACH: (20, 0.98), attempts.CROPPED: cropped})
     rig.apart = 0.01
     found = climbed(rig, tmp_path)
-    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", attempts.CROPPED]
-    assert found.rung == (attempts.CROPPED if kept else "exhaustive")
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.CROPPED]
+    assert found.best == (attempts.CROPPED if kept else "exhaustive")
 
 
 @pytest.mark.parametrize(
@@ -158,9 +158,9 @@ def test_networks_come_last_and_for_photographs_without_a_camera_alone(
     monkeypatch.setattr(attempts, "add_matches", lambda place, images, wanted, networks, **k: compared.append(wanted))
     monkeypatch.setattr(merging, "triangulated", lambda place, images, models, *a, **k: models[0])
     found = find_models(Search(tmp_path, IMAGES, 0, 100, 1, networks=(tmp_path / "a", tmp_path / "b"), **QUIET), "exhaustive")
-    rungs = [rung["rung"] for rung in found.rungs]
+    rungs = [rung["rung"] for rung in found.tried]
     assert [rung for rung in rungs if "network" in str(rung)] == tried
-    assert [rung for rung in found.rungs if rung["rung"] not in tried] == without.rungs
+    assert [rung for rung in found.tried if rung["rung"] not in tried] == without.tried
     assert (tmp_path / "networks").exists() == bool(tried)
     weak = set(range(registered, 20))
     assert compared == ([[(i, j) for i, j in sorted(pairs.all_pairs(20)) if {i, j} & weak]] if tried else [])

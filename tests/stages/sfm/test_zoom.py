@@ -35,10 +35,10 @@ def test_a_zoom_that_changed_gives_each_photograph_its_focal_length(tmp_path: Pa
     taken = cameras(ZOOMED)
     images = matched(tmp_path, taken)
     found = found_for(tmp_path, images)
-    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", attempts.EACH]
-    one, each = (float(rung["agreeing"]) for rung in found.rungs)  # type: ignore[arg-type]
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.EACH]
+    one, each = (float(rung["agreeing"]) for rung in found.tried)  # type: ignore[arg-type]
     assert one < DOUBTFUL < 0.98 < each
-    assert (found.rung, found.work) == (attempts.EACH, tmp_path / "own_cameras")
+    assert (found.best, found.work) == (attempts.EACH, tmp_path / "own_cameras")
     model = found.models[0]
     assert [image.name for image in registered(model)] == [image.file for image in images]
     assert [model.cameras[image.camera_id].focal_length for image in registered(model)] == pytest.approx(ZOOMED, rel=0.01)
@@ -57,7 +57,7 @@ def test_two_zooms_are_told_where_the_matches_agree_with_one(tmp_path: Path) -> 
     assert off(shared, taken) > 0.05
     assert zoom.focal_length_spread(shared) > attempts.SPREAD
     found = found_for(tmp_path, images)
-    assert found.rung == attempts.EACH
+    assert found.best == attempts.EACH
     assert zoom.focal_length_spread(found.models[0]) < 1.01
     assert off(found.models[0], taken) < 0.01
 
@@ -69,7 +69,7 @@ def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
     assert zoom.principal_point_spread(shared) > attempts.APART
     found = found_for(tmp_path, images)
-    assert found.rung == attempts.CROPPED
+    assert found.best == attempts.CROPPED
     model = found.models[0]
     lens = np.array([model.cameras[image.camera_id].params for image in registered(model)])
     assert np.ptp(lens[:, [0, 3]], axis=0).max() == 0.0
