@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.geometry.cameras import pose_from_opengl
-from stages.sfm.reconstruction import find_cameras
+from stages.sfm.cameras import find_cameras
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -69,6 +69,16 @@ def noted(path: Path, kind: type[T], warn: Warn, check: Callable[[T, Collection[
     return None
 
 
+def same_as(expected: T) -> Callable[[T, Collection[str]], None]:
+    """A check that a note's value is this one."""
+
+    def check(found: T, names: Collection[str]) -> None:
+        if found != expected:
+            raise ValueError("it was made of something else")
+
+    return check
+
+
 def unusable(path: Path, reason: object) -> str:
     """The warning about a piece of scratch that does not count."""
     return f"{path.name} of an earlier attempt can't be used ({printable(reason, 200)}); what it stands for is made again"

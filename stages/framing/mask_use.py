@@ -21,7 +21,7 @@ from stages.framing import scene_bounds
 from stages.framing.training_frame import focus_point
 from stages.io.capture import Capture, Photo, Silhouettes
 from stages.io.pictures import UnreadableImage, read_header
-from stages.io.silhouettes import SmallPictures
+from stages.io.reader import PhotoReader
 
 # docs/experiments/silhouettes.md
 MIN_AGREEING = 0.9  # of the photographs, that keep one compact object
@@ -60,7 +60,7 @@ class MaskUse:
         return {kind: {"use": "silhouette" if use[kind] else "ignore", "because": why} for kind, why in self.reasons.items()}
 
 
-def find_mask_use(capture: Capture, choice: str, renders: bool, small: SmallPictures, safe_point: Callable[[], None] = lambda: None) -> MaskUse:
+def find_mask_use(capture: Capture, choice: str, renders: bool, reader: PhotoReader, safe_point: Callable[[], None] = lambda: None) -> MaskUse:
     """Decide what masks and alpha channels mean.
 
     choice   the setting: "auto", "silhouette" or "ignore"
@@ -75,7 +75,7 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, small: SmallPict
         return MaskUse(Silhouettes(wanted and (there["alpha"] > 0 or not there["masks"]), wanted and there["masks"] > 0), reasons)
     use, reasons, doubtful = {"alpha": False, "masks": False}, {}, []
     if there["alpha"]:
-        pictures = _pictures(photos, small.alpha, safe_point)
+        pictures = _pictures(photos, reader.alpha, safe_point)
         if any(picture is not None and (picture < 255).any() for _, picture in pictures):
             rendered = renders and there["alpha"] == len(photos)
             use["alpha"], reasons["alpha"], names = _of_renders(pictures) if rendered else _of_photographs(capture, pictures)
@@ -84,7 +84,7 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, small: SmallPict
         if all(photo.mask_ignore == "white" for photo in photos if photo.mask is not None):
             reasons["masks"] = "they mark what moves"
         else:
-            use["masks"], reasons["masks"], names = _of_photographs(capture, _pictures(photos, small.mask, safe_point))
+            use["masks"], reasons["masks"], names = _of_photographs(capture, _pictures(photos, reader.mask, safe_point))
             doubtful += names
     return MaskUse(Silhouettes(use["alpha"], use["masks"]), reasons, tuple(dict.fromkeys(doubtful)))
 
@@ -215,10 +215,10 @@ def hull_overlaps(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray]]
     return np.zeros(len(pictures)) if hull is None else overlaps(masks, cameras, *hull)
 
 
-def share_that_fits(capture: Capture, kind: Silhouettes, small: SmallPictures) -> float:
+def share_that_fits(capture: Capture, kind: Silhouettes, reader: PhotoReader) -> float:
     """How many of the capture's silhouettes fit to their visual hull: a test of the cameras by what they were not found from."""
     photos = scene_bounds.chosen_photos(capture.photos)
-    pictures = [(photo, picture >= 128) for photo in photos if (picture := small.mask(photo) if kind.masks else small.alpha(photo)) is not None]
+    pictures = [(photo, picture >= 128) for photo in photos if (picture := reader.mask(photo) if kind.masks else reader.alpha(photo)) is not None]
     return float((hull_overlaps(capture, pictures) >= LEAST_OVERLAP).mean()) if len(pictures) >= MIN_IMAGES else 0.0
 
 
@@ -230,13 +230,13 @@ def _same(masks: Sequence[np.ndarray]) -> bool:
     return bool(stack.all(0).sum() >= SAME * stack.any(0).sum() and stack.mean() > HALF)
 
 
-def points_of_object(capture: Capture, small: SmallPictures) -> np.ndarray:
+def points_of_object(capture: Capture, reader: PhotoReader) -> np.ndarray:
     """(N,) bool: the sparse points that lie in the silhouettes of nearly all photographs that have them in view. Others are background."""
     assert capture.points is not None
     xyz = capture.points.xyz
     views, within = np.zeros(len(xyz), int), np.zeros(len(xyz), int)
     for photo in scene_bounds.chosen_photos(capture.photos):
-        picture = small.silhouette(photo, capture.silhouettes)
+        picture = reader.silhouette(photo, capture.silhouettes)
         if picture is None or not picture.any():
             continue  # an empty one is left out later
         camera = resized(photo.camera, picture.shape[1], picture.shape[0])

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from efficientnerf.geometry.cameras import Camera, Similarity, project, rays, resized
 from stages.io.capture import Capture, Photo, SparsePoints
-from stages.io.silhouettes import SmallPictures
+from stages.io.reader import PhotoReader
 
 MIN_POINTS = 50  # sparse points
 MIN_VIEW_RATIO = 0.65  # views of a point over those of the points with most: below, it is background
@@ -40,13 +40,13 @@ class SceneBounds:
     cut: tuple[str, ...] = ()
 
 
-def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool, small: SmallPictures | None = None) -> SceneBounds:
+def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool, reader: PhotoReader | None = None) -> SceneBounds:
     """The box of a capture, in the turned frame.
 
     turned      the rotation from the capture's frame to one with z up
     focus       what the cameras look at, in the turned frame
     converging  whether their axes meet there
-    small       what alpha channels and masks keep, as far as it was read
+    reader      what alpha channels and masks keep, as far as it was read
     """
     photos = chosen_photos(capture.photos)
     cameras = [turned.camera(photo.camera) for photo in photos]
@@ -54,7 +54,7 @@ def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, c
     bounded = capture.background is not None  # silhouettes are more exact than points, in bounded scenes
     for way in ("silhouettes", "sparse points") if bounded else ("sparse points", "silhouettes"):
         if way == "silhouettes":
-            pictures = [(small or SmallPictures()).silhouette(photo, capture.silhouettes) for photo in photos]
+            pictures = [(reader or PhotoReader()).silhouette(photo, capture.silhouettes) for photo in photos]
             hull = whole_visual_hull(pictures, cameras, ranges, focus, converging)
             if hull is not None:
                 low, high = box_round(*hull)

@@ -18,8 +18,8 @@ from pipeline.errors import BadInput
 from stages.framing import scene_bounds
 from stages.framing.near_planes import content_depths, near_far_planes
 from stages.io.capture import Capture
+from stages.io.reader import PhotoReader
 from stages.io.scene import Orbit
-from stages.io.silhouettes import SmallPictures
 
 UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
 MIN_CONVERGENCE = 0.03  # mean squared sine of the angles between view axes and their mean (10 degrees), below which they do not meet in a point
@@ -49,7 +49,7 @@ class TrainingFrame:
 
 
 def find_training_frame(
-    capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto", small: SmallPictures | None = None
+    capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto", reader: PhotoReader | None = None
 ) -> TrainingFrame:
     """Choose the training frame and the scene bounds.
 
@@ -57,7 +57,7 @@ def find_training_frame(
     box     six numbers in the capture's frame, x y z of one corner and of the opposite one; None: estimated
     margin  added on each side of the bounds of sparse points, as a fraction of their longest side; silhouettes already bound the subject from outside
     space   "auto", "box", "contracted" or "ndc"
-    small   what alpha channels and masks keep, as far as it was read
+    reader  what alpha channels and masks keep, as far as it was read
 
     Raises BadInput for an empty box or an unknown axis, and for ndc where the capture is not forward-facing.
     """
@@ -76,7 +76,7 @@ def find_training_frame(
         low, high, how = corners.min(0), corners.max(0), "given" if box is not None else "stated by the source"
     else:
         turned = Similarity(1.0, turn, np.zeros(3))
-        found = scene_bounds.find_scene_bounds(capture, turned, turned.points(focus), converging, small)
+        found = scene_bounds.find_scene_bounds(capture, turned, turned.points(focus), converging, reader)
         low, high, how, cut = found.low, found.high, found.how, found.cut
         padding = margin * (high - low).max() if how == "sparse points" else 0.0
         low, high = low - padding, high + padding

@@ -20,26 +20,37 @@ _FISHEYE = ("fisheye", "fish-eye", "fish eye")  # in names of lenses; rectilinea
 
 
 @dataclass(frozen=True)
-class DecodedPhoto:
+class PhotoDetails:
+    """What is known of a photograph besides its pixels.
+
+    width, height            of the source after EXIF rotation, pixels
+    work_width, work_height  at working size
+    orientation              EXIF's number, 1 where there is none
+    focal                    pixels of the source, from EXIF, or None
+    maker                    make and model
+    fisheye                  whether EXIF names a fisheye lens
+    """
+
+    width: int
+    height: int
+    work_width: int
+    work_height: int
+    orientation: int
+    focal: float | None
+    maker: str
+    fisheye: bool
+
+
+@dataclass(frozen=True)
+class DecodedPhoto(PhotoDetails):
     """A photograph after EXIF rotation.
 
-    rgb            (h, w, 3) uint8 sRGB at working size
-    opaque         (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
-    width, height  of the source after EXIF rotation, pixels
-    orientation    EXIF's number, 1 where there is none
-    focal          pixels of the source, from EXIF, or None
-    maker          make and model
-    fisheye        whether EXIF names a fisheye lens
+    rgb     (h, w, 3) uint8 sRGB at working size
+    opaque  (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
     """
 
     rgb: np.ndarray
     opaque: np.ndarray | None
-    width: int
-    height: int
-    orientation: int
-    focal: float | None
-    maker: str
-    fisheye: bool = False
 
 
 def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
@@ -73,7 +84,8 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
     opaque = None
     if alpha is not None and (alpha < 128).any():
         opaque = _resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
-    return DecodedPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *taken), maker, names_fisheye(details))
+    size = width, height, rgb.shape[1], rgb.shape[0]
+    return DecodedPhoto(*size, orientation, focal_from_exif(details, *taken), maker, names_fisheye(details), rgb, opaque)
 
 
 def read_alpha(path: Path) -> np.ndarray | None:
@@ -84,17 +96,20 @@ def read_alpha(path: Path) -> np.ndarray | None:
     return None if alpha is None else apply_exif_orientation(alpha, orientation)
 
 
-def read_mask_file(path: Path, photo: DecodedPhoto) -> np.ndarray:
+def read_mask_file(path: Path, photo: PhotoDetails) -> np.ndarray:
     """(h, w) bool at the photograph's working size, True where the mask is not black; raises UnreadableImage."""
     with opened(path) as image:
         mask = apply_exif_orientation(grey_of(image), orientation_of(image))
     mask = upright_mask(mask, photo.orientation, photo.width, photo.height)
     if not same_aspect(mask.shape, (photo.height, photo.width)):
         raise UnreadableImage(f"{path.name} is {mask.shape[1]}x{mask.shape[0]}, the photograph {photo.width}x{photo.height}")
-    height, width = photo.rgb.shape[:2]
-    rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(int)
-    columns = ((np.arange(width) + 0.5) * mask.shape[1] / width).astype(int)
-    return mask[rows][:, columns] > 0
+    return mask_at(mask, (photo.work_width, photo.work_height)) > 0
+
+
+def mask_at(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """The mask (H, W) at a working size (width, height): the pixel at the middle of each."""
+    rows, columns = (((np.arange(side) + 0.5) * own / side).astype(int) for side, own in zip(size[::-1], mask.shape, strict=True))
+    return np.asarray(mask[rows][:, columns])
 
 
 def upright_mask(mask: np.ndarray, orientation: int, width: int, height: int) -> np.ndarray:

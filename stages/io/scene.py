@@ -368,14 +368,7 @@ def _forward_from(document: SceneDocument) -> ForwardFacing | None:
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """A camera as JSON holds it."""
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "model": camera.model,
-        "params": list(camera.params),
-        "world_from_camera": camera.world_from_camera.tolist(),
-    }
+    return {**vars(camera), "params": list(camera.params), "world_from_camera": camera.world_from_camera.tolist()}
 
 
 def camera_from(data: CameraDocument, where: str) -> Camera:

@@ -17,7 +17,7 @@ from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo, Silhouettes
 from stages.io.matting import without_background
-from stages.io.photo import apply_exif_orientation, same_aspect, upright_mask, working_size
+from stages.io.photo import apply_exif_orientation, mask_at, same_aspect, upright_mask, working_size
 from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, profile_of, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
@@ -199,10 +199,7 @@ def mask_levels(photo: Photo, orientation: int) -> tuple[np.ndarray, list[str]]:
 def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.ndarray, list[str]]:
     """(h, w) bool at working size from the photo's mask file, and warnings."""
     mask, lossy, warnings = _read_mask(photo, orientation)
-    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(int)
-    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(int)
-    # Lossy files have no clean zero.
-    marked = mask[rows][:, columns] > (127 if lossy else 0)
+    marked = mask_at(mask, size) > (127 if lossy else 0)  # lossy files have no clean zero
     return marked if photo.mask_ignore == "black" else ~marked, warnings
 
 

@@ -16,9 +16,8 @@ from efficientnerf.geometry.cameras import Camera
 from stages.framing.mask_use import alike
 from stages.framing.scene_bounds import chosen_photos
 from stages.io.capture import Photo, Silhouettes
-from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, read_header
-from stages.io.silhouettes import SMALL, SmallPictures
+from stages.io.reader import SMALL, PhotoReader
 
 MOST_PAIRS = 24  # of photographs that follow each other
 FINE = 4.0  # px at `SMALL`, standard deviation of the blur that separates texture from shading
@@ -26,7 +25,9 @@ STANDING = 0.5  # correlation of the texture of two photographs, from which the 
 LEAST_TEXTURE = 1.0  # of 255, standard deviation
 
 
-def silhouettes_with_surroundings(paths: Mapping[str, Path], masks: Mapping[str, Path], choice: str, safe_point: Callable[[], None]) -> Silhouettes:
+def silhouettes_with_surroundings(
+    paths: Mapping[str, Path], masks: Mapping[str, Path], choice: str, reader: PhotoReader, safe_point: Callable[[], None]
+) -> Silhouettes:
     """Which of masks and alpha channels are silhouettes before a background in which features should be looked for, too; of alpha channels where colours
     were left below what is transparent.
 
@@ -34,23 +35,23 @@ def silhouettes_with_surroundings(paths: Mapping[str, Path], masks: Mapping[str,
     choice        `poses.masks`
     """
     photos = [photo for name in sorted(paths) if (photo := photo_without_camera(name, paths[name], masks.get(name))) is not None]
-    kind, small = Silhouettes(alpha=not masks, masks=bool(masks)), SmallPictures()
-    pictures = [] if choice == "ignore" else [(photo, small.mask(photo) if masks else small.alpha(photo)) for photo in chosen_photos(photos)]
+    kind = Silhouettes(alpha=not masks, masks=bool(masks))
+    pictures = [] if choice == "ignore" else [(photo, reader.mask(photo) if masks else reader.alpha(photo)) for photo in chosen_photos(photos)]
     if all(picture is None for _, picture in pictures) or (choice == "auto" and alike(pictures)[0]):
         return Silhouettes()
-    return Silhouettes() if stands_still(photos, kind, small, safe_point) else kind
+    return Silhouettes() if stands_still(photos, kind, reader, safe_point) else kind
 
 
-def stands_still(photos: Sequence[Photo], kind: Silhouettes, small: SmallPictures, safe_point: Callable[[], None]) -> bool:
+def stands_still(photos: Sequence[Photo], kind: Silhouettes, reader: PhotoReader, safe_point: Callable[[], None]) -> bool:
     """Whether what lies outside of the silhouettes is the same in photographs that follow each other, or has no texture at all."""
     found: list[float] = []
     for index in range(0, len(photos) - 1, -(-len(photos) // MOST_PAIRS)):
         safe_point()
         pair = []
         for photo in photos[index : index + 2]:
-            mask = small.mask(photo) if kind.masks else small.alpha(photo)
+            mask = reader.mask(photo) if kind.masks else reader.alpha(photo)
             try:
-                grey = read_photo(photo.image, SMALL).rgb.astype(np.float32).mean(2)
+                grey = reader.photo(photo.image, SMALL).rgb().astype(np.float32).mean(2)
             except UnreadableImage:
                 continue
             if mask is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from efficientnerf.capture.keying import key_of, keyed
 from pipeline.errors import BadInput
-from stages.io.photo import read_photo
+from stages.io.photo import DecodedPhoto, read_photo
 from stages.io.pictures import UnreadableImage
 from stages.io.png import write_png
 from stages.masking.network import MaskNetwork
@@ -20,6 +21,7 @@ from stages.masking.static import SIDE, StillBackground, sharpened
 STATIC = "static"
 MASK_SIDE = 2048  # px, longest side of the photographs that masks are made from
 Warn = Callable[..., Any]
+Make = Callable[[DecodedPhoto, Path], np.ndarray | None]  # the mask of a photograph, by its pixels and its file; None where it has none
 
 
 def made_masks(
@@ -44,7 +46,7 @@ def masks_by_network(
 
 def _all_made(
     paths: Mapping[str, Path],
-    make: Callable[[Path, Path], bool],
+    make: Make,
     folder: Path,
     option: str,
     what: str,
@@ -53,23 +55,21 @@ def _all_made(
     progress: Callable[[int, int, str], None],
     warn: Warn,
 ) -> dict[str, Path]:
-    """
-    make  writes the mask of a photograph to a file; whether it has one
-    """
     names = sorted(paths)
     folder.mkdir(parents=True, exist_ok=True)
     found, without = {}, []
     for number, name in enumerate(names):
         safe_point()
         progress(number, len(names), "masks")
-        target = folder / f"{number:05d}.png"
         try:
-            if make(paths[name], target):
-                found[name] = target
-            else:
-                without.append(name)
+            photo = read_photo(paths[name], MASK_SIDE)
         except UnreadableImage:
             continue  # reported where it is read
+        if (mask := make(photo, paths[name])) is None:
+            without.append(name)
+        else:
+            found[name] = folder / f"{number:05d}.png"
+            write_mask(mask, (photo.width, photo.height), found[name])
     if not found:
         article = "such a background" if what == "such background" else f"a {what}"
         raise BadInput(f"{option}: no photograph shows {article}. Choose another, or leave {option.split()[0]} away.")
@@ -78,59 +78,36 @@ def _all_made(
     return found
 
 
-def _by_network(model: Path) -> Callable[[Path, Path], bool]:
+def _by_network(model: Path) -> Make:
     network = MaskNetwork(model)
 
-    def make(photograph: Path, target: Path) -> bool:
-        photo = _read(photograph, MASK_SIDE)
+    def make(photo: DecodedPhoto, path: Path) -> np.ndarray | None:
         mask = network.mask(photo.rgb)
-        if mask is not None:
-            write_mask(sharpened(mask, photo.rgb), (photo.width, photo.height), target)
-        return mask is not None
+        return None if mask is None else sharpened(mask, photo.rgb)
 
     return make
 
 
-def _by_key(how: str) -> Callable[[Path, Path], bool]:
+def _by_key(how: str) -> Make:
     key = key_of(how)
-
-    def make(photograph: Path, target: Path) -> bool:
-        photo = _read(photograph, MASK_SIDE)
-        mask = keyed(photo.rgb, key)
-        if mask is not None:
-            write_mask(mask, (photo.width, photo.height), target)
-        return mask is not None
-
-    return make
+    return lambda photo, path: keyed(photo.rgb, key)
 
 
-def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Callable[[], None]) -> Callable[[Path, Path], bool]:
+def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Callable[[], None]) -> Make:
     small: dict[Path, np.ndarray] = {}
     for name in names:
         safe_point()
-        try:
-            small[paths[name]] = _read(paths[name], SIDE).rgb
-        except UnreadableImage:
-            continue
+        with contextlib.suppress(UnreadableImage):
+            small[paths[name]] = read_photo(paths[name], SIDE).rgb
     shapes = [each.shape for each in small.values()]
     usual = max(dict.fromkeys(shapes), key=shapes.count, default=None)
     still = StillBackground(np.stack([each for each in small.values() if each.shape == usual]) if usual else np.zeros((0, 1, 1, 3), np.uint8))
 
-    def make(photograph: Path, target: Path) -> bool:
-        photo = _read(photograph, MASK_SIDE)
-        if small[photograph].shape != usual:
-            return False
-        mask = still.mask(small[photograph])
-        if not mask.any():
-            return False
-        write_mask(sharpened(mask, photo.rgb), (photo.width, photo.height), target)
-        return True
+    def make(photo: DecodedPhoto, path: Path) -> np.ndarray | None:
+        mask = still.mask(small[path]) if small[path].shape == usual else np.zeros(0, np.uint8)
+        return sharpened(mask, photo.rgb) if mask.any() else None
 
     return make
-
-
-def _read(path: Path, side: int) -> Any:
-    return read_photo(path, side)
 
 
 def write_mask(mask: np.ndarray, size: tuple[int, int], target: Path) -> None:

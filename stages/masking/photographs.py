@@ -13,37 +13,38 @@ from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.cores import count_cores
 from stages.formats.importers import IMPORTERS, posed_format
+from stages.framing.gps import STATED, with_gps, with_stated_cameras
 from stages.framing.mask_use import MIN_AGREEING, share_that_fits
 from stages.io.capture import BACKGROUND, FOREGROUND, LEFT_OUT, SEEN, Capture, Silhouettes
 from stages.io.material import photographs_of
 from stages.io.pictures import UnreadableImage, read_header
-from stages.io.silhouettes import SmallPictures
+from stages.io.reader import PhotoReader
 from stages.masking.background import silhouettes_with_surroundings
 from stages.masking.made import made_masks, masks_by_network
 from stages.masking.polarity import INVERTED_NOTICE, kept_white
 from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
-from stages.sfm.gps import STATED, with_gps, with_stated_cameras
-from stages.sfm.ladder import ENOUGH, features_for
+from stages.sfm.attempts import ENOUGH
+from stages.sfm.cameras import find_cameras
 from stages.sfm.learned.networks import given_networks
-from stages.sfm.reconstruction import find_cameras
+from stages.sfm.pairs import features_for
 
 Find = Callable[[str, Mapping[str, Path | None]], Capture]
 
 
-def cameras_of_photographs(job: Job, warn: Any) -> Capture:
+def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     """The capture of the job's photographs and videos. Raises BadInput."""
     found = photographs_of(job, warn)
     paths, settings = found.paths, job.settings
-    find = _search(job, paths, warn)
-    given = kept_white(job, paths, found.masks)
+    find = _search(job, paths, reader, warn)
+    given = kept_white(job, paths, found.masks, reader)
     masks = {**given.masks, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     if not masks and settings.mask_from == "auto" and settings.masks != "ignore":
-        capture, seen = _of_turning_subject(job, find, paths)
+        capture, seen = _of_turning_subject(job, find, paths, reader)
     else:
         capture, seen = None, False
     if capture is None:
-        capture = _by_masks(job, find, paths, masks, given.inverted)
+        capture = _by_masks(job, find, paths, masks, given.inverted, reader)
     if seen:
         capture = replace(capture, facts={**capture.facts, BACKGROUND: SEEN})
     capture, sentences = _in_known_frame(job, capture, paths)
@@ -70,12 +71,17 @@ def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tu
     return capture, [*said, sentence] if sentence else said
 
 
-def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], inverted: Mapping[str, Path]) -> Capture:
+def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], inverted: Mapping[str, Path], reader: PhotoReader) -> Capture:
     """The capture of photographs with these masks; with the inverted ones in their place where these are silhouettes of one thing."""
+
     def search(masks: Mapping[str, Path]) -> Capture:
-        kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, {}), job.safe_point)
+        kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, {}), reader, job.safe_point)
         # Alpha channels leave pixels out where these are no silhouettes.
-        return _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths)) if kind else find("cameras", masks)
+        return _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths), reader) if kind else find("cameras", masks)
+
+    def fit(capture: Capture) -> bool:
+        """Whether the masks of nearly all photographs are silhouettes of one thing."""
+        return share_that_fits(capture, Silhouettes(masks=True), reader) >= MIN_AGREEING
 
     if not inverted:
         return search(masks)
@@ -85,11 +91,11 @@ def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[st
         other = None
         with contextlib.suppress(BadInput):
             other = search(inverted)
-        if other is None or not _fit(other):
+        if other is None or not fit(other):
             raise
     else:
         other = replace(capture, photos=tuple(replace(photo, mask=inverted.get(photo.camera.name)) for photo in capture.photos))
-        if not _fit(other):
+        if not fit(other):
             return capture
     job.say(INVERTED_NOTICE)
     return other
@@ -115,7 +121,7 @@ def mask_choice(settings: Any, facts: Mapping[str, object]) -> str:
     return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
 
 
-def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
+def _search(job: Job, paths: Mapping[str, Path], reader: PhotoReader, warn: Any) -> Find:
     """Structure from motion on photographs, with a scratch folder of its own for each name."""
     source, settings = job.source, job.settings
     assert source is not None
@@ -139,6 +145,7 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
             lens="perspective" if settings.lens == "equirectangular" else settings.lens,
             networks=networks,
             work=job.work / name,
+            copies=reader.folder,
             progress=job.progress,
             safe_point=job.safe_point,
             warn=warn,
@@ -147,13 +154,13 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
     return find
 
 
-def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path]) -> tuple[Capture | None, bool]:
+def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path], reader: PhotoReader) -> tuple[Capture | None, bool]:
     """The capture of photographs where a subject seems to have turned before a background that stands still, or None where all of the picture is to be
     used; and whether that is certain.
 
     Cameras by the subject alone are taken where they have nearly all photographs, or where all of the picture does not explain more.
     """
-    masks = masks_of_turning_subject(paths, job.work / "masks", safe_point=job.safe_point, progress=job.progress)
+    masks = masks_of_turning_subject(paths, job.work / "masks", reader, safe_point=job.safe_point, progress=job.progress)
     if not masks:
         return None, False
     job.say("the background stands still from photograph to photograph: cameras are looked for by the subject alone; --mask off uses all of the picture")
@@ -180,18 +187,14 @@ def _explained(capture: Capture) -> float:
     return len(capture.photos) * float(capture.facts["pairs_agreeing"])  # type: ignore[arg-type]
 
 
-def _fit(capture: Capture) -> bool:
-    """Whether the masks of nearly all photographs are silhouettes of one thing."""
-    return share_that_fits(capture, Silhouettes(masks=True), SmallPictures()) >= MIN_AGREEING
-
-
-def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None]) -> Capture:
+def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None], reader: PhotoReader) -> Capture:
     """The capture found from all of the photographs; or from what their silhouettes keep, where these fit to each other better then: the object was turned.
 
     masks, everywhere  what leaves out what is not of the object, and what does not
     """
+
     def fit(found: Capture) -> float:
-        return share_that_fits(found, kind, SmallPictures()) * len(found.photos)
+        return share_that_fits(found, kind, reader) * len(found.photos)
 
     what = "masks" if kind.masks else "alpha channels"
     job.say(f"{what} are taken for silhouettes; features are looked for outside of them, too: the background moves with the object")

@@ -18,7 +18,7 @@ from stages.framing.mask_use import MIN_AGREEING, alike, share_that_fits
 from stages.io.capture import Capture, Photo, Silhouettes
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.png import FAST, write_png
-from stages.io.silhouettes import SmallPictures
+from stages.io.reader import PhotoReader
 from stages.io.working_images import mask_levels
 from stages.masking.background import photo_without_camera
 
@@ -38,7 +38,7 @@ class Kept:
     inverted: dict[str, Path] = field(default_factory=dict)
 
 
-def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path]) -> Kept:
+def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path], reader: PhotoReader) -> Kept:
     """The masks of photographs without cameras, each turned round where `poses.mask_polarity` says so; and turned round where they look like it."""
     polarity = job.settings.mask_polarity
     if not masks or polarity == "white" or (polarity == "auto" and job.settings.masks == "ignore"):
@@ -47,33 +47,32 @@ def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path]) -
     if polarity == "black":
         job.say(INVERTED)
         return Kept({**masks, **_turned_round(job, photos)})
-    return Kept(dict(masks), _turned_round(job, photos) if _look_inverted(photos) else {})
+    return Kept(dict(masks), _turned_round(job, photos) if _look_inverted(photos, reader) else {})
 
 
-def capture_kept_white(job: Job, capture: Capture) -> Capture:
+def capture_kept_white(job: Job, capture: Capture, reader: PhotoReader) -> Capture:
     """The same of a capture with cameras; masks whose format says which level is left out (`Photo.mask_ignore`) stay."""
     polarity = job.settings.mask_polarity
     photos = [photo for photo in capture.photos if photo.mask is not None and photo.mask_ignore == "black"]
     if not photos or polarity == "white":
         return capture
     if polarity == "auto":
-        if job.settings.masks == "ignore" or not _look_inverted(photos):
+        if job.settings.masks == "ignore" or not _look_inverted(photos, reader):
             return capture
         flipped = replace(capture, photos=tuple(replace(photo, mask_ignore="white") for photo in photos))
-        if share_that_fits(flipped, Silhouettes(masks=True), SmallPictures()) < MIN_AGREEING:
+        if share_that_fits(flipped, Silhouettes(masks=True), reader) < MIN_AGREEING:
             return capture
     job.say(INVERTED_NOTICE if polarity == "auto" else INVERTED)
     masks = _turned_round(job, photos)
     return replace(capture, photos=tuple(replace(photo, mask=masks.get(photo.camera.name, photo.mask)) for photo in capture.photos))
 
 
-def _look_inverted(photos: Sequence[Photo]) -> bool:
+def _look_inverted(photos: Sequence[Photo], reader: PhotoReader) -> bool:
     """Whether masks leave out one compact thing in nearly all photographs, and do not keep one."""
     chosen = scene_bounds.chosen_photos(photos)
-    small, flipped = SmallPictures(), SmallPictures()
-    if not alike([(photo, small.mask(photo)) for photo in chosen])[0]:
+    if not alike([(photo, reader.mask(photo)) for photo in chosen])[0]:
         return False
-    return not alike([(photo, flipped.mask(replace(photo, mask_ignore="white"))) for photo in chosen])[0]
+    return not alike([(photo, reader.mask(replace(photo, mask_ignore="white"))) for photo in chosen])[0]
 
 
 def _turned_round(job: Job, photos: Sequence[Photo]) -> dict[str, Path]:

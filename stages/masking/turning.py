@@ -18,9 +18,8 @@ import numpy as np
 from pipeline.errors import BadInput
 from stages.framing.mask_use import alike
 from stages.io.capture import Photo
-from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, read_header
-from stages.io.silhouettes import SmallPictures
+from stages.io.reader import PhotoReader
 from stages.masking.background import FINE, LEAST_TEXTURE, photo_without_camera
 from stages.masking.made import STATIC, made_masks
 from stages.masking.static import border_of
@@ -32,20 +31,21 @@ ONE_SIZE = 0.9  # of the photographs
 LEAST_TURN = 15.0  # degrees between two view directions
 
 
-def masks_of_turning_subject(paths: Mapping[str, Path], folder: Path, *, safe_point: Callable[[], None], progress: Callable[..., None]) -> dict[str, Path]:
+def masks_of_turning_subject(
+    paths: Mapping[str, Path], folder: Path, reader: PhotoReader, *, safe_point: Callable[[], None], progress: Callable[..., None]
+) -> dict[str, Path]:
     """Name -> mask, written to a folder, of a subject that probably turns before a background that stands still; none where nothing says so."""
-    if not border_stands_still(paths, safe_point):
+    if not border_stands_still(paths, reader, safe_point):
         return {}
     try:
         masks = made_masks(paths, STATIC, folder, safe_point=safe_point, progress=progress, warn=lambda *_, **__: None)
     except BadInput:  # no background that recurs
         return {}
-    small = SmallPictures()
     photos = [photo for name in sorted(masks) if (photo := photo_without_camera(name, paths[name], masks[name])) is not None]
-    return {} if len(masks) < ONE_SIZE * len(paths) or alike([(photo, small.mask(photo)) for photo in photos])[0] else masks
+    return {} if len(masks) < ONE_SIZE * len(paths) or alike([(photo, reader.mask(photo)) for photo in photos])[0] else masks
 
 
-def border_stands_still(paths: Mapping[str, Path], safe_point: Callable[[], None]) -> bool:
+def border_stands_still(paths: Mapping[str, Path], reader: PhotoReader, safe_point: Callable[[], None]) -> bool:
     """Whether photographs of one size, far apart in the order of their names, have texture along their border, and the same."""
     names = sorted(paths)
     sizes = []
@@ -65,22 +65,18 @@ def border_stands_still(paths: Mapping[str, Path], safe_point: Callable[[], None
     borders: list[np.ndarray] = []
     for index in np.linspace(0, len(chosen) - 1, COMPARED).astype(int):
         safe_point()
-        texture = _texture_of_border(paths[chosen[index]])
-        if texture is None or texture.std() < LEAST_TEXTURE:
+        try:
+            grey = reader.photo(paths[chosen[index]], SIDE).rgb().astype(np.float32).mean(2)
+        except UnreadableImage:
+            return False
+        texture = (grey - cv2.GaussianBlur(grey, (0, 0), FINE))[border_of(grey.shape)]
+        if texture.std() < LEAST_TEXTURE:
             return False
         borders.append(texture)
         if len(borders) == 2 and _correlation(*borders) < STANDING:
             return False  # of nearly all captures: what follows costs time
     pairs = [_correlation(one, other) >= STANDING for k, one in enumerate(borders) for other in borders[k + 1 :]]
     return float(np.mean(pairs)) >= STILL_PAIRS
-
-
-def _texture_of_border(path: Path) -> np.ndarray | None:
-    try:
-        grey = read_photo(path, SIDE).rgb.astype(np.float32).mean(2)
-    except UnreadableImage:
-        return None
-    return np.asarray((grey - cv2.GaussianBlur(grey, (0, 0), FINE))[border_of(grey.shape)])
 
 
 def _correlation(one: np.ndarray, other: np.ndarray) -> float:

@@ -30,8 +30,8 @@ from stages.framing.mask_use import doubts, find_mask_use, points_of_object, wit
 from stages.io import working_images
 from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
 from stages.io.pictures import UnreadableImage
+from stages.io.reader import PhotoReader
 from stages.io.scene import SPLITS, Scene, View, save, save_points
-from stages.io.silhouettes import SmallPictures
 from stages.masking.photographs import cameras_of_photographs, mask_choice, masks_made_for
 from stages.masking.polarity import capture_kept_white
 from stages.memory.need import refuse_what_does_not_fit
@@ -53,17 +53,17 @@ def run(job: Job) -> None:
         notes.append(text)
         job.warn(text, **facts)
 
-    capture = read(job, settings, warn)
+    reader = PhotoReader(job.work / "photographs")
+    capture = read(job, settings, reader, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
     refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
-    small = SmallPictures()
-    capture, mask_facts = with_mask_use(job, capture, small, warn)
+    capture, mask_facts = with_mask_use(job, capture, reader, warn)
     capture, written = _write_images(job, capture, warn)
     judged = capture  # by all sparse points that its cameras were found with
-    capture = with_points_of_object(capture, small)
+    capture = with_points_of_object(capture, reader)
     framed = training_frame.find_training_frame(
-        capture, up=settings.up, box=resolved(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
+        capture, up=settings.up, box=resolved(settings.crop_box), margin=settings.box_margin, space=settings.space, reader=reader
     )
     _say_what_is_cut(framed.facts.get("silhouettes_cut", ()), warn)
     splits = assign_splits(capture.photos, settings.test_every, warn)
@@ -112,7 +112,7 @@ def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
         warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
 
 
-def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
+def read(job: Job, settings: PosesSettings, reader: PhotoReader, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
     assert job.source is not None
     possible = _formats(job, settings)
@@ -123,11 +123,11 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
         capture = importers.IMPORTERS[name].read(job.source, settings)
         for sentence in capture.warnings:
             warn(sentence)
-        capture = capture_kept_white(job, capture)
+        capture = capture_kept_white(job, capture, reader)
         made = masks_made_for(job, {photo.camera.name: photo.image for photo in capture.photos if photo.mask is None}, warn)
         capture = replace(capture, photos=tuple(replace(photo, mask=made.get(photo.camera.name, photo.mask)) for photo in capture.photos))
     else:
-        capture = cameras_of_photographs(job, warn)
+        capture = cameras_of_photographs(job, reader, warn)
     if settings.mask_from == FOREGROUND:
         from stages.masking.foreground import with_foreground_masks  # trains a field, for which the stage needs no torch else
 
@@ -153,10 +153,10 @@ def _format_of(capture: Capture) -> str:
     return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
 
 
-def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
+def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) -> tuple[Capture, dict[str, object]]:
     """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
     renders = _may_be_renders(capture)
-    use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, small, job.safe_point)
+    use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, reader, job.safe_point)
     for sentence in use.sentences:
         job.say(sentence)
     for sentence in doubts(use):
@@ -171,11 +171,11 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
     return replace(capture, background=WHITE, silhouettes=use.silhouettes), use.facts
 
 
-def with_points_of_object(capture: Capture, small: SmallPictures) -> Capture:
+def with_points_of_object(capture: Capture, reader: PhotoReader) -> Capture:
     """Without the sparse points that lie outside of silhouettes."""
     if not capture.silhouettes or capture.points is None:
         return capture
-    return replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, small))))
+    return replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, reader))))
 
 
 def _may_be_renders(capture: Capture) -> bool:

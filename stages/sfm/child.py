@@ -15,7 +15,7 @@ from pipeline.executors.child import end_with
 from pipeline.library_output import warnings_for_users
 from pipeline.stage import ByName
 
-TASKS = {"pairs": ByName("stages.sfm.pair_workers:match_for"), "cameras": ByName("stages.sfm.reconstruction:capture_for")}
+TASKS = {"pairs": ByName("stages.sfm.pair_workers:match_for"), "cameras": ByName("stages.sfm.cameras:capture_for")}
 
 
 class Stopped(Exception):
@@ -95,3 +95,7 @@ def _send_error(channel: Channel, error: BaseException) -> None:
         name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else None
         facts |= {"errno": error.errno, "strerror": error.strerror, "filename": name}
     channel.send("error", **facts, traceback="".join(traceback.format_exception(error)))
+
+
+if __name__ == "__main__":
+    main()

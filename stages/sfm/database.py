@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from pipeline.errors import StageFailed
 from pipeline.files import remove, rename
 from stages.scratch import Warn, note, noted, once, opened, unusable
 from stages.sfm.colmap import import_pycolmap, quiet_pycolmap
-from stages.sfm.images import WorkImage, images_of
 
 # Tables of which a row each belongs to an image, or to a pair of them, and the column that names it.
 FEATURES = ("keypoints", "image_id"), ("descriptors", "image_id")
@@ -31,42 +30,64 @@ _BLOBS = {"F": 72, "E": 72, "H": 72, "qvec": 32, "tvec": 24}  # bytes, where the
 MAX_IMAGES = 2147483647  # COLMAP's
 _MAX_KEYPOINTS = 2**20
 FISHEYE_FOCAL = 0.4  # of the longest side: 180 degrees along the diagonal of a picture of 4:3
+OVERLAPPING = 30  # verified matches, from which two photographs count as overlapping
 HOMOGRAPHIES = (4, 5, 6)  # of COLMAP's two-view geometries: planar, panoramic, either of them
 
 Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class WorkImage:
+    """The copy of one photograph after EXIF rotation.
+
+    name            of the photograph
+    file            of the copy: numbers in sorted order of name
+    width, height   of the photograph after EXIF rotation, pixels
+    work_width, work_height  of the copy
+    focal           pixels of the photograph, from its EXIF data, or None
+    camera_key      photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
+    fisheye         whether it was taken through a fisheye lens
+    """
+
+    name: str
+    file: str
+    width: int
+    height: int
+    work_width: int
+    work_height: int
+    focal: float | None
+    camera_key: str
+    fisheye: bool = False
+
+
+def images_of(work: Path) -> Path:
+    """The folder of the copies; for a step's own scratch folder, that of its parent."""
+    here = work / "images"
+    return here if here.is_dir() else work.parent / "images"
 
 
 def database_path(work: Path) -> Path:
     return work / "database.db"
 
 
-def remove_database(work: Path) -> None:
-    _remove(database_path(work))
-
-
-def _remove(path: Path) -> None:
+def remove_database(path: Path) -> None:
     for suffix in _WRITTEN:
         remove(Path(str(path) + suffix))
 
 
-def open_database(work: Path, images: Sequence[WorkImage], warn: Warn) -> bool:
-    """Make a database of exactly `images`, each with its camera, and with the features and matches of an earlier call that are as they were written.
-
-    returns  whether any are
-    """
+def open_database(work: Path, images: Sequence[WorkImage], warn: Warn) -> None:
+    """Make a database of exactly `images`, each with its camera, and with the features and matches of an earlier call that are as they were written."""
     aside = work / "database.part"
-    _remove(aside)
+    remove_database(aside)
     # The database appears by rename: a kill while the images are being listed leaves none.
     _list_images(aside, work, images)
-    kept = False
     with contextlib.closing(sqlite3.connect(aside)) as fresh:
         if database_path(work).exists():
-            kept = _copy_rows(work, fresh, images, once(warn))
+            _copy_rows(work, fresh, images, once(warn))
         fresh.commit()
         fresh.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    remove_database(work)
+    remove_database(database_path(work))
     rename(aside, database_path(work))
-    return kept
 
 
 def _list_images(aside: Path, work: Path, images: Sequence[WorkImage]) -> None:
@@ -144,7 +165,7 @@ def insert_features(path: Path, image: int, rows: Sequence[Row]) -> bool:
 
 def copy_database(work: Path, place: Path) -> None:
     """A copy of the database in another scratch folder, in the place of what is there."""
-    remove_database(place)
+    remove_database(database_path(place))
     with contextlib.closing(sqlite3.connect(database_path(work))) as old, contextlib.closing(sqlite3.connect(database_path(place))) as fresh:
         old.backup(fresh)
 
@@ -152,7 +173,7 @@ def copy_database(work: Path, place: Path) -> None:
 def copy_with_own_cameras(work: Path, place: Path, images: Sequence[WorkImage]) -> None:
     """Replace the database of another scratch folder by one of the same images, features and matches, but with a camera for each image, of the first
     guess."""
-    remove_database(place)
+    remove_database(database_path(place))
     _list_images(database_path(place), place, [replace(image, camera_key=image.file) for image in images])
     with contextlib.closing(attached(place, work)) as connection, connection:
         for table, _ in (*FEATURES, *PAIRS):
@@ -203,9 +224,8 @@ def _digest(rows: Sequence[Row]) -> str:
     return digest.hexdigest()
 
 
-def _copy_rows(work: Path, fresh: sqlite3.Connection, images: Sequence[WorkImage], warn: Warn) -> bool:
-    """Copy the rows of the database of an earlier call that are as noted; whether there are any."""
-    kept = False
+def _copy_rows(work: Path, fresh: sqlite3.Connection, images: Sequence[WorkImage], warn: Warn) -> None:
+    """Copy the rows of the database of an earlier call that are as noted."""
     try:
         opened(database_path(work)).close()
         with contextlib.closing(sqlite3.connect(database_path(work))) as old:
@@ -215,14 +235,12 @@ def _copy_rows(work: Path, fresh: sqlite3.Connection, images: Sequence[WorkImage
             for key, rows in _noted_rows(work, old, "features_*.json", FEATURES, warn):
                 features[key] = _check_features(key, rows, len(images))
                 _insert(fresh, FEATURES, rows)
-                kept = True
             counts = dict(fresh.execute("SELECT image_id, rows FROM keypoints"))
             for key, rows in _noted_rows(work, old, "pairs_*.json", PAIRS, warn):
                 _check_pair(key, rows, counts)
                 _insert(fresh, PAIRS, rows)
     except (sqlite3.Error, OSError, ValueError, TypeError, KeyError) as error:
         warn(unusable(database_path(work), error))
-    return kept
 
 
 def _definition(connection: sqlite3.Connection, table: str) -> list[tuple[str, str]]:
@@ -279,16 +297,20 @@ def _size(row: Row) -> int:
     return len(row["data"] or b"")
 
 
-def verified_pairs(path: Path) -> list[tuple[int, int]]:
-    """Image ids of each pair in the table of two-view geometries, in order."""
-    with contextlib.closing(sqlite3.connect(path)) as connection:
-        return [image_ids_of_pair(row[0]) for row in connection.execute("SELECT pair_id FROM two_view_geometries ORDER BY pair_id")]
-
-
 def inlier_counts(path: Path) -> dict[tuple[int, int], int]:
     """Verified matches of each pair of image ids that was compared, in order."""
     with contextlib.closing(sqlite3.connect(path)) as connection:
         return {image_ids_of_pair(row[0]): int(row[1]) for row in connection.execute("SELECT pair_id, rows FROM two_view_geometries ORDER BY pair_id")}
+
+
+def neighbours(work: Path, count: int) -> dict[int, set[int]]:
+    """The positions of the photographs that each of `count` overlaps with."""
+    found: dict[int, set[int]] = {i: set() for i in range(count)}
+    for (i, j), inliers in inlier_counts(database_path(work)).items():
+        if inliers >= OVERLAPPING:
+            found[i - 1].add(j - 1)
+            found[j - 1].add(i - 1)
+    return found
 
 
 def planar_share(path: Path) -> float | None:

@@ -7,10 +7,11 @@ without; 0 keeps none. Features are detected where there can be no such folder, 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,34 +103,23 @@ def _read(path: Path) -> list[Row] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError):
-        _remove([path])
+        with contextlib.suppress(OSError):
+            remove(path)
         return None
 
 
 def _prune(cache: Path) -> None:
     """Remove the least recently used files beyond `max_bytes`."""
-    kept, most = 0, max_bytes()
-    for _, size, path in sorted(_listed(cache), reverse=True):
+    kept, most, listed = 0, max_bytes(), []
+    for path in cache.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(FileNotFoundError):  # another process has removed it
+            about = path.lstat()
+            listed.append((about.st_mtime, about.st_size, path))
+    for _, size, path in sorted(listed, reverse=True):
         kept += size
         if kept > most:
-            _remove([path])
-
-
-def _listed(cache: Path) -> Iterator[tuple[float, int, Path]]:
-    for path in cache.glob(f"*{SUFFIX}"):
-        try:
-            about = path.lstat()
-        except FileNotFoundError:  # another process has removed it
-            continue
-        yield about.st_mtime, about.st_size, path
-
-
-def _remove(paths: Iterable[Path]) -> None:
-    for path in paths:
-        try:
-            remove(path)
-        except OSError:
-            continue
+            with contextlib.suppress(OSError):
+                remove(path)
 
 
 def _sha256(data: bytes) -> str:

@@ -1,28 +1,28 @@
-"""Copies of the photographs that COLMAP reads: after EXIF rotation, at working size, with their masks. Copies of a killed call are reused."""
+"""Copies of the photographs that COLMAP reads: after EXIF rotation, at working size, with their masks; decoded once for all searches of a stage."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+import os
+import shutil
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
-from typing import Annotated, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
-import msgspec
 import numpy as np
 
 from pipeline.files import SafePoint, open_plain, remove, write_atomically
 from stages.cores import in_order
-from stages.io.photo import DecodedPhoto, read_mask_file, read_photo
+from stages.io.photo import read_mask_file
 from stages.io.pictures import UnreadableImage
 from stages.io.png import FAST, read_png, write_png
-from stages.scratch import note, noted, once, opened
+from stages.io.reader import PhotoReader
+from stages.scratch import opened
+from stages.sfm.database import WorkImage
 
-LAYOUT = 5  # of the work folder; raise it when what is written there changes meaning
+LAYOUT = 6  # of the work folder; raise it when what is written there changes meaning
 
-Side = Annotated[int, msgspec.Meta(ge=1, le=2**20)]  # pixels
 Progress = Callable[..., None]
 
 
@@ -38,30 +38,6 @@ Masks = Mapping[str, Path | None]  # file of the mask of each photograph that ha
 WHOLE = "whole"  # in the place of the digest of a mask
 
 
-@dataclass(frozen=True)
-class WorkImage:
-    """The copy of one photograph after EXIF rotation.
-
-    name            of the photograph
-    file            of the copy: numbers in sorted order of name
-    width, height   of the photograph after EXIF rotation, pixels
-    work_width, work_height  of the copy
-    focal           pixels of the photograph, from its EXIF data, or None
-    camera_key      photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
-    fisheye         whether it was taken through a fisheye lens
-    """
-
-    name: str
-    file: str
-    width: Side
-    height: Side
-    work_width: Side
-    work_height: Side
-    focal: Annotated[float, msgspec.Meta(gt=0)] | None
-    camera_key: str
-    fisheye: bool = False
-
-
 def _sha256(path: Path) -> str:
     """Of a plain file, or the reason why it is unreadable. A pipe would block."""
     try:
@@ -72,58 +48,47 @@ def _sha256(path: Path) -> str:
 
 
 def prepare_images(
-    folder: Path,
-    names: Sequence[str],
+    paths: Mapping[str, Path],
     *,
     max_side: int,
     features: int,
     seed: int,
     masks: Masks,
     lens: str = "auto",
-    paths: Mapping[str, Path] | None = None,
     threads: int = 1,
     work: Path,
+    copies: Path | None = None,
     **callables: Unpack[Callables],
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
     """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
+    paths    the file of each photograph, by name
     masks    of some or all names; None: the photograph as a whole, whatever its alpha channel says
     lens     "fisheye", "perspective", or "auto": fisheye where EXIF data say so
-    paths    of some or all names: the file that is read, where it is not the name below the folder
     threads  on which photographs are read
+    copies   folder that others read photographs of the stage from (`PhotoReader`); None: one in the work folder
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 
     What an earlier, killed call with the same photographs and settings left in `work` is kept, anything else there is removed.
     """
-    safe_point, warn = callables["safe_point"], callables["warn"]
-    paths = {name: folder / name for name in names} | dict(paths or {})
+    safe_point, warn, reader = callables["safe_point"], callables["warn"], PhotoReader(copies or work / "photographs")
     request: dict[str, object] = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "lens": lens}
     request["photographs"] = _digests(paths, masks, safe_point)
     _begin(work, json.dumps(request, indent=1, sort_keys=True).encode())
-    ordered, warn_once = sorted(paths), once(warn)
-    known: list[Copy | None] = []
-    for index, name in enumerate(ordered):
-        safe_point()
-        known.append(noted(_note_of(index, work), Copy, warn_once, partial(_check, name, index, max_side, work)))
-    fresh = in_order(
-        lambda index: _copy(ordered[index], paths[ordered[index]], index, max_side, masks, lens, work),
-        [index for index, copied in enumerate(known) if copied is None],
-        threads,
-        safe_point,
+    ordered = sorted(paths)
+    copied = in_order(
+        lambda index: _copy(ordered[index], paths[ordered[index]], index, max_side, masks, lens, work, reader), range(len(ordered)), threads, safe_point
     )
     images: list[WorkImage] = []
     rejected: list[tuple[str, str]] = []
-    for index, (name, copied) in enumerate(zip(ordered, known, strict=True)):
-        if copied is None:
-            copied, outputs = next(fresh)
-            note(_note_of(index, work), msgspec.to_builtins(copied), outputs)
-        if copied.image is None:
-            rejected.append((name, copied.remark))
-            warn(f"{name}: {copied.remark}; left out.")
+    for index, (name, (image, remark)) in enumerate(zip(ordered, copied, strict=True)):
+        if image is None:
+            rejected.append((name, remark))
+            warn(f"{name}: {remark}; left out.")
         else:
-            if copied.remark:
-                warn(f"{name}: {copied.remark}")
-            images.append(copied.image)
+            if remark:
+                warn(f"{name}: {remark}")
+            images.append(image)
         callables["progress"](index + 1, len(paths), "reading photographs")
     return images, rejected
 
@@ -140,10 +105,6 @@ def _begin(work: Path, request: bytes) -> None:
         write_atomically(record, request, durable=False)
 
 
-def _note_of(index: int, work: Path) -> Path:
-    return work / f"copy_{index:05d}.json"
-
-
 def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> list[list[str | None]]:
     rows: list[list[str | None]] = []
     for name in sorted(paths):
@@ -153,69 +114,43 @@ def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> 
     return rows
 
 
-@dataclass(frozen=True)
-class Copy:
-    """The result of copying a photograph: its copy, or None where it is unreadable; a remark, or the reason."""
-
-    image: WorkImage | None
-    remark: str
-
-
-def images_of(work: Path) -> Path:
-    """The folder of the copies; for a step's own scratch folder, that of its parent."""
-    here = work / "images"
-    return here if here.is_dir() else work.parent / "images"
-
-
-def _file(index: int) -> str:
-    return f"{index:05d}.png"
-
-
-def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: str, work: Path) -> tuple[Copy, list[Path]]:
-    """Copy one photograph; with the files written."""
+def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: str, work: Path, reader: PhotoReader) -> tuple[WorkImage | None, str]:
+    """The copy of one photograph, None where it is unreadable; and a remark, or the reason."""
     try:
-        photo: DecodedPhoto = read_photo(path, max_side)
+        photo = reader.photo(path, max_side)
     except UnreadableImage as error:
-        return Copy(None, str(error)), []
-    outputs = [work / "images" / _file(index)]
-    write_png(photo.rgb, outputs[0], compress_level=FAST, durable=False)
-    mask, remark = photo.opaque, ""
+        return None, str(error)
+    details, file = photo.details, f"{index:05d}.png"
+    _link(photo.image, work / "images" / file)
+    mask, remark = None if photo.opaque is None else read_png(photo.opaque) > 0, ""
     if (mask_path := masks.get(name)) is None:
         mask = None if name in masks else mask
     else:
         try:
-            given = read_mask_file(mask_path, photo)
+            given = read_mask_file(mask_path, details)
             mask = given if mask is None else mask & given
         except UnreadableImage as error:
             remark = f"its mask is not used: {error}"
-    if mask is not None:
-        outputs.append(work / "masks" / f"{_file(index)}.png")
-        write_png(np.where(mask, np.uint8(255), np.uint8(0)), outputs[1], compress_level=FAST, durable=False)
-    height, width = photo.rgb.shape[:2]
-    focal = None if photo.focal is None else float(photo.focal)
+    target = work / "masks" / f"{file}.png"
+    if mask is None:
+        remove(target)  # which `extract_features` may have written
+    else:
+        write_png(np.where(mask, np.uint8(255), np.uint8(0)), target, compress_level=FAST, durable=False)
+    focal = details.focal
     # Nothing tells the cameras of photographs without EXIF data apart but the folder, or of several sources the source, that they are in.
-    maker = photo.maker if photo.maker or focal else PurePosixPath(name).parts[0] if "/" in name else ""
-    key = f"{photo.width}x{photo.height} {maker} {focal if focal is None else round(focal, 1)}"
-    fisheye = lens == "fisheye" or (lens == "auto" and photo.fisheye)
-    key += " fisheye" if fisheye else ""
-    return Copy(WorkImage(name, _file(index), photo.width, photo.height, width, height, focal, key, fisheye), remark), outputs
+    maker = details.maker if details.maker or focal else PurePosixPath(name).parts[0] if "/" in name else ""
+    fisheye = lens == "fisheye" or (lens == "auto" and details.fisheye)
+    key = f"{details.width}x{details.height} {maker} {focal if focal is None else round(focal, 1)}{' fisheye' if fisheye else ''}"
+    return WorkImage(name, file, details.width, details.height, details.work_width, details.work_height, focal, key, fisheye), remark
 
 
-def _check(name: str, index: int, max_side: int, work: Path, copied: Copy, outputs: Collection[str]) -> None:
-    """Raises where this is not what became of a photograph, or its copy and mask are not there at working size."""
-    image = copied.image
-    if image is None:
-        return
-    if (image.name, image.file) != (name, _file(index)) or max(image.work_width, image.work_height) > max_side:
-        raise ValueError("of another photograph")
-    for path in (work / "images" / image.file, work / "masks" / f"{image.file}.png"):
-        there = path.relative_to(work).as_posix() in outputs
-        if there and read_png(path).shape[:2] != (image.work_height, image.work_width):
-            raise ValueError(f"{path.name} is of another size")
-        if not there and path.parent.name == "images":
-            raise ValueError(f"{path.name} is missing")
-        if not there:
-            remove(path)  # that of a photograph without a mask, of which only `extract_features` knows
+def _link(source: Path, target: Path) -> None:
+    """A second name for a file, or where the file system has none a copy."""
+    remove(target)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
 
 
 def _holds(path: Path, data: bytes) -> bool:

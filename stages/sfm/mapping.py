@@ -1,10 +1,11 @@
-"""Verified matches to cameras: COLMAP's incremental mapper, and a final robust bundle adjustment. `stages.sfm.ladder` says what is attempted when.
+"""Verified matches to cameras: COLMAP's incremental mapper, and a final robust bundle adjustment. `stages.sfm.reconstruction` says what is attempted when.
 
 See docs/experiments/sfm.md.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,12 @@ from efficientnerf.capture.moving_parts import moving_parts
 from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
 from pipeline.files import SafePoint, remove
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
-from stages.sfm.database import database_path, inlier_counts
-from stages.sfm.images import Progress, WorkImage, images_of
+from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts
+from stages.sfm.images import Progress
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
+TOLERANCE = 4.0  # px at working size, of the epipolar error of a match that agrees with the cameras
 MANY_OBSERVATIONS = 150_000  # of points in images; of more, an even choice holds the cameras as well
 NEARLY = 0.95  # of the photographs: later steps may bring back the others
 ALL_OF = 300  # points: a photograph with no more keeps all of them
@@ -45,35 +47,25 @@ FORWARD: Options = {
 
 
 def sub_models(work: Path, images: Sequence[WorkImage], seed: int, options: Options, progress: Progress, safe_point: SafePoint) -> list[Any]:
-    """The sub-models that are found from the matches, largest first."""
+    """The sub-models that are found from the matches, largest first.
+
+    Where a focal length contradicts its EXIF data (forward motion does not determine it), those found with intrinsics fixed at the EXIF data, if they
+    register nearly as many photographs with about the same reprojection error.
+    """
     models = _incremental_mapping(work, len(images), seed, options, progress, safe_point)
-    return _with_exif_focal(work, images, seed, options, models, progress, safe_point)
-
-
-def continued(work: Path, images: Sequence[WorkImage], model: Any, seed: int, options: Options, progress: Progress, safe_point: SafePoint) -> list[Any]:
-    """A model with more photographs registered, as far as the matches of `work` let them, and other sub-models; largest first."""
-    fixed = bool(cameras_with_fixed_focal(images, model))
-    return _incremental_mapping(work, len(images), seed, options, progress, safe_point, refine_camera=not fixed, start=model)
-
-
-def _with_exif_focal(
-    work: Path,
-    images: Sequence[WorkImage],
-    seed: int,
-    options_of_attempt: Options,
-    models: list[Any],
-    progress: Progress,
-    safe_point: SafePoint,
-) -> list[Any]:
-    """`models`; or, where a focal length contradicts its EXIF data (forward motion does not determine it), those found with intrinsics fixed at
-    the EXIF data, if they register nearly as many photographs with about the same reprojection error."""
     if not models or not any(contradicts_exif(camera.mean_focal_length(), prior) for camera, prior in _cameras_with_exif_focal(images, models[0])):
         return models
-    fixed = _incremental_mapping(work, len(images), seed, options_of_attempt, progress, safe_point, refine_camera=False)
+    fixed = _incremental_mapping(work, len(images), seed, options, progress, safe_point, refine_camera=False)
     enough = fixed and num_registered(fixed) >= NEARLY * num_registered(models)
     if enough and fixed[0].compute_mean_reprojection_error() < 1.15 * models[0].compute_mean_reprojection_error():
         return fixed
     return models
+
+
+def continued(work: Path, images: Sequence[WorkImage], model: Any, seed: int, progress: Progress, safe_point: SafePoint) -> list[Any]:
+    """A model with more photographs registered, as far as the matches of `work` let them, and other sub-models; largest first."""
+    fixed = bool(cameras_with_fixed_focal(images, model))
+    return _incremental_mapping(work, len(images), seed, RELAXED, progress, safe_point, refine_camera=not fixed, start=model)
 
 
 def _cameras_with_exif_focal(images: Sequence[WorkImage], model: Any) -> list[tuple[Any, float | None]]:
@@ -199,7 +191,7 @@ def _with_adjusted_cameras(work: Path, images: Sequence[WorkImage], model: Any, 
         fixed = cameras_with_fixed_focal(images, model)
         safe_point()
         bundle_adjust(pycolmap, model, fixed)
-        counts = _images_of_cameras(model)
+        counts = Counter(image.camera_id for image in model.images.values() if image.has_pose)
         simple = {camera_id for camera_id in counts if model.cameras[camera_id].model == pycolmap.CameraModelId.SIMPLE_RADIAL}
         refinable = [camera_id for camera_id in sorted(simple - fixed) if counts[camera_id] >= 10]  # fewer would be overfitted
         if not refinable:
@@ -213,15 +205,7 @@ def _with_adjusted_cameras(work: Path, images: Sequence[WorkImage], model: Any, 
         bundle_adjust(pycolmap, richer, fixed)
         better = richer.compute_mean_reprojection_error() < 0.99 * model.compute_mean_reprojection_error()
     square = all(abs(richer.cameras[i].focal_length_x / richer.cameras[i].focal_length_y - 1) < 0.02 for i in refinable)
-    return richer if better and square and match_agreement(work, images, richer) >= match_agreement(work, images, model) - 0.001 else model
-
-
-def _images_of_cameras(model: Any) -> dict[int, int]:
-    counts: dict[int, int] = {}
-    for image in model.images.values():
-        if image.has_pose:
-            counts[image.camera_id] = counts.get(image.camera_id, 0) + 1
-    return counts
+    return richer if better and square and match_agreement(work, richer) >= match_agreement(work, model) - 0.001 else model
 
 
 def bundle_adjust(
@@ -255,13 +239,9 @@ def num_registered(models: Sequence[Any]) -> int:
     return int(models[0].num_reg_images()) if models else 0
 
 
-def match_agreement(work: Path, images: Sequence[WorkImage], model: Any) -> float:
-    return pair_agreement(work, cameras_of(model, images))
-
-
 def moving_shares(work: Path, images: Sequence[WorkImage], model: Any, safe_point: SafePoint) -> dict[str, float]:
     """Name of a photograph -> share of it that moves, of those in which anything does (`efficientnerf.capture.moving_parts`)."""
-    cameras = cameras_of(model, images)
+    cameras, names = cameras_of(model), {image.file: image.name for image in images}
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
 
         def matches() -> Iterator[tuple[tuple[int, int], np.ndarray]]:
@@ -271,32 +251,30 @@ def moving_shares(work: Path, images: Sequence[WorkImage], model: Any, safe_poin
                     yield pair, np.asarray(database.read_matches(*pair))
 
         keypoints = {image: np.asarray(database.read_keypoints(image), np.float64)[:, :2] for image in cameras}
-        return {cameras[image].name: round(share, 4) for image, share in moving_parts(cameras, keypoints, matches()).items()}
+        return {names[cameras[image].name]: round(share, 4) for image, share in moving_parts(cameras, keypoints, matches()).items()}
 
 
-def cameras_of(model: Any, images: Sequence[WorkImage]) -> dict[int, Camera]:
-    """By COLMAP's image id, of the photographs that have one, at working size."""
-    by_file = {image.file: image for image in images}
-    return {image.image_id: camera_of(model, image, by_file[image.name]) for image in model.images.values() if image.has_pose}
+def cameras_of(model: Any) -> dict[int, Camera]:
+    """By COLMAP's image id, of the photographs that have one."""
+    return {image.image_id: camera_of(model, image) for image in model.images.values() if image.has_pose}
 
 
-def camera_of(model: Any, image: Any, source: WorkImage) -> Camera:
+def camera_of(model: Any, image: Any) -> Camera:
+    """At working size, by the name of the photograph's copy."""
     pose = np.eye(4)
     camera_from_world = np.asarray(image.cam_from_world().matrix())
     pose[:3, :3] = camera_from_world[:, :3].T
     pose[:3, 3] = -camera_from_world[:, :3].T @ camera_from_world[:, 3]
     lens = model.cameras[image.camera_id]
-    return Camera(source.name, source.work_width, source.work_height, lens.model_name, tuple(float(p) for p in lens.params), pose)
+    return Camera(image.name, lens.width, lens.height, lens.model_name, tuple(float(p) for p in lens.params), pose)
 
 
-def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: float = 4.0) -> float:
-    """The share of the verified matches of all pairs whose epipolar error is below `tolerance` pixels at working size.
+def match_agreement(work: Path, model: Any) -> float:
+    """The share of the verified matches of all pairs whose epipolar error is below TOLERANCE.
 
     COLMAP drops observations that do not fit, so that its reprojection error is small even where repeated structure was folded onto itself.
-
-    cameras  by COLMAP's image id, at working size
     """
-    agreeing = total = 0
+    cameras, agreeing, total = cameras_of(model), 0, 0
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
         directions = {
             image_id: rays(camera, np.asarray(database.read_keypoints(image_id), np.float64)[:, :2])[1] for image_id, camera in cameras.items()
@@ -306,6 +284,6 @@ def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: floa
                 continue
             inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
             a, b = directions[first][inliers[:, 0]], directions[second][inliers[:, 1]]
-            agreeing += int((epipolar_error(cameras[first], cameras[second], a, b) < tolerance).sum())
+            agreeing += int((epipolar_error(cameras[first], cameras[second], a, b) < TOLERANCE).sum())
             total += len(inliers)
     return agreeing / total if total else 1.0

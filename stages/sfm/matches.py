@@ -11,14 +11,15 @@ import numpy as np
 from pipeline.files import SafePoint
 from stages.cores import count_cores
 from stages.io.png import FAST, write_png
-from stages.sfm import feature_cache, pair_workers
+from stages.sfm import feature_cache, pair_workers, pairs
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, database_path, pair_id_of, record, verified_pairs
-from stages.sfm.images import Progress, WorkImage, images_of
+from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, images_of, inlier_counts, neighbours, pair_id_of, record
+from stages.sfm.images import Progress
 from stages.sfm.pairs import Pair, aggregated, in_blocks, likeness_of, ordered
 
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md
 MAX_WORKERS = 8  # processes that match pairs
+FEW_NEIGHBOURS = 3  # photographs that one overlaps with; of fewer, more are looked for
 PAIRS_A_WORKER = 96  # a process is not worth its start for fewer
 
 
@@ -73,28 +74,17 @@ def extract_features(
 
 
 def _extract(pycolmap: Any, work: Path, files: Sequence[str], ids: Mapping[str, int], reader: Any, options: Any) -> None:
-    place = images_of(work).parent
+    """Once more where COLMAP has written nothing of some, not even that they have no features; raises the OSError that may have kept it from reading one."""
+    place, how = images_of(work).parent, {"reader_options": reader, "extraction_options": options, "device": pycolmap.Device.cpu}
     for _ in range(2):
-        pycolmap.extract_features(
-            database_path(work), place / "images", files, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
-        )
-        if not _check_readable(place, _without_features(pycolmap, work, ids, files)):
+        pycolmap.extract_features(database_path(work), place / "images", files, **how)
+        with pycolmap.Database.open(database_path(work)) as database:
+            left_out = [file for file in files if not database.exists_descriptors(ids[file])]
+        if not left_out:
             break
-
-
-def _without_features(pycolmap: Any, work: Path, ids: Mapping[str, int], files: Sequence[str]) -> list[str]:
-    """Those that COLMAP has written no features of, not even that there are none."""
-    with pycolmap.Database.open(database_path(work)) as database:
-        return [file for file in files if not database.exists_descriptors(ids[file])]
-
-
-def _check_readable(place: Path, files: Sequence[str]) -> bool:
-    """Whether there are any; raises the OSError that may have kept COLMAP from reading one, for it goes on without."""
-    for file in files:
-        (place / "images" / file).read_bytes()
-        if (mask := place / "masks" / f"{file}.png").exists():
-            mask.read_bytes()
-    return bool(files)
+        for path in [place / "images" / file for file in left_out] + [place / "masks" / f"{file}.png" for file in left_out]:
+            if path.parent.name == "images" or path.exists():
+                path.read_bytes()
 
 
 def likeness(work: Path, seed: int, safe_point: SafePoint) -> np.ndarray:
@@ -107,6 +97,21 @@ def likeness(work: Path, seed: int, safe_point: SafePoint) -> np.ndarray:
             descriptors.append(aggregated(every).copy())  # not a view of all
     safe_point()
     return likeness_of(descriptors, seed)
+
+
+def match_photographs(work: Path, images: Sequence[WorkImage], how: str, *, seed: int, workers: int, progress: Progress, safe_point: SafePoint) -> None:
+    """Verified matches of the pairs that `how` stands for; of retrieval also of more pairs of the photographs that overlap with few others."""
+    common: dict[str, Any] = {"seed": seed, "workers": workers, "progress": progress, "safe_point": safe_point}
+    if how in ("exhaustive", "sequential"):
+        match_pairs(work, images, pairs.all_pairs(len(images)) if how == "exhaustive" else pairs.sequential_pairs(len(images)), **common)
+        return
+    if how != "retrieval":
+        raise ValueError(f"matching {how!r}: expected 'exhaustive', 'retrieval' or 'sequential'")
+    alike = likeness(work, seed, safe_point)
+    match_pairs(work, images, pairs.retrieved_pairs(alike), **common)
+    near = neighbours(work, len(images))
+    weak = [i for i, others in near.items() if len(others) < FEW_NEIGHBOURS] + [i for part in pairs.components(near)[1:] for i in part]
+    match_pairs(work, images, pairs.wider_pairs(alike, weak, near), name="wider_", **common)
 
 
 def match_pairs(
@@ -132,7 +137,7 @@ def match_pairs(
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-    verified = set(verified_pairs(database_path(work)))
+    verified = inlier_counts(database_path(work))
     blocks: dict[str, list[tuple[int, int]]] = {}
     total = done = 0
     for number, block in enumerate(in_blocks(wanted)):

@@ -17,8 +17,7 @@ from efficientnerf.geometry.cameras import Similarity, closest_similarity, rays
 from pipeline.files import SafePoint, remove
 from stages.sfm import mapping
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
-from stages.sfm.database import database_path, inlier_counts
-from stages.sfm.images import WorkImage, images_of
+from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts
 
 LEAST, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
 TOLERANCE = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart
@@ -60,7 +59,7 @@ def merged(work: Path, images: Sequence[WorkImage], models: Sequence[Any], seed:
 
     work  the scratch folder whose database they are of
     """
-    parts = [_features(model, images) for model in models]
+    parts = [_features(model) for model in models]
     placed = {0: Similarity.identity()}
     left = list(range(1, len(models)))
     while left:
@@ -120,16 +119,16 @@ def _fitting(similarity: Similarity, ours: Sights, theirs: Sights) -> np.ndarray
 # ------------------------------------------------------------------------------------------------------ shared points
 
 
-def _features(model: Any, images: Sequence[WorkImage]) -> dict[int, tuple[np.ndarray, Sights]]:
+def _features(model: Any) -> dict[int, tuple[np.ndarray, Sights]]:
     """Of each registered photograph, by COLMAP's id: the numbers of the features that have a point, ascending, and these points."""
-    by_file, found = {image.file: image for image in images}, {}
+    found = {}
     for image_id in sorted(model.reg_image_ids()):
         image = model.images[image_id]
         numbers = np.array(image.get_observation_point2D_idxs(), np.int64)
         if not len(numbers):
             continue
         seen = [image.points2D[int(number)] for number in numbers]
-        camera = mapping.camera_of(model, image, by_file[image.name])
+        camera = mapping.camera_of(model, image)
         centre, direction = rays(camera, np.array([point.xy for point in seen]))
         xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
         order = np.argsort(numbers)
@@ -165,9 +164,7 @@ def _joined(parts: Sequence[Sights]) -> Sights:
 # ----------------------------------------------------------------------------------------------------------- one model
 
 
-def triangulated(
-    work: Path, images: Sequence[WorkImage], models: Sequence[Any], placed: Mapping[int, Similarity], seed: int, safe_point: SafePoint
-) -> Any:
+def triangulated(work: Path, images: Sequence[WorkImage], models: Sequence[Any], placed: Mapping[int, Similarity], seed: int, safe_point: SafePoint) -> Any:
     """A model of the photographs of all that are placed; one that is in several has its pose of the first."""
     with quiet_pycolmap() as pycolmap:
         whole = pycolmap.Reconstruction()

@@ -17,6 +17,9 @@ import numpy as np
 
 Pair = tuple[int, int]  # positions in the sorted list of images, the smaller first
 
+MAX_EXHAUSTIVE = 60  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
+OF_FEW, OF_MANY = 4096, 2048  # features of a photograph, at most: OF_MANY of more than MAX_EXHAUSTIVE photographs
+WIDER = 48  # photographs that are most like one, which it is compared with where it overlaps with few
 BLOCK_SIZE = 8  # images along a side of a block of pairs: between two blocks lies a safe point, a second or three apart
 OVERLAP = 10  # of sequential matching: images that follow each one
 KEYFRAMES = 40  # images of a sequence that are all matched with each other, for loop closure
@@ -31,8 +34,23 @@ AGGREGATED = 1500  # descriptors of an image, at most
 _LEVELS = 2**14  # of a component of a vector
 
 
+def features_for(count: int) -> int:
+    """The default limit for each of `count` photographs."""
+    return OF_FEW if count <= MAX_EXHAUSTIVE else OF_MANY
+
+
+def matching_for(count: int) -> str:
+    """The meaning of "auto"."""
+    return "exhaustive" if count <= MAX_EXHAUSTIVE else "retrieval"
+
+
 def all_pairs(count: int) -> set[Pair]:
     return {(i, j) for i in range(count) for j in range(i + 1, count)}
+
+
+def pairs_with(some: Iterable[int], count: int) -> set[Pair]:
+    """Each of some images with all others."""
+    return {ordered(i, j) for i in some for j in range(count) if i != j}
 
 
 def sequential_pairs(count: int) -> set[Pair]:
@@ -54,7 +72,7 @@ def retrieved_pairs(likeness: np.ndarray) -> set[Pair]:
     return wanted | {(i, i + offset) for i in range(count) for offset in FOLLOWING if i + offset < count}
 
 
-def wider_pairs(likeness: np.ndarray, weak: Iterable[int], neighbours: Mapping[int, set[int]], most: int) -> set[Pair]:
+def wider_pairs(likeness: np.ndarray, weak: Iterable[int], neighbours: Mapping[int, set[int]], most: int = WIDER) -> set[Pair]:
     """More pairs for the images that too few others were found to overlap with: the `most` that are most like each, and the neighbours of its neighbours.
 
     neighbours  images that each overlaps with
@@ -89,6 +107,19 @@ def in_blocks(wanted: Iterable[Pair]) -> list[list[Pair]]:
         else:
             blocks.append([(i, j)])
     return blocks
+
+
+def components(near: Mapping[int, set[int]]) -> list[list[int]]:
+    """Images that are joined by overlaps, the largest component first."""
+    left, found = set(near), []
+    while left:
+        part, edge = set[int](), {min(left)}
+        while edge:
+            part |= edge
+            edge = {j for i in edge for j in near[i]} - part
+        left -= part
+        found.append(sorted(part))
+    return sorted(found, key=lambda part: (-len(part), part))
 
 
 # ------------------------------------------------------------------------------------------------------------ likeness
@@ -143,9 +174,7 @@ def _nearest(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
     """(N,) the nearest word of each; of equals the first. Every sum is a whole number below 2^24, exact in 32 bits in any order."""
     w = words.astype(np.float32)
     norms = (words.astype(np.int64) ** 2).sum(1).astype(np.float32)
-    found = [
-        np.argmax(2.0 * (descriptors[start : start + 4096].astype(np.float32) @ w.T) - norms, axis=1) for start in range(0, len(descriptors), 4096)
-    ]
+    found = [np.argmax(2.0 * (descriptors[start : start + 4096].astype(np.float32) @ w.T) - norms, axis=1) for start in range(0, len(descriptors), 4096)]
     return np.concatenate(found)
 
 

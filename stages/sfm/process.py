@@ -19,18 +19,16 @@ import os
 import select
 import signal
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from pipeline import errors
 from pipeline.errors import StageFailed
+from pipeline.executors.child import command_for
 from pipeline.text import printable
 
-# An entry of sys.path that is empty stands for the working folder, which may hold anything: the parent's own entries take its place first.
-_BOOTSTRAP = "import sys; sys.path[:] = sys.argv[1:]; from stages.sfm.child import main; main()"
 _HANDLED = (signal.SIGINT, signal.SIGTERM)
 _TAIL_BYTES = 16384  # of the child's standard error that are kept
 _SHOWN_LINES, _SHOWN_CHARACTERS = 3, 240
@@ -91,7 +89,7 @@ class _Child:
         # Signals that arrive while the interpreter starts wait until the child ignores them; the mask is inherited.
         former = signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
         try:
-            self.process = subprocess.Popen(command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+            self.process = subprocess.Popen(command_for("stages.sfm.child"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, former)
         self._tail, self._said, self._looked = bytearray(), bytearray(), 0  # _looked: bytes of _said without a line end
@@ -174,36 +172,6 @@ class _Child:
         """The last lines of its standard error, without stack traces."""
         lines = [line for line in self._tail.decode(errors="replace").splitlines() if line.strip() and not line.startswith(_FRAMES)]
         return [printable(line.strip(), _SHOWN_CHARACTERS) for line in lines[-_SHOWN_LINES:]]
-
-
-def command() -> list[str]:
-    """The command line of the child: this interpreter with its options, and where it finds modules."""
-    path = [entry or _working_folder() for entry in sys.path]
-    return [interpreter(), *_options(), "-c", _BOOTSTRAP, *(entry for entry in path if entry)]
-
-
-def interpreter() -> str:
-    """The path of the interpreter that runs; StageFailed where there is none, as in a program that embeds Python."""
-    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    for candidate in (sys.executable, os.path.join(sys.exec_prefix, "bin", version), getattr(sys, "_base_executable", ""), "/proc/self/exe"):
-        if candidate and os.path.basename(os.path.realpath(candidate)).startswith(("python", "pypy")) and os.access(candidate, os.X_OK):
-            return candidate
-    raise StageFailed(f"poses: no Python interpreter to run structure from motion in (sys.executable is {sys.executable!r}). Set it to one of {version}.")
-
-
-def _options() -> Iterator[str]:
-    flags = sys.flags
-    for option, given in (("-I", flags.isolated), ("-E", flags.ignore_environment), ("-s", flags.no_user_site), ("-B", flags.dont_write_bytecode)):
-        if given:
-            yield option
-    yield from ("-X", f"utf8={flags.utf8_mode}")  # the names of files mean the same in both
-
-
-def _working_folder() -> str:
-    try:
-        return os.getcwd()
-    except OSError:
-        return ""
 
 
 def _raise(message: Mapping[str, Any]) -> NoReturn:

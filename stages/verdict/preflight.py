@@ -25,11 +25,13 @@ from stages.formats.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.capture import FOREGROUND
 from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
+from stages.io.reader import PhotoReader
 from stages.masking.first_training import FIRST, RAYS
 from stages.masking.first_training import SIDE as SIDE_OF_FIRST
 from stages.masking.turning import masks_of_turning_subject
 from stages.poses.memory import decoding_needed, features_needed
-from stages.sfm import ladder, pairs
+from stages.sfm import pairs
+from stages.sfm.attempts import MORE_FEATURES
 from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
 from stages.train.memory import first_training_needed
 from stages.verdict import looks, run_forecast
@@ -199,7 +201,7 @@ def _groups(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> list[list[int
     for i, j in overlaps:
         near[i].add(j)
         near[j].add(i)
-    return ladder.components(near)
+    return pairs.components(near)
 
 
 def _share_in_largest(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> float:
@@ -251,7 +253,7 @@ def _with_turning(problems: Sequence[Problem], files: Mapping[str, Path]) -> lis
     if not any(each.what == "stands still" for each in problems):
         return list(problems)
     with tempfile.TemporaryDirectory() as folder:
-        turns = masks_of_turning_subject(files, Path(folder), safe_point=lambda: None, progress=lambda *_: None)
+        turns = masks_of_turning_subject(files, Path(folder), PhotoReader(Path(folder) / "photographs"), safe_point=lambda: None, progress=lambda *_: None)
     return [TURNING if turns and each.what == "stands still" else each for each in problems]
 
 
@@ -282,13 +284,13 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
 def forecast(
     first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool, joined: float
 ) -> dict[str, Any]:
-    """Seconds of the stage poses on a machine that does nothing else, where the first step of `stages.sfm.ladder` suffices and where all are tried, and bytes
+    """Seconds of the stage poses on a machine that does nothing else, where the mapper's first run suffices and where all is tried, and bytes
     at its peak; roughly.
 
     joined  share of the photographs that overlap, in the largest component
     """
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
-    features = resolved(settings.max_features) or ladder.features_for(count)
+    features = resolved(settings.max_features) or pairs.features_for(count)
     before, rgb = time.thread_time(), np.zeros((1, 1, 3), np.uint8)
     with contextlib.suppress(UnreadableImage):
         rgb = read_photo(files[first], side).rgb
@@ -304,15 +306,15 @@ def forecast(
     memory = max(memory, features_needed(sizes * -(-count // len(sizes)), side, features, threads, networks=settings.features_model != "off").total)
     reduced = [working_size(*size, side) for size in sizes]
     pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
-    how = ladder.matching_for(count) if settings.matching == "auto" else settings.matching
+    how = pairs.matching_for(count) if settings.matching == "auto" else settings.matching
     compared = min(count * (count - 1) // 2, 10**9 if how == "exhaustive" else PAIRS_AN_IMAGE * count)
     finding = count * float(np.mean(pixels)) / 1e6 * FEATURES_A_MEGAPIXEL / threads
     detected, workers = min(features, count_features(rgb)), max(1, min(threads, MAX_WORKERS, compared // PAIRS_A_WORKER))
     mapping = AN_IMAGE * count * max(1.0, count / 50) ** 0.4
     seconds = finding + compared * pair_seconds(detected) / workers + mapping
     weak = max(LEAST_WEAK, 1 - joined)  # matched once more with what they have, and once with more features
-    again = min(compared, weak * count * min(ladder.WIDER, count - 1)) * (pair_seconds(detected) + pair_seconds(ladder.MORE_FEATURES * detected))
-    most = seconds + ladder.MORE_FEATURES * weak * finding + again / workers + MAPPED_AGAIN * mapping
+    again = min(compared, weak * count * min(pairs.WIDER, count - 1)) * (pair_seconds(detected) + pair_seconds(MORE_FEATURES * detected))
+    most = seconds + MORE_FEATURES * weak * finding + again / workers + MAPPED_AGAIN * mapping
     return {
         "poses_seconds": round(reading + slower * seconds, 1),
         "poses_seconds_at_most": round(reading + slower * most, 1),

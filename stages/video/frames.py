@@ -8,9 +8,9 @@ Memory does not grow with the length of a video but for three numbers a frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -21,7 +21,7 @@ from efficientnerf.capture import frame_choice as choice
 from efficientnerf.capture.frame_motion import DETAIL, TRACKED, Motion, sharpness
 from pipeline.files import atomic, remove
 from stages.io.png import FAST
-from stages.scratch import note, noted, once
+from stages.scratch import note, noted, once, same_as
 from stages.video.reading import Frame, UnreadableVideo, Video, opened
 
 SLOWEST = 12.0  # frames a second that are looked at at least; of videos with more than twice as many, every n-th
@@ -109,7 +109,7 @@ def _looked(name: str, path: Path, place: int, reader: Reader) -> Looked:
         reader.work.mkdir(parents=True, exist_ok=True)
         with _naming(name):
             found = look(path, reader)
-        note(file, {field: getattr(found, field) for field in Looked.__dataclass_fields__})
+        note(file, asdict(found))
     if found.damaged:
         reader.warn(f"{name}: damaged; {found.damaged} of its frames or packets are left out.")
     if found.hdr:
@@ -122,17 +122,13 @@ def _check(found: Looked, outputs: object) -> None:
         raise ValueError("lists of different lengths")
 
 
-class _naming:
+@contextlib.contextmanager
+def _naming(name: str) -> Iterator[None]:
     """UnreadableVideo with the video's name before its text."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, UnreadableVideo):
-            raise UnreadableVideo(f"{self.name}: {error}") from error
+    try:
+        yield
+    except UnreadableVideo as error:
+        raise UnreadableVideo(f"{name}: {error}") from error
 
 
 def look(path: Path, reader: Reader) -> Looked:
@@ -165,7 +161,7 @@ def _written(name: str, path: Path, place: int, numbers: list[int], max_side: in
     """The second reading: the chosen frames as PNG by number, or those that an earlier call wrote."""
     folder, file = reader.work / f"frames_{place}", reader.work / f"frames_{place}.json"
     targets = {number: folder / f"{number:06d}.png" for number in numbers}
-    if noted(file, list[int], once(reader.warn), partial(_same, numbers)) is not None:
+    if noted(file, list[int], once(reader.warn), same_as(numbers)) is not None:
         return targets
     remove(folder)
     folder.mkdir(parents=True)
@@ -183,11 +179,6 @@ def _written(name: str, path: Path, place: int, numbers: list[int], max_side: in
         raise UnreadableVideo(f"{name}: unreadable: {len(left)} frames that were there a moment ago are not. Was the file changed?")
     note(file, numbers, list(targets.values()))
     return targets
-
-
-def _same(numbers: list[int], found: list[int], outputs: object) -> None:
-    if found != numbers:
-        raise ValueError("of another choice of frames")
 
 
 def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> None:

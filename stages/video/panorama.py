@@ -7,7 +7,6 @@ panorama shows who carries the camera.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,7 @@ from pipeline.files import atomic, remove
 from stages.io.photo import read_photo
 from stages.io.pictures import MAX_SIDE, UnreadableImage, opened
 from stages.io.png import FAST
-from stages.scratch import note, noted, once
+from stages.scratch import note, noted, once, same_as
 
 VIEWS = 8
 _MAKER, _EXIF = 271, 34665
@@ -74,7 +73,7 @@ def views_of(
     for place, (name, path) in enumerate(pictures.items()):
         folder, done = work / f"panorama_{place}", work / f"panorama_{place}.json"
         targets = {f"{name}/{360 * view // VIEWS:03d}.png": folder / f"{view}.png" for view in range(VIEWS)}
-        if noted(done, list[str], warn_once, partial(_same, list(targets))) is None:
+        if noted(done, list[str], warn_once, same_as(list(targets))) is None:
             remove(folder)
             folder.mkdir(parents=True)
             try:
@@ -89,11 +88,6 @@ def views_of(
         progress(place + 1, len(pictures), "cutting panoramas")
         found |= targets
     return found
-
-
-def _same(names: list[str], found: list[str], outputs: object) -> None:
-    if found != names:
-        raise ValueError("of another panorama")
 
 
 def _write(pixels: np.ndarray, path: Path) -> None:

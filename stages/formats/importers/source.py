@@ -46,9 +46,9 @@ class ImportSettings(Protocol):
     def llff_factor(self) -> int | Auto: ...
 
 
-def abbreviated(names: Sequence[str]) -> str:
+def abbreviated(names: Sequence[str], most: int = MAX_NAMES) -> str:
     """The first few names, and how many more there are."""
-    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def name_key(name: str) -> str:

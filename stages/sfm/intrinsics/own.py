@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.images import SafePoint, WorkImage
+from stages.sfm.database import WorkImage
+from stages.sfm.images import SafePoint
 from stages.sfm.mapping import bundle_adjust, cameras_with_fixed_focal, thinned
 
 # Richer from left to right: what each photograph has of its own, and what is refined then. Distortion stays that of the lens.

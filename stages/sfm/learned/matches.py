@@ -11,8 +11,8 @@ from pipeline.files import SafePoint
 from stages.cores import in_order
 from stages.io.png import read_png
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, database_path, forget, pair_id_of
-from stages.sfm.images import Progress, WorkImage, images_of
+from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, forget, images_of, pair_id_of
+from stages.sfm.images import Progress
 from stages.sfm.learned.networks import FEWEST, Detector, Features, Matcher
 from stages.sfm.pairs import Pair, ordered
 

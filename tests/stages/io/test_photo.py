@@ -46,7 +46,7 @@ def test_what_is_transparent_may_count(masks: dict[str, Path | None], masked: bo
     Image.fromarray(rgba).save(tmp_path / "a.png")
     quiet: dict[str, Any] = {"progress": lambda *_: None, "safe_point": lambda: None, "warn": lambda *_: None}
     for _ in range(2):  # the second finds what the first left
-        images, _ = prepare_images(tmp_path, ["a.png"], max_side=60, features=100, seed=0, masks=masks, work=tmp_path / "work", **quiet)
+        images, _ = prepare_images({"a.png": tmp_path / "a.png"}, max_side=60, features=100, seed=0, masks=masks, work=tmp_path / "work", **quiet)
         assert len(images) == 1
         assert (tmp_path / "work/masks" / f"{images[0].file}.png").exists() == masked
 

@@ -17,6 +17,7 @@ from stages.formats.importers.masks import masks_of
 from stages.formats.importers.source import Source
 from stages.io.capture import Capture, Photo
 from stages.io.photo import read_mask_file, read_photo
+from stages.io.reader import PhotoReader
 from stages.masking import photographs
 from stages.masking.polarity import kept_white
 from stages.poses.settings import PosesSettings
@@ -70,7 +71,7 @@ def test_masks_are_found_by_the_names_that_other_programs_give_them(tmp_path: Pa
 def test_masks_keep_white_from_here_on(tmp_path: Path, black: bool, polarity: str) -> None:
     paths, masks = sources(tmp_path, drawn, black=black)
     events: list[dict[str, Any]] = []
-    kept = kept_white(job_in(tmp_path, events, mask_polarity=polarity), paths, masks)
+    kept = kept_white(job_in(tmp_path, events, mask_polarity=polarity), paths, masks, PhotoReader())
     assert any("keep what is black" in event["text"] for event in events) == (polarity == "black")
     assert bool(kept.inverted) == (polarity == "auto" and black)
     for index, camera in enumerate(captures.cameras()):
@@ -78,7 +79,7 @@ def test_masks_keep_white_from_here_on(tmp_path: Path, black: bool, polarity: st
         np.testing.assert_array_equal(read_mask_file(kept.masks[camera.name], photo), inside != (black != (polarity == "black")))
         if kept.inverted:
             np.testing.assert_array_equal(read_mask_file(kept.inverted[camera.name], photo), inside)
-    assert kept_white(job_in(tmp_path, [], masks="ignore"), paths, masks).masks == masks
+    assert kept_white(job_in(tmp_path, [], masks="ignore"), paths, masks, PhotoReader()).masks == masks
 
 
 @pytest.mark.parametrize("surroundings", [True, False])
@@ -98,9 +99,9 @@ def test_cameras_show_whether_black_is_one_thing(tmp_path: Path, draw: Any, surr
     job = job_in(tmp_path, events)
     if draw is wandering and not surroundings:
         with pytest.raises(BadInput, match="no cameras"):
-            photographs.cameras_of_photographs(job, lambda *_, **__: None)
+            photographs.cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
         return
-    capture = photographs.cameras_of_photographs(job, lambda *_, **__: None)
+    capture = photographs.cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
     assert any("keep what is black" in event.get("text", "") for event in events) == (draw is drawn)
     for index, photo in enumerate(capture.photos):
         assert photo.mask is not None

@@ -15,6 +15,7 @@ from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo
 from stages.io.png import write_png
+from stages.io.reader import PhotoReader
 from stages.masking.photographs import _of_turning_subject, mask_choice
 from stages.masking.turning import border_stands_still, masks_of_turning_subject
 from stages.poses.run import read
@@ -41,14 +42,14 @@ def turntable(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Came
 
 
 def found_in(paths: dict[str, Path], work: Path) -> dict[str, Path]:
-    return masks_of_turning_subject(paths, work, safe_point=lambda: None, progress=lambda *_: None)
+    return masks_of_turning_subject(paths, work, PhotoReader(work / "photographs"), safe_point=lambda: None, progress=lambda *_: None)
 
 
 def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
     folder, cameras = turntable
     events: list[dict[str, Any]] = []
     job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=folder, stage="poses", report=events.append)
-    capture = read(job, PosesSettings(), job.warn)
+    capture = read(job, PosesSettings(), PhotoReader(tmp_path / "photographs"), job.warn)
     assert capture.facts[BACKGROUND] == LEFT_OUT
     assert any("the background stands still" in event.get("text", "") for event in events)
     assert mask_choice(job.settings, capture.facts) == "silhouette"
@@ -68,14 +69,14 @@ def test_what_moves_or_has_no_texture_is_no_standing_background(turntable: tuple
     plain = [turntables.picture(camera, number, wall=np.full((240, 320, 3), 200.0)) for number, camera in enumerate(cameras)]
     few = dict(list({path.name: path for path in sorted(turntable[0].iterdir())}.items())[:7])
     for name, paths in (("moving", written(tmp_path / "moving", moving)), ("plain", written(tmp_path / "plain", plain)), ("few", few)):
-        assert not border_stands_still(paths, lambda: None), name
+        assert not border_stands_still(paths, PhotoReader(tmp_path / "photographs"), lambda: None), name
         assert not found_in(paths, tmp_path / f"{name} masks"), name
 
 
 def test_nothing_is_left_out_where_nothing_moves_or_all_inside_a_frame_does(tmp_path: Path) -> None:
     camera = turntables.cameras(1)[0]
     same = written(tmp_path / "same", [turntables.picture(camera, number) for number in range(9)])
-    assert border_stands_still(same, lambda: None)
+    assert border_stands_still(same, PhotoReader(tmp_path / "photographs"), lambda: None)
     assert not found_in(same, tmp_path / "same masks")
     rng = np.random.default_rng(0)
     frame = turntables.wall_picture()
@@ -115,7 +116,7 @@ def test_few_photographs_by_the_subject_alone_leave_no_others_out(
         return Capture(kind="photographs", photos=photos, background=None, facts={"pairs_agreeing": agreeing})
 
     job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=tmp_path, stage="poses")
-    capture, seen = _of_turning_subject(job, find, paths)
+    capture, seen = _of_turning_subject(job, find, paths, PhotoReader())
     assert not seen
     assert len(capture.photos) == (alone[0] if used == "cameras_of_subject" else whole[0])
     assert (capture.facts.get(BACKGROUND) == LEFT_OUT) == (used == "cameras_of_subject")

@@ -12,8 +12,7 @@ from PIL import Image
 from benchmarks.poses import aligned_errors
 from efficientnerf.geometry.cameras import Camera, project
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import database_path, open_database
-from stages.sfm.images import WorkImage
+from stages.sfm.database import WorkImage, database_path, open_database
 
 SIZE = 480, 360
 COUNT, POINTS = 9, 250

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from stages.sfm import feature_cache, matches
-from stages.sfm.database import FEATURES, database_path, open_database, rows_of
-from stages.sfm.images import WorkImage, prepare_images
+from stages.sfm.database import FEATURES, WorkImage, database_path, open_database, rows_of
+from stages.sfm.images import prepare_images
 
 QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
 
@@ -40,7 +40,7 @@ def photographs(tmp_path: Path) -> Path:
 def opened(photographs: Path, work: Path, **changes: Any) -> list[WorkImage]:
     names = sorted(path.name for path in photographs.iterdir())
     how: dict[str, Any] = {"max_side": 256, "features": 200, "seed": 0, "masks": {}, "work": work, "warn": print, **QUIET, **changes}
-    images, _ = prepare_images(photographs, names, **how)
+    images, _ = prepare_images({name: photographs / name for name in names}, **how)
     open_database(work, images, print)
     return images
 

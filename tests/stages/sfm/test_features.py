@@ -24,9 +24,8 @@ def test_masked_parts_give_no_features(tmp_path: Path) -> None:
     mask[:, 240:] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
     quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
-    images, _ = prepare_images(
-        STILL_LIFE, names, max_side=240, features=500, seed=0, masks={names[1]: tmp_path / "mask.png"}, work=tmp_path / "w", warn=print, **quiet
-    )
+    paths = {name: STILL_LIFE / name for name in names}
+    images, _ = prepare_images(paths, max_side=240, features=500, seed=0, masks={names[1]: tmp_path / "mask.png"}, work=tmp_path / "w", warn=print, **quiet)
     open_database(tmp_path / "w", images, print)
     matches.extract_features(tmp_path / "w", images, features=500, **quiet)
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(tmp_path / "w")) as database:

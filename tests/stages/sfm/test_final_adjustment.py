@@ -11,7 +11,7 @@ import pytest
 from benchmarks.poses import aligned_errors
 from stages.sfm import mapping
 from stages.sfm.colmap import import_pycolmap
-from stages.sfm.images import WorkImage
+from stages.sfm.database import WorkImage
 
 
 def made_model() -> tuple[Any, list[WorkImage], np.ndarray]:

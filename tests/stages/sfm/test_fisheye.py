@@ -13,8 +13,9 @@ from benchmarks.poses import aligned_errors
 from benchmarks.scenes import room as rooms
 from efficientnerf.geometry.cameras import Camera, rays
 from stages.io.photo import read_photo
-from stages.sfm.images import WorkImage, prepare_images
-from stages.sfm.reconstruction import find_cameras
+from stages.sfm.cameras import find_cameras
+from stages.sfm.database import WorkImage
+from stages.sfm.images import prepare_images
 
 WIDTH, HEIGHT = 400, 300
 LENS = (132.0, 132.4, 200.0, 150.0, 0.03, -0.008, 0.002, -0.0005)  # 174 degrees from left to right
@@ -44,7 +45,7 @@ def test_cameras_and_lens_are_those_that_took_the_photographs(room: tuple[Path, 
 
 def prepared(folder: Path, work: Path, lens: str) -> list[WorkImage]:
     names = sorted(path.name for path in folder.iterdir())
-    return prepare_images(folder, names, max_side=100, features=100, seed=0, masks={}, lens=lens, work=work, **QUIET)[0]
+    return prepare_images({name: folder / name for name in names}, max_side=100, features=100, seed=0, masks={}, lens=lens, work=work, **QUIET)[0]
 
 
 def test_the_lens_is_told_by_exif_and_overruled_by_the_setting(room: tuple[Path, list[Camera]], tmp_path: Path) -> None:

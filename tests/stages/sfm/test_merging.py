@@ -11,11 +11,12 @@ import pytest
 
 from benchmarks.poses import aligned_errors
 from efficientnerf.geometry.cameras import Similarity
-from stages.sfm import ladder, mapping, merging
+from stages.sfm import attempts, mapping, matches, merging
+from stages.sfm.attempts import Search
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import PAIRS, forget, pair_id_of
-from stages.sfm.images import WorkImage
+from stages.sfm.database import PAIRS, WorkImage, forget, pair_id_of
 from stages.sfm.merging import Sights
+from stages.sfm.reconstruction import find_models
 from tests.stages.sfm.made_matches import COUNT, QUIET, cameras, matched, off, registered
 
 MOVED = Similarity(3.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, -2, 1]))
@@ -54,7 +55,7 @@ def test_two_sub_models_become_one_by_photographs_or_matches(scene: tuple[Path, 
     assert [image.name for image in registered(whole)] == [image.file for image in scene[1]]
     assert off(whole, TRUTH) < 1.5 * off(scene[2], TRUTH) < 0.01
     assert whole.compute_mean_reprojection_error() < 1.1 * scene[2].compute_mean_reprojection_error()
-    assert mapping.match_agreement(scene[0], scene[1], whole) > 0.97
+    assert mapping.match_agreement(scene[0], whole) > 0.97
     again = merged(scene, *parts)[0]
     for one, other in zip(registered(whole), registered(again), strict=True):
         assert one.cam_from_world().matrix().tobytes() == other.cam_from_world().matrix().tobytes()
@@ -115,18 +116,18 @@ def test_a_similarity_is_found_among_wrong_matches_unless_most_are(wrong: float,
     assert merging.similarity_of(few[0], few[1], seed=0) is None
 
 
-# ------------------------------------------------------------------------------------------------------- on the ladder
+# ---------------------------------------------------------------------------------------------------------- attempts
 
 
-def climbed(scene: tuple[Path, list[WorkImage], Any], parts: list[Any], monkeypatch: pytest.MonkeyPatch) -> ladder.Found:
-    """The ladder, of which the mapper leaves these sub-models, and finds no camera more."""
+def climbed(scene: tuple[Path, list[WorkImage], Any], parts: list[Any], monkeypatch: pytest.MonkeyPatch) -> Search:
+    """All attempts, of which the mapper leaves these sub-models, and finds no camera more."""
     work, images, _ = scene
     monkeypatch.setattr(mapping, "sub_models", lambda work, images, seed, options, **_: parts if options is mapping.DEFAULTS else [])
     monkeypatch.setattr(mapping, "continued", lambda *_, **__: [])
-    monkeypatch.setattr(ladder, "match", lambda *_, **__: None)
-    monkeypatch.setattr(ladder, "_match_again", lambda *_, **__: None)
-    monkeypatch.setattr(ladder, "_detect_more", lambda *_, **__: None)
-    return ladder.find_models(work, images, "exhaustive", features=100, seed=0, threads=1, **QUIET)
+    monkeypatch.setattr(matches, "match_photographs", lambda *_, **__: None)
+    monkeypatch.setattr(attempts, "match_again", lambda *_, **__: None)
+    monkeypatch.setattr(attempts, "find_features_again", lambda *_, **__: None)
+    return find_models(Search(work, images, 0, 100, 1, **QUIET), "exhaustive")
 
 
 def test_a_merge_that_contradicts_the_matches_is_refused(scene: tuple[Path, list[WorkImage], Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,9 +147,9 @@ def test_a_merge_that_contradicts_the_matches_is_refused(scene: tuple[Path, list
     monkeypatch.setattr(merging, "similarity_of", false_place)
     found = climbed(scene, parts, monkeypatch)
     assert asked
-    rungs = {str(rung["rung"]): rung for rung in found.rungs}
-    assert rungs[ladder.MERGED]["agreeing"] < rungs["exhaustive"]["agreeing"] - ladder.KEPT  # type: ignore[operator]
-    assert found.rung == "exhaustive"
+    rungs = {str(rung["rung"]): rung for rung in found.tried}
+    assert rungs[attempts.MERGED]["agreeing"] < rungs["exhaustive"]["agreeing"] - attempts.KEPT  # type: ignore[operator]
+    assert found.best == "exhaustive"
     assert found.models[0].num_reg_images() == 5
     errors = aligned_errors(np.array([image.projection_center() for image in registered(found.models[0])]), np.array([c.centre for c in TRUTH[:5]]))
     assert errors.max() < 0.02

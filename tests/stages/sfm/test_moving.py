@@ -9,7 +9,9 @@ import pytest
 
 from efficientnerf.capture.moving_parts import OF_A_PART, motions, moving_parts, share_of_parts
 from efficientnerf.geometry.cameras import project
-from stages.sfm import ladder, mapping
+from stages.sfm import mapping
+from stages.sfm.attempts import Search
+from stages.sfm.reconstruction import find_models
 from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, SIZE, cameras, clouds, matched
 
 BALL = 60  # points that move
@@ -103,7 +105,7 @@ def test_the_share_is_that_of_the_outlines_of_what_lies_together() -> None:
 @pytest.mark.parametrize("elsewhere", [0, BALL])
 def test_the_mapper_s_cameras_show_what_moved(tmp_path: Path, elsewhere: int) -> None:
     images = matched(tmp_path, list(TAKEN.values()), elsewhere)
-    found = ladder.find_models(tmp_path, images, "exhaustive", features=POINTS, seed=0, threads=1, **QUIET)
+    found = find_models(Search(tmp_path, images, 0, POINTS, 1, **QUIET), "exhaustive")
     model = mapping.bundle_adjusted(found.work, images, found.models[0], QUIET["safe_point"])
     shares = mapping.moving_shares(found.work, images, model, QUIET["safe_point"])
     assert sorted(shares) == ([image.name for image in images] if elsewhere else [])

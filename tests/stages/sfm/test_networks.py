@@ -13,12 +13,14 @@ import pytest
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
+from stages.io.reader import PhotoReader
 from stages.masking.photographs import cameras_of_photographs
 from stages.poses.settings import PosesSettings
-from stages.sfm import ladder, matches
+from stages.sfm import attempts, matches
+from stages.sfm.cameras import find_cameras
 from stages.sfm.database import FEATURES, forget
 from stages.sfm.learned.matches import NEIGHBOURS, pairs_of
-from stages.sfm.reconstruction import find_cameras, reconstruct
+from stages.sfm.reconstruction import Request, reconstruct
 
 pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
@@ -134,7 +136,7 @@ def test_a_missing_file_package_or_second_network_is_a_usage_error(tmp_path: Pat
         given_networks(other, path)
     job = Job(settings=PosesSettings(features_model=path), out=tmp_path / "out", work=tmp_path / "work", source=STILL_LIFE)
     with pytest.raises(UsageError):  # before cameras are looked for
-        cameras_of_photographs(job, lambda *_, **__: None)
+        cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[rembg\]'"):
         given_networks(path, other)
@@ -169,7 +171,7 @@ def test_cameras_are_found_where_sift_finds_none(tmp_path: Path) -> None:
     networks = detector(tmp_path / "d.onnx"), matcher(tmp_path / "m.onnx")
     capture = find_cameras(STILL_LIFE, names, work=tmp_path / "work", networks=networks, **asked)
     rungs: list[dict[str, Any]] = capture.facts["rungs"]  # type: ignore[assignment]
-    first = next(number for number, rung in enumerate(rungs) if rung["rung"] in (ladder.NETWORK, ladder.NETWORK_ANEW))
+    first = next(number for number, rung in enumerate(rungs) if rung["rung"] in (attempts.NETWORK, attempts.NETWORK_ANEW))
     assert max(rung["registered"] for rung in rungs[:first]) < 3
     assert len(capture.photos) == 6
     assert errors_of(capture, truth).max() < 0.05
@@ -189,9 +191,10 @@ def test_a_photograph_without_sift_features_gets_its_camera(tmp_path: Path, monk
 
     monkeypatch.setattr(matches, "extract_features", without_the_third)
     networks = detector(tmp_path / "d.onnx", "COLMAP"), matcher(tmp_path / "m.onnx", "COLMAP")
-    asked: dict[str, Any] = {"max_side": 360, "features": 4096, "matching": "auto", "seed": 0, "masks": {}, **QUIET}
-    usual = reconstruct(STILL_LIFE, names, work=tmp_path / "without", threads=1, **asked)
-    found = [reconstruct(STILL_LIFE, names, work=tmp_path / f"with {threads}", threads=threads, networks=networks, **asked) for threads in (1, 2)]
+    paths = {name: STILL_LIFE / name for name in names}
+    usual = reconstruct(Request(STILL_LIFE, paths, tmp_path / "without", 360, 4096, threads=1), **QUIET)
+    asked = [Request(STILL_LIFE, paths, tmp_path / f"with {threads}", 360, 4096, threads=threads, networks=networks) for threads in (1, 2)]
+    found = [reconstruct(request, **QUIET) for request in asked]
     assert [name for name, _ in usual.rejected] == [names[2]]
     before, after = (list(capture.facts["rungs"]) for capture in (usual, found[0]))  # type: ignore[call-overload]
     assert after[: len(before)] == before, "what is tried before it is the same"

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.poses import aligned_errors
 from stages.sfm.colmap import import_pycolmap
-from stages.sfm.images import WorkImage
+from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics import own as own_intrinsics
 from stages.sfm.intrinsics.own import FOCAL_LENGTH, PRINCIPAL_POINT, with_own_intrinsics
 

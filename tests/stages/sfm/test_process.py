@@ -45,10 +45,10 @@ def child_does(monkeypatch: pytest.MonkeyPatch, body: str) -> None:
     """Let the child run this body of `capture_for(arguments, progress, safe_point, warn)`."""
     lines = "\n".join(f"    {line}" for line in body.splitlines())
     code = (
-        "import sys; sys.path[:] = sys.argv[1:]\nimport ctypes, os, signal, time\nfrom stages.sfm import child, reconstruction\n"
-        f"def capture_for(arguments, progress, safe_point, warn):\n{lines}\nreconstruction.capture_for = capture_for\nchild.main()\n"
+        f"import sys; sys.path[:] = {[entry or os.getcwd() for entry in sys.path]!r}\nimport ctypes, os, signal, time\nfrom stages.sfm import cameras, child\n"
+        f"def capture_for(arguments, progress, safe_point, warn):\n{lines}\ncameras.capture_for = capture_for\nchild.main()\n"
     )
-    monkeypatch.setattr(process, "_BOOTSTRAP", code)
+    monkeypatch.setattr(process, "command_for", lambda module: [sys.executable, "-c", code])
 
 
 def test_progress_warnings_and_the_result_come_through_in_order(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,22 +10,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.sfm import ladder, mapping
+from stages.sfm import attempts, mapping
+from stages.sfm.attempts import Search
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, copy_with_own_cameras, database_path
-from stages.sfm.images import WorkImage
+from stages.sfm.database import FEATURES, PAIRS, WorkImage, copy_with_own_cameras, database_path
 from stages.sfm.intrinsics import zoom
+from stages.sfm.reconstruction import find_models
 from stages.verdict.verdict import DOUBTFUL
 from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, cameras, matched, off, registered
 
 ZOOMED = tuple(400.0 / (1.0, 0.8, 0.65)[k % 3] for k in range(COUNT))
 
 
-def found_for(work: Path, images: list[WorkImage]) -> ladder.Found:
-    return ladder.find_models(work, images, "exhaustive", features=POINTS, seed=0, threads=1, **QUIET)
+def found_for(work: Path, images: list[WorkImage]) -> Search:
+    return find_models(Search(work, images, 0, POINTS, 1, **QUIET), "exhaustive")
 
 
-def numbers(found: ladder.Found) -> list[bytes]:
+def numbers(found: Search) -> list[bytes]:
     model = found.models[0]
     return [np.concatenate([model.cameras[i.camera_id].params, i.cam_from_world().matrix().ravel()]).tobytes() for i in registered(model)]
 
@@ -34,10 +35,10 @@ def test_a_zoom_that_changed_gives_each_photograph_its_focal_length(tmp_path: Pa
     taken = cameras(ZOOMED)
     images = matched(tmp_path, taken)
     found = found_for(tmp_path, images)
-    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", ladder.EACH]
-    one, each = (float(rung["agreeing"]) for rung in found.rungs)  # type: ignore[arg-type]
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.EACH]
+    one, each = (float(rung["agreeing"]) for rung in found.tried)  # type: ignore[arg-type]
     assert one < DOUBTFUL < 0.98 < each
-    assert (found.rung, found.work) == (ladder.EACH, tmp_path / "own_cameras")
+    assert (found.best, found.work) == (attempts.EACH, tmp_path / "own_cameras")
     model = found.models[0]
     assert [image.name for image in registered(model)] == [image.file for image in images]
     assert [model.cameras[image.camera_id].focal_length for image in registered(model)] == pytest.approx(ZOOMED, rel=0.01)
@@ -52,11 +53,11 @@ def test_two_zooms_are_told_where_the_matches_agree_with_one(tmp_path: Path) -> 
     taken = cameras((400.0,) * 5 + (520.0,) * 4)
     images = matched(tmp_path, taken)
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    assert mapping.match_agreement(tmp_path, images, shared) > DOUBTFUL
+    assert mapping.match_agreement(tmp_path, shared) > DOUBTFUL
     assert off(shared, taken) > 0.05
-    assert zoom.focal_length_spread(shared) > ladder.SPREAD
+    assert zoom.focal_length_spread(shared) > attempts.SPREAD
     found = found_for(tmp_path, images)
-    assert found.rung == ladder.EACH
+    assert found.best == attempts.EACH
     assert zoom.focal_length_spread(found.models[0]) < 1.01
     assert off(found.models[0], taken) < 0.01
 
@@ -66,16 +67,16 @@ def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -
     taken = cameras(cut=cut)
     images = matched(tmp_path, taken)
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    assert zoom.principal_point_spread(shared) > ladder.APART
+    assert zoom.principal_point_spread(shared) > attempts.APART
     found = found_for(tmp_path, images)
-    assert found.rung == ladder.CROPPED
+    assert found.best == attempts.CROPPED
     model = found.models[0]
     lens = np.array([model.cameras[image.camera_id].params for image in registered(model)])
     assert np.ptp(lens[:, [0, 3]], axis=0).max() == 0.0
     assert lens[0, 0] == pytest.approx(400.0, rel=0.08)
     true = np.array([camera.params[1:3] for camera in taken])
     assert (lens[:, 1:3] - true).std() < 0.4 * true.std()
-    assert zoom.principal_point_spread(model) < ladder.APART / 2
+    assert zoom.principal_point_spread(model) < attempts.APART / 2
     assert off(model, taken) < 0.5 * off(shared, taken) < 0.005
     assert numbers(found_for(tmp_path, images)) == numbers(found)
 

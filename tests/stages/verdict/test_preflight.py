@@ -143,7 +143,7 @@ def test_time_of_matching_follows_the_number_of_features(tmp_path: Path) -> None
             with Image.open(still_life / name) as image:
                 image.resize((width, 3 * width // 4), Image.Resampling.BICUBIC).save(folder / name, quality=95)
         quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
-        images, _ = prepare_images(folder, names, max_side=1600, features=20000, seed=0, masks={}, work=work, warn=print, **quiet)
+        images, _ = prepare_images({name: folder / name for name in names}, max_side=1600, features=20000, seed=0, masks={}, work=work, warn=print, **quiet)
         open_database(work, images, print)
         matches.extract_features(work, images, features=20000, **quiet)
         with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:

@@ -144,7 +144,7 @@ def test_photographs_without_exif_share_a_camera_within_their_source(tmp_path: P
         Image.fromarray(captures.picture()).save(tmp_path / folder / "9.jpg", exif=exif)
     paths = find_material(named([tmp_path / "a", tmp_path / "b"]), False, lambda text: None).paths
     quiet: dict[str, Any] = {"progress": lambda *values: None, "safe_point": lambda: None, "warn": lambda text: None}
-    images, _ = prepare_images(tmp_path, list(paths), paths=paths, max_side=100, features=300, seed=0, masks={}, work=tmp_path / "work", **quiet)
+    images, _ = prepare_images(paths, max_side=100, features=300, seed=0, masks={}, work=tmp_path / "work", **quiet)
     keys = {image.name: image.camera_key for image in images}
     assert keys["a/1.png"] == keys["a/2.png"] != keys["b/1.png"]
     assert keys["a/9.jpg"] == keys["b/9.jpg"] not in (keys["a/1.png"], keys["b/1.png"])

@@ -287,7 +287,7 @@ def test_pipes_among_photographs_are_not_waited_for(tmp_path: Path) -> None:
     (tmp_path / "work").mkdir()
     signal.alarm(SECONDS)
     images, rejected = prepare_images(
-        tmp_path, names, max_side=64, features=100, seed=0, masks={"a.png": tmp_path / "mask.png"}, work=tmp_path / "work",
+        {name: tmp_path / name for name in names}, max_side=64, features=100, seed=0, masks={"a.png": tmp_path / "mask.png"}, work=tmp_path / "work",
         progress=lambda *_: None, safe_point=lambda: None, warn=lambda *_, **__: None,
     )  # fmt: skip
     assert images == []

@@ -1,4 +1,4 @@
-"""Rungs of structure from motion: what is tried when, what is kept, and that a weak photograph gets its camera."""
+"""Attempts of structure from motion: what is tried when, what is kept, and that a weak photograph gets its camera."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from PIL import Image, ImageFilter
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.sfm import ladder, mapping, matches, merging, pairs
-from stages.sfm.images import WorkImage
+from stages.sfm import attempts, mapping, matches, merging, pairs
+from stages.sfm.attempts import Search
+from stages.sfm.cameras import find_cameras
+from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics import zoom
-from stages.sfm.reconstruction import find_cameras
+from stages.sfm.reconstruction import find_models
 
 ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
@@ -25,38 +27,38 @@ IMAGES = [WorkImage(f"{k}.jpg", f"{k:05d}.png", 64, 48, 64, 48, None, "a") for k
 
 
 class Rig:
-    """Stands for COLMAP: each rung registers as many photographs, with such a share of matches that agrees."""
+    """Stands for COLMAP: each attempt registers as many photographs, with such a share of matches that agrees."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, outcomes: dict[str, tuple[int, float]]) -> None:
         self.outcomes, self.tried, self.weak = outcomes, list[str](), list[list[int]]()
         self._rung, self.spread, self.apart = "exhaustive", 1.0, 0.001
         monkeypatch.setattr(mapping, "sub_models", lambda work, images, seed, options, *a, **k: self.model(work, "begin", options))
-        monkeypatch.setattr(mapping, "continued", lambda work, images, model, seed, options, *a, **k: self.model(work, "continue", options))
+        monkeypatch.setattr(mapping, "continued", lambda work, images, model, seed, *a, **k: self.model(work, "continue", mapping.RELAXED))
         monkeypatch.setattr(mapping, "match_agreement", self.agreement)
         monkeypatch.setattr(zoom, "focal_length_spread", lambda model: self.spread)
         monkeypatch.setattr(zoom, "principal_point_spread", lambda model: self.apart)
         monkeypatch.setattr(zoom, "with_principal_points", lambda model, safe_point: self.model(Path("own_cameras"), "adjust", None)[0])
-        monkeypatch.setattr(ladder, "match", lambda *a, **k: None)
-        monkeypatch.setattr(ladder, "copy_database", lambda *a: None)
-        monkeypatch.setattr(ladder, "copy_with_own_cameras", lambda *a: None)
-        monkeypatch.setattr(ladder, "_detect_more", lambda place, images, weak, **k: self.weak.append(list(weak)))
-        monkeypatch.setattr(ladder, "_match_again", self.match_again)
+        monkeypatch.setattr(matches, "match_photographs", lambda *a, **k: None)
+        monkeypatch.setattr(attempts, "copy_database", lambda *a: None)
+        monkeypatch.setattr(attempts, "copy_with_own_cameras", lambda *a: None)
+        monkeypatch.setattr(attempts, "find_features_again", lambda search: self.weak.append(search.missing))
+        monkeypatch.setattr(attempts, "match_again", self.match_again)
 
-    def agreement(self, work: Path, images: Any, model: Any) -> float:
+    def agreement(self, work: Path, model: Any) -> float:
         assert work.is_dir(), "there is no database to read"
         return float(model.agreeing)
 
-    def match_again(self, place: Path, images: Any, weak: list[int], rung: str, **_: Any) -> None:
-        self._rung = rung
-        self.weak.append(list(weak))
+    def match_again(self, search: Search, name: str) -> None:
+        self._rung = {"wider_": "wider matching", "more_": "more features"}[name]
+        self.weak.append(search.missing)
 
     def model(self, work: Path, how: str, options: Any) -> list[Any]:
         if work.name == "own_cameras":
-            name = ladder.CROPPED if how == "adjust" else ladder.EACH
+            name = attempts.CROPPED if how == "adjust" else attempts.EACH
         elif work.name == "rungs" and how == "begin" and self._rung == "beyond":
             name = "small angles" if options is mapping.FORWARD else "another beginning"
         elif work.name == "networks":
-            name = ladder.NETWORK if how == "continue" else ladder.NETWORK_ANEW
+            name = attempts.NETWORK if how == "continue" else attempts.NETWORK_ANEW
         elif how == "continue" and work.name != "rungs":
             name = "fewer matches"
         elif how == "begin" and options is not mapping.DEFAULTS and self._rung in ("exhaustive", "more features"):
@@ -68,28 +70,28 @@ class Rig:
         if not count:
             return []
         images = {k: SimpleNamespace(name=IMAGES[k].file, has_pose=True) for k in range(count)}
-        error = 0.3 if name == ladder.CROPPED else 0.5
+        error = 0.3 if name == attempts.CROPPED else 0.5
         return [SimpleNamespace(images=images, num_reg_images=lambda: count, agreeing=agreeing, rung=name, compute_mean_reprojection_error=lambda: error)]
 
 
-def climbed(rig: Rig, tmp_path: Path) -> ladder.Found:
-    return ladder.find_models(tmp_path, IMAGES, "exhaustive", features=100, seed=0, threads=1, **QUIET)
+def climbed(rig: Rig, tmp_path: Path) -> Search:
+    return find_models(Search(tmp_path, IMAGES, 0, 100, 1, **QUIET), "exhaustive")
 
 
 def test_nothing_more_is_tried_where_every_photograph_has_a_camera(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.95)})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive"]
-    assert found.rungs == [{"rung": "exhaustive", "registered": 20, "agreeing": 0.95}]
+    assert found.tried == [{"rung": "exhaustive", "registered": 20, "agreeing": 0.95}]
     assert found.work == tmp_path
     assert not (tmp_path / "rungs").exists()
 
 
-def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_attempts_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", *ANEW, "wider matching", "more features", ladder.EACH]
-    assert [rung["registered"] for rung in found.rungs] == [8, 9, 0, 0, 11, 19, 0]
+    assert rig.tried == ["exhaustive", "fewer matches", *ANEW, "wider matching", "more features", attempts.EACH]
+    assert [rung["registered"] for rung in found.tried] == [8, 9, 0, 0, 11, 19, 0]
     assert rig.weak == [list(range(9, 20)), list(range(11, 20)), list(range(11, 20))]
     assert (found.models[0].rung, found.work) == ("more features", tmp_path / "rungs")
 
@@ -97,19 +99,19 @@ def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch
 def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (12, 0.95), "more features": (20, 0.4), "another beginning": (14, 0.9)})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles", ladder.EACH]
-    assert found.models[0].rung == found.rung == "another beginning"
+    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles", attempts.EACH]
+    assert found.models[0].rung == found.best == "another beginning"
 
 
 @pytest.mark.parametrize(("each", "kept"), [((20, 0.97), True), ((20, 0.92), False), ((10, 0.99), False)])
 def test_own_focal_lengths_are_kept_where_they_explain_disagreement(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, each: tuple[int, float], kept: bool
 ) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), ladder.EACH: each})
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), attempts.EACH: each})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", ladder.EACH]
-    assert found.rungs[-1] == {"rung": ladder.EACH, "registered": each[0], "agreeing": each[1]}
-    assert (found.rung, found.work) == ((ladder.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
+    assert rig.tried == ["exhaustive", attempts.EACH]
+    assert found.tried[-1] == {"rung": attempts.EACH, "registered": each[0], "agreeing": each[1]}
+    assert (found.best, found.work) == ((attempts.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
 
 
 def test_a_way_straight_ahead_begins_with_small_angles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -117,34 +119,32 @@ def test_a_way_straight_ahead_begins_with_small_angles(monkeypatch: pytest.Monke
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", *ANEW]
     assert rig.weak == []
-    assert (found.rung, found.work) == ("small angles", tmp_path)
+    assert (found.best, found.work) == ("small angles", tmp_path)
     again = Rig(monkeypatch, {"exhaustive": (9, 0.5), "wider matching": (20, 0.7)})
     found = climbed(again, tmp_path)
-    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", "fewer matches", *ANEW, "wider matching", *ANEW, ladder.EACH]
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", "fewer matches", *ANEW, "wider matching", *ANEW, attempts.EACH]
 
 
 def test_focal_lengths_that_differ_are_looked_at_though_the_matches_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), ladder.EACH: (20, 0.999)})
-    assert climbed(rig, tmp_path).rung == "exhaustive"
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.EACH: (20, 0.999)})
+    assert climbed(rig, tmp_path).best == "exhaustive"
     rig.spread = 1.2
-    assert climbed(rig, tmp_path).rung == ladder.EACH
-    rig.outcomes[ladder.EACH] = (20, 0.984)  # not worth so many more parameters
-    assert climbed(rig, tmp_path).rung == "exhaustive"
+    assert climbed(rig, tmp_path).best == attempts.EACH
+    rig.outcomes[attempts.EACH] = (20, 0.984)  # not worth so many more parameters
+    assert climbed(rig, tmp_path).best == "exhaustive"
 
 
 @pytest.mark.parametrize(("cropped", "kept"), [((20, 0.979), True), ((20, 0.96), False), ((19, 0.98), False)])
-def test_own_principal_points_are_kept_where_points_lie_closer(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cropped: tuple[int, float], kept: bool
-) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), ladder.EACH: (20, 0.98), ladder.CROPPED: cropped})
+def test_own_principal_points_are_kept_where_points_lie_closer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cropped: tuple[int, float], kept: bool) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.EACH: (20, 0.98), attempts.CROPPED: cropped})
     rig.apart = 0.01
     found = climbed(rig, tmp_path)
-    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", ladder.CROPPED]
-    assert found.rung == (ladder.CROPPED if kept else "exhaustive")
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.CROPPED]
+    assert found.best == (attempts.CROPPED if kept else "exhaustive")
 
 
 @pytest.mark.parametrize(
-    ("registered", "tried"), [(20, []), (12, [ladder.NETWORK]), (6, [ladder.NETWORK, *2 * [ladder.NETWORK_ANEW]]), (0, 2 * [ladder.NETWORK_ANEW])]
+    ("registered", "tried"), [(20, []), (12, [attempts.NETWORK]), (6, [attempts.NETWORK, *2 * [attempts.NETWORK_ANEW]]), (0, 2 * [attempts.NETWORK_ANEW])]
 )
 def test_networks_come_last_and_for_photographs_without_a_camera_alone(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, registered: int, tried: list[str]
@@ -153,14 +153,14 @@ def test_networks_come_last_and_for_photographs_without_a_camera_alone(
     without = climbed(Rig(monkeypatch, outcomes), tmp_path)
     Rig(monkeypatch, outcomes)
     compared: list[list[pairs.Pair]] = []
-    monkeypatch.setattr(ladder, "neighbours", lambda work, count: {i: set() for i in range(count)})
-    monkeypatch.setattr(ladder, "inlier_counts", lambda path: {})
-    monkeypatch.setattr(ladder, "add_matches", lambda place, images, wanted, networks, **k: compared.append(wanted))
+    monkeypatch.setattr(attempts, "neighbours", lambda work, count: {i: set() for i in range(count)})
+    monkeypatch.setattr(attempts, "inlier_counts", lambda path: {})
+    monkeypatch.setattr(attempts, "add_matches", lambda place, images, wanted, networks, **k: compared.append(wanted))
     monkeypatch.setattr(merging, "triangulated", lambda place, images, models, *a, **k: models[0])
-    found = ladder.find_models(tmp_path, IMAGES, "exhaustive", features=100, seed=0, threads=1, networks=(tmp_path / "a", tmp_path / "b"), **QUIET)
-    rungs = [rung["rung"] for rung in found.rungs]
+    found = find_models(Search(tmp_path, IMAGES, 0, 100, 1, networks=(tmp_path / "a", tmp_path / "b"), **QUIET), "exhaustive")
+    rungs = [rung["rung"] for rung in found.tried]
     assert [rung for rung in rungs if "network" in str(rung)] == tried
-    assert [rung for rung in found.rungs if rung["rung"] not in tried] == without.rungs
+    assert [rung for rung in found.tried if rung["rung"] not in tried] == without.tried
     assert (tmp_path / "networks").exists() == bool(tried)
     weak = set(range(registered, 20))
     assert compared == ([[(i, j) for i, j in sorted(pairs.all_pairs(20)) if {i, j} & weak]] if tried else [])
@@ -168,10 +168,11 @@ def test_networks_come_last_and_for_photographs_without_a_camera_alone(
 
 def test_a_weak_photograph_is_matched_with_all_but_those_it_overlaps_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: dict[str, Any] = {}
-    monkeypatch.setattr(ladder, "neighbours", lambda work, count: {i: {5} if i == 3 else {3} if i == 5 else set() for i in range(count)})
-    monkeypatch.setattr(ladder, "forget", lambda place, tables, keys: asked.update(forgotten=keys))
+    monkeypatch.setattr(attempts, "neighbours", lambda work, count: {i: {5} if i == 3 else {3} if i == 5 else set() for i in range(count)})
+    monkeypatch.setattr(attempts, "forget", lambda place, tables, keys: asked.update(forgotten=keys))
     monkeypatch.setattr(matches, "match_pairs", lambda place, images, wanted, **k: asked.update(wanted=wanted, **k))
-    ladder._match_again(tmp_path, IMAGES, [3], "wider matching", seed=0, workers=2, **QUIET)
+    there = {k: SimpleNamespace(name=image.file, has_pose=True) for k, image in enumerate(IMAGES) if k != 3}
+    attempts.match_again(Search(tmp_path, IMAGES, 0, 100, 2, models=[SimpleNamespace(images=there)], **QUIET), "wider_")
     assert asked["wanted"] == {pairs.ordered(3, j) for j in range(20) if j not in (3, 5)}
     assert len(asked["forgotten"]) == 18
     assert asked["guided"]

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 from efficientnerf.geometry.cameras import Camera, Similarity
+from stages.framing.gps import enu_from_gps, robust_similarity, with_gps, with_stated_cameras
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.photo import read_gps_position
 from stages.sfm.colmap import import_pycolmap
-from stages.sfm.gps import enu_from_gps, robust_similarity, with_gps, with_stated_cameras
 from stages.verdict.verdict import verdict_on
 
 HOME = np.array([55.7047, 13.1910, 62.0])
