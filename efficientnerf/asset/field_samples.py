@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,23 +143,26 @@ def _boxes_of(samples: FieldSamples, boxes: Sequence[np.ndarray]) -> Iterator[tu
 
 def cascade_visibility(samples: FieldSamples, grids: Sequence[Grid], brick: int, threshold: float) -> list[Visibility]:
     """The greatest weight of each voxel of nested grids; a sample counts in the innermost one whose box holds it, and along all of its extent: the density
-    is taken to be the same throughout. Weights that do not exceed `threshold` are left out."""
-    found = []
-    hole = np.zeros((2, 3))
-    for shape, voxel, low in grids:
-        row_of = np.full(math.prod(shape), -1, np.int32)
-        greatest, rows = np.zeros((0, brick**3), np.float32), 0
-        for _ in range(2):  # rows are counted, then filled
-            for rays, part in samples.blocks():
-                values = (samples.start[part], samples.extent[part], samples.weight[part], samples.thickness[part])
-                of_rays = (samples.origin[samples.view[rays]], samples.direction[rays], samples.first[rays.start : rays.stop + 1] - part.start)
-                rows = weigh_voxels(*of_rays, *values, float(threshold), shape, float(voxel), np.asarray(low, np.float64), hole, brick, row_of, greatest, rows)
-            if not len(greatest):
-                greatest = np.zeros((rows, brick**3), np.float32)
-        cells = np.flatnonzero(row_of >= 0)
-        found.append(Visibility(cells, greatest[row_of[cells]]))
-        hole = np.stack([low, low + np.asarray(shape) * brick * voxel])
-    return found
+    is taken to be the same throughout. Weights that do not exceed `threshold` are left out. The grids are filled by a thread each."""
+    holes = [np.zeros((2, 3)), *(np.stack([low, low + np.asarray(shape) * brick * voxel]) for shape, voxel, low in grids[:-1])]
+    with ThreadPoolExecutor(torch.get_num_threads()) as threads:
+        return list(threads.map(lambda grid, hole: _grid_visibility(samples, grid, hole, brick, threshold), grids, holes))
+
+
+def _grid_visibility(samples: FieldSamples, grid: Grid, hole: np.ndarray, brick: int, threshold: float) -> Visibility:
+    """`cascade_visibility` of one grid, without what lies in the box `hole` (2, 3)."""
+    shape, voxel, low = grid
+    row_of = np.full(math.prod(shape), -1, np.int32)
+    greatest, rows = np.zeros((0, brick**3), np.float32), 0
+    for _ in range(2):  # rows are counted, then filled
+        for rays, part in samples.blocks():
+            values = (samples.start[part], samples.extent[part], samples.weight[part], samples.thickness[part])
+            of_rays = (samples.origin[samples.view[rays]], samples.direction[rays], samples.first[rays.start : rays.stop + 1] - part.start)
+            rows = weigh_voxels(*of_rays, *values, float(threshold), shape, float(voxel), np.asarray(low, np.float64), hole, brick, row_of, greatest, rows)
+        if not len(greatest):
+            greatest = np.zeros((rows, brick**3), np.float32)
+    cells = np.flatnonzero(row_of >= 0)
+    return Visibility(cells, greatest[row_of[cells]])
 
 
 def seen_weights(visibility: Visibility, indices: np.ndarray, shape: tuple[int, int, int], brick: int) -> np.ndarray:

@@ -89,7 +89,24 @@ def resample_weights(
 MAX_PIECES = 64  # of a sample that reaches through many voxels
 
 
-@numba.njit(cache=True, error_model="numpy")
+MARGIN = 0.5  # voxels, by which a ray's way through a box is taken too long, or too short: its samples are told apart one by one
+
+
+@numba.njit(error_model="numpy")
+def _way_through(origin, direction, low, high):  # type: ignore[no-untyped-def]
+    """Where a ray enters and leaves a box; leaving before entering where it misses it."""
+    enters, leaves = -np.inf, np.inf
+    for axis in range(3):
+        if direction[axis] == 0:
+            if not low[axis] <= origin[axis] <= high[axis]:
+                return 0.0, -1.0
+            continue
+        one, other = (low[axis] - origin[axis]) / direction[axis], (high[axis] - origin[axis]) / direction[axis]
+        enters, leaves = max(enters, min(one, other)), min(leaves, max(one, other))
+    return enters, leaves
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def weigh_voxels(  # type: ignore[no-untyped-def]
     origin, direction, first, start, extent, weight, thickness, threshold, shape, voxel, low, hole, brick, row_of, into, rows
 ) -> int:
@@ -100,9 +117,16 @@ def weigh_voxels(  # type: ignore[no-untyped-def]
     hole          (2, 3) box that is left out
     row_of, into  as in `resample_weights`
     """
-    size_x, size_y, size_z = shape[0] * brick, shape[1] * brick, shape[2] * brick
+    size = np.array([shape[0] * brick, shape[1] * brick, shape[2] * brick])
+    margin = MARGIN * voxel
+    outer_low, outer_high, hole_low, hole_high = low - margin, low + size * voxel + margin, hole[0] + margin, hole[1] - margin
     for r in range(len(first) - 1):
+        enters, leaves = _way_through(origin[r], direction[r], outer_low, outer_high)
+        hidden, shown = _way_through(origin[r], direction[r], hole_low, hole_high)
         for n in range(first[r], first[r + 1]):
+            end = np.float64(start[n]) + extent[n]
+            if not weight[n] > threshold or end < enters or start[n] > leaves or (start[n] > hidden and end < shown):
+                continue
             depth = np.float64(thickness[n])
             absorbed = -np.expm1(-depth)
             light = weight[n] / absorbed if absorbed > 0 else 0.0
@@ -119,7 +143,7 @@ def weigh_voxels(  # type: ignore[no-untyped-def]
                 if hole[0, 0] <= px < hole[1, 0] and hole[0, 1] <= py < hole[1, 1] and hole[0, 2] <= pz < hole[1, 2]:
                     continue
                 x, y, z = int(np.floor((px - low[0]) / voxel)), int(np.floor((py - low[1]) / voxel)), int(np.floor((pz - low[2]) / voxel))
-                if x < 0 or y < 0 or z < 0 or x >= size_x or y >= size_y or z >= size_z:
+                if x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]:
                     continue
                 rows = _raise_voxel(x, y, z, share, shape, brick, row_of, into, rows)
     return rows
