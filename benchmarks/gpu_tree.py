@@ -11,7 +11,6 @@ from gpu_kernels import copy_rate, milliseconds, orbit
 
 from efficientnerf.asset.refinement import device as refinement
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
-from efficientnerf.asset.refinement.rule import DECAY, EPSILON
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import Hyperparameters, Moments, RayTargets
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
@@ -74,7 +73,7 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
         tree_gradients.backward(grid, sent, density, sh, outputs, (by[0], by[1]), sums, stamp, 1)
 
     def step() -> None:  # of no length, so that every repetition does the same
-        rule = Hyperparameters(0.0, 0.0, 1.0, DECAY, EPSILON)
+        rule = Hyperparameters(0.0, 0.0, 1.0)
         tree_steps.step(grid, (density, sh), sums, moments, stamp, rule, neighbours, number=1, rays=count)
 
     of_packets, of_all = voxels_met(tree, origins, directions, host, first)

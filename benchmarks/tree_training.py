@@ -91,11 +91,10 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
 
     from efficientnerf.asset.refinement.error_map import ErrorMap
     from efficientnerf.asset.refinement.host import in_voxels, packet_bases
-    from efficientnerf.asset.refinement.rule import Rule
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
     from efficientnerf.asset.refinement.targets import step_rng
     from efficientnerf.asset.refinement.tiles import tiles_met
-    from efficientnerf.backends.layout import Moments
+    from efficientnerf.backends.layout import Hyperparameters, Moments
     from efficientnerf.backends.numba.tree.cells import cells_of
     from efficientnerf.backends.numba.tree_training import gradients
     from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
@@ -108,7 +107,7 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     values, error_map = values_of(cells, state.density, state.sh), ErrorMap(patches, tiles_met(tree, patches))
     width = state.sh.shape[1]
     moments = Moments(np.zeros(0, np.float32), np.zeros((0, width), np.float32), state.square_density, state.square_sh, state.visits)
-    rule = Rule(total_variation=0.01).hyperparameters(1, tree.harmonics_count, density_lr=0.1, sh_lr=0.01, view_share=1.0)
+    rule = Hyperparameters(0.1, 0.01, 1.0, total_variation=0.01)
     neighbours = neighbours_of(cells)
     times: dict[str, list[tuple[float, float]]] = {}
     counts, number, until = [], 0, time.perf_counter() + seconds

@@ -71,19 +71,13 @@ class Hyperparameters(NamedTuple):
     decay            of the running mean of the squared gradient
     epsilon          added to its root
     momentum         of the running mean of the gradient; 0: RMSprop
-    total_variation  weights of the terms of `efficientnerf.backends.numba.tree_training.steps`
-    sparsity
-    entropy
-    terms            coefficients that have gradients, of each channel: the first ones; those beyond stay as they are
+    total_variation  weight of this term of `efficientnerf.backends.numba.tree_training.steps`
     """
 
     density_rate: float
     sh_rate: float
     view_share: float
-    decay: float
-    epsilon: float
+    decay: float = 0.99
+    epsilon: float = 1e-10
     momentum: float = 0.0
     total_variation: float = 0.0
-    sparsity: float = 0.0
-    entropy: float = 0.0
-    terms: int = 25

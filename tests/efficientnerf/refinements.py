@@ -45,15 +45,13 @@ def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.nd
 
 def gradients(
     tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets, dtype: Any = np.float64, stop: float = 0.0, packet: int = 1,
-    min_weight: float = 0.0,
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
     """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels, in packets of so many rays."""
-    return packet_gradients(tree, origins, directions, seen, packets_of(len(origins), packet), dtype, stop, min_weight)
+    return packet_gradients(tree, origins, directions, seen, packets_of(len(origins), packet), dtype, stop)
 
 
 def packet_gradients(
     tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets, first: np.ndarray, dtype: Any = np.float64, stop: float = 0.0,
-    min_weight: float = 0.0,
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
     """`gradients` of packets whose first rays, and the end, are (P + 1,)."""
     start, along, bases = in_voxels(tree, origins, directions)
@@ -62,7 +60,6 @@ def packet_gradients(
     dense = dense_densities(cells, voxel_places(cells, len(sh)), density)
     loss, records = kernels.forward_backward(
         cells, first, start, along, packet_bases(bases.astype(dtype), first), dense, sh, seen, RecordBuffer(dtype), stop=stop,
-        min_weight=min_weight,
     )  # fmt: skip
     by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)
     sum_gradients(records, by_density, by_sh)
@@ -77,7 +74,7 @@ def ball_tree(side: int = 20) -> NerfTree:
 
 
 def device_gradients(
-    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str, *, min_weight: float = 0.0, terms: int = 25
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str
 ) -> tuple[np.ndarray, ...]:
     """`gradients` by Triton's kernels, and the voxels that rays meet are stamped."""
     from efficientnerf.asset.refinement.device import rays_in_voxels, values_of
@@ -85,12 +82,12 @@ def device_gradients(
 
     rays = rays_in_voxels(tree, *(torch.from_numpy(a).to(device) for a in (origins, directions)))
     grid, density, sh = values_of(tree, torch.device(device))
-    outputs = tree_gradients.forward(grid, rays, density, sh, min_weight=min_weight)
+    outputs = tree_gradients.forward(grid, rays, density, sh)
     sent = RayTargets(*(torch.from_numpy(np.asarray(part, np.float32)).to(device) for part in targets[:4]), targets.opacity_weight)
     loss, *by = tree_gradients.loss_and_gradients(*outputs, sent)
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp = torch.zeros(len(density), dtype=torch.int32, device=device)
-    tree_gradients.backward(grid, rays, density, sh, outputs, (by[0], by[1]), sums, stamp, 3, min_weight=min_weight, terms=terms)
+    tree_gradients.backward(grid, rays, density, sh, outputs, (by[0], by[1]), sums, stamp, 3)
     by_thickness, by_sh = (part.cpu().double().numpy() / tree_gradients.fixed_point_scale(len(origins)) for part in sums)
     assert set(stamp.tolist()) <= {0, 3}
     assert not (by_sh.any(axis=1) & (stamp.cpu().numpy() != 3)).any()

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset.refinement.error_map import INTERVAL, Drawn, ErrorMap
-from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
@@ -65,13 +64,12 @@ class DeviceArrays:
                 arrived.synchronize()
             self.error = self.error_map.record(drawn, loss.numpy()) / 3
 
-    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters, min_weight: float = 0.0) -> Tensor:
+    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters) -> Tensor:
         """Losses (R,) of the rays before the step."""
         values, sums = (self.values["density"], self.values["sh"]), (self.by_thickness, self.by_sh)
-        outputs = tree_gradients.forward(self.grid, rays, *values, min_weight=min_weight)
+        outputs = tree_gradients.forward(self.grid, rays, *values)
         loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
-        terms = hyperparameters.terms
-        tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number, min_weight=min_weight, terms=terms)
+        tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number)
         step(self.grid, values, sums, self.moments, self.stamp, hyperparameters, self.neighbours, number=number, rays=len(loss))
         return loss
 
@@ -99,27 +97,26 @@ def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float, patch_side: int, rule: Rule = PLAIN,
+    view_dependent_lr_ratio: float, patch_side: int, total_variation: float, error_map: float,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
     assert isinstance(targets.pixels, DevicePixels)
     state.fetch()
     patches = PatchGrid(targets.host_pixels, patch_side)
-    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=rule.error_map)
-    state.errors = error_map.errors
-    state.device_state = arrays = DeviceArrays(state, targets.pixels.device, error_map, smooth=rule.total_variation > 0)
+    errors = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=error_map)
+    state.errors = errors.errors
+    state.device_state = arrays = DeviceArrays(state, targets.pixels.device, errors, smooth=total_variation > 0)
     begin = state.step
     while state.step < until:
         number = state.step + 1
         if state.step % INTERVAL == 0:
             arrays.record(0)
-            error_map.set_chances()
-        drawn = error_map.draw(rays, step_rng(seed, number))
+            errors.set_chances()
+        drawn = errors.draw(rays, step_rng(seed, number))
         origins, directions, wanted = targets.of(drawn.patches.pixels)
         factor = fall(number)
-        rates = {"density_lr": density_lr * factor, "sh_lr": sh_lr * factor, "view_share": view_dependent_lr_ratio}
-        hyperparameters = rule.hyperparameters(number, state.tree.harmonics_count, **rates)
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters, rule.min_weight)
+        hyperparameters = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, total_variation=total_variation)
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters)
         arrays.pending.append((drawn, *to_host_async(loss)))
         state.step = number
         arrays.record(0 if number == begin + 1 else LAG)

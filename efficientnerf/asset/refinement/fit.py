@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets
 from efficientnerf.asset.tree import NerfTree
@@ -28,7 +27,7 @@ WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measur
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float = 1.0, patch_side: int = PATCH_SIDE, rule: Rule = PLAIN,
+    view_dependent_lr_ratio: float = 1.0, patch_side: int = PATCH_SIDE, total_variation: float = 0.0, error_map: float = 0.9,
 ) -> Iterator[float]:  # fmt: skip
     """Take steps up to `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.
 
@@ -38,11 +37,12 @@ def optimise(
     fall                     factor of the learning rates by a step's number (`efficientnerf.asset.refinement.schedule`)
     view_dependent_lr_ratio  factor of that for harmonics of degree 1 and above
     patch_side               pixels along a side of the patches that rays are drawn in
-    rule                     what is minimised besides
+    total_variation          share, of the density's learning rate, of the differences between the logarithms of a voxel's and its neighbours' optical thickness
+    error_map                share of the rays that are drawn by the errors of earlier ones, below 1
     """
     yield from fitting(targets.backend).optimise(
         state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
-        patch_side=patch_side, rule=rule,
+        patch_side=patch_side, total_variation=total_variation, error_map=error_map,
     )  # fmt: skip
 
 

@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from efficientnerf.asset.refinement.error_map import INTERVAL, ErrorMap
-from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import Moments
+from efficientnerf.backends.layout import Hyperparameters, Moments
 from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients
@@ -44,33 +43,31 @@ def packet_bases(bases: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float, patch_side: int, rule: Rule = PLAIN,
+    view_dependent_lr_ratio: float, patch_side: int, total_variation: float, error_map: float,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`."""
     cells, buffer = cells_of(state.tree), RecordBuffer()
     values = values_of(cells, state.density, state.sh)
     patches = PatchGrid(targets.host_pixels, patch_side)
-    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=rule.error_map)
-    state.errors = error_map.errors
+    errors = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=error_map)
+    state.errors = errors.errors
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
     moments = Moments(*none, state.square_density, state.square_sh, state.visits)
-    neighbours = neighbours_of(cells) if rule.total_variation > 0 else NO_NEIGHBOURS
+    neighbours = neighbours_of(cells) if total_variation > 0 else NO_NEIGHBOURS
     while state.step < until:
         number = state.step + 1
         if state.step % INTERVAL == 0:
-            error_map.set_chances()
-        drawn = error_map.draw(rays, step_rng(seed, number))
+            errors.set_chances()
+        drawn = errors.draw(rays, step_rng(seed, number))
         origins, directions, wanted = targets.of(drawn.patches.pixels)
         start, along, bases = in_voxels(state.tree, origins, directions)
         first = drawn.patches.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
-        loss, records = gradients.forward_backward(
-            cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer, min_weight=rule.min_weight
-        )
+        loss, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer)
         factor = fall(number)
-        rates = {"density_lr": density_lr * factor, "sh_lr": sh_lr * factor, "view_share": view_dependent_lr_ratio}
-        step(records, values, moments, rule.hyperparameters(number, state.tree.harmonics_count, **rates), neighbours)
+        rates = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, total_variation=total_variation)
+        step(records, values, moments, rates, neighbours)
         state.step = number
-        yield error_map.record(drawn, loss) / 3
+        yield errors.record(drawn, loss) / 3
 
 
 def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> float:

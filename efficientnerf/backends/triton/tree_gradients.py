@@ -74,14 +74,12 @@ def device_grid(tree: NerfTree, device: str | torch.device) -> DeviceGrid:
 
 
 class Voxels(NamedTuple):
-    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels; min_weight: below it samples absorb, and have neither a colour
-    nor a gradient."""
+    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels."""
 
     index: Any
     density: Any
     sh: Any
     voxel: Any
-    min_weight: Any
 
 
 class Scene(NamedTuple):
@@ -91,19 +89,17 @@ class Scene(NamedTuple):
     density: Any
     sh: Any
     voxel: Any
-    min_weight: Any
     basis: Any
     column: Any
 
 
 class Sums(NamedTuple):
-    """Where gradients are added, `scale` to a one: thickness (N,), sh (N, 3 K), the first `terms` coefficients of each channel; stamp (N,), set to `number`."""
+    """Where gradients are added, `scale` to a one: thickness (N,), sh (N, 3 K); stamp (N,), set to `number`."""
 
     thickness: Any
     sh: Any
     stamp: Any
     number: Any
-    terms: Any
     scale: Any
 
 
@@ -150,7 +146,7 @@ def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.const
     thickness = _thickness(scene.index, scene.density, sample, scene.voxel, BRICK, NEAREST)
     after = transmittance * tl.exp(-thickness)
     weight = transmittance - after
-    visible = (thickness > 0) & (weight >= scene.min_weight)
+    visible = thickness > 0
     mixed, total = interpolate_harmonics(scene.index, scene.sh, sample, visible, scene.column, 3 * K, BRICK, NEAREST)
     return visible, weight * visible.to(tl.float32), colour_of(mixed, total, scene.basis, scene.column % 3), after, total
 
@@ -177,7 +173,7 @@ def _forward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Premultiplied colour (R, 3) and final transmittance (R,) of rays."""
     r, live, origin, direction, basis = _rays(rays, count, K, ROW, BLOCK)
-    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, voxels.min_weight, basis, tl.arange(0, ROW))
+    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, basis, tl.arange(0, ROW))
     start = Forward(tl.full((BLOCK,), 1.0, tl.float32), zeros_vec3(BLOCK))
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
     store_vec3(colour, r, end.colour, live)
@@ -209,13 +205,13 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
         tl.store(sums.stamp + voxel, sums.number, stored)
         tl.atomic_add(sums.thickness + voxel, (scaled * by_depth * sample.step).to(tl.int64), stored, sem="relaxed")
         row = sums.sh + voxel[:, None] * (3 * K) + column[None, :]
-        tl.atomic_add(row, (scaled[:, None] * by_column).to(tl.int64), stored[:, None] & (column < 3 * sums.terms)[None, :], sem="relaxed")
+        tl.atomic_add(row, (scaled[:, None] * by_column).to(tl.int64), stored[:, None] & (column < 3 * K)[None, :], sem="relaxed")
     return Backward(after, behind)
 
 
-@triton.jit(do_not_specialize=["number", "terms"])
+@triton.jit(do_not_specialize=["number"])
 def _backward(  # type: ignore[no-untyped-def]
-    rays, cascades, voxels, outputs, gradients, sums, stamp, count, number, terms, scale,
+    rays, cascades, voxels, outputs, gradients, sums, stamp, count, number, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds `scale` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as integers; stamps the voxels that rays meet.
@@ -225,11 +221,11 @@ def _backward(  # type: ignore[no-untyped-def]
     sums       by optical thickness, and by harmonics
     """
     r, live, origin, direction, basis = _rays(rays, count, K, ROW, BLOCK)
-    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, voxels.min_weight, basis, tl.arange(0, ROW))
+    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, basis, tl.arange(0, ROW))
     behind = load_vec3(outputs[0], r, live)
     by_colour = load_vec3(gradients[0], r, live)
     by_end = tl.load(outputs[1] + r, live, other=1.0) * tl.load(gradients[1] + r, live, other=0.0)
-    given = (scene, Upstream(by_colour, by_end), Sums(sums[0], sums[1], stamp, number, terms, scale))
+    given = (scene, Upstream(by_colour, by_end), Sums(sums[0], sums[1], stamp, number, scale))
     start = Backward(tl.full((BLOCK,), 1.0, tl.float32), behind)
     march_cascades(cascades, origin, direction, live, given, start, _add_gradients, CASCADES, BRICK, NEAREST, K, ROW)
 
@@ -264,15 +260,12 @@ def fixed_point_scale(rays: int) -> float:
     return 2.0 ** (62 - BITS_PER_RAY - math.ceil(math.log2(max(rays, 1))))
 
 
-def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, *, min_weight: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Premultiplied colour (R, 3) and final transmittance (R,) of rays through voxels of density (N,) and harmonics (N, 3 K).
-
-    min_weight  samples that weigh less absorb, and have neither a colour nor a gradient
-    """
+def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor) -> tuple[Tensor, Tensor]:
+    """Premultiplied colour (R, 3) and final transmittance (R,) of rays through voxels of density (N,) and harmonics (N, 3 K)."""
     count = len(rays.origins)
     colour, transmittance = torch.empty(count, 3, device=density.device), torch.empty(count, device=density.device)
     _forward[(blocks(count, g.rays),)](
-        rays, g.cascades, Voxels(g.index, density, sh, float(g.voxel), float(min_weight)), colour, transmittance, count,
+        rays, g.cascades, Voxels(g.index, density, sh, float(g.voxel)), colour, transmittance, count,
         NEAREST=g.nearest, CASCADES=len(g.cascades.first), BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
     return colour, transmittance
@@ -289,9 +282,9 @@ def loss_and_gradients(colour: Tensor, transmittance: Tensor, targets: RayTarget
 
 def backward(
     g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, outputs: tuple[Tensor, Tensor], by: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor],
-    stamp: Tensor, number: int, *, min_weight: float = 0.0, terms: int = 25,
+    stamp: Tensor, number: int,
 ) -> None:  # fmt: skip
-    """Add the gradients by optical thickness and by the first `terms` harmonics to `sums`, (N,) and (N, 3 K) int64, `fixed_point_scale(R)` to a one.
+    """Add the gradients by optical thickness and by harmonics to `sums`, (N,) and (N, 3 K) int64, `fixed_point_scale(R)` to a one.
 
     outputs  of `forward`
     by       gradients by colour (R, 3) and opacity (R,)
@@ -299,8 +292,8 @@ def backward(
     """
     count = len(rays.origins)
     _backward[(blocks(count, g.rays),)](
-        rays, g.cascades, Voxels(g.index, density, sh, float(g.voxel), float(min_weight)), outputs, tuple(part.contiguous() for part in by), sums, stamp,
-        count, number, min(terms, g.terms), fixed_point_scale(count),
+        rays, g.cascades, Voxels(g.index, density, sh, float(g.voxel)), outputs, tuple(part.contiguous() for part in by), sums, stamp,
+        count, number, fixed_point_scale(count),
         NEAREST=g.nearest, CASCADES=len(g.cascades.first), BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
 

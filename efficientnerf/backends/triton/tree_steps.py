@@ -44,8 +44,6 @@ class Rule(NamedTuple):
     momentum: Any
     log_momentum: Any
     total_variation: Any
-    sparsity: Any
-    entropy: Any
     min_thickness: Any
     max_thickness: Any
     max_visits: Any
@@ -62,19 +60,9 @@ def _total_variation(v, met, thickness, side, weight, before, beside, least):  #
     return weight * slope
 
 
-@triton.jit
-def _of_opacity(thickness, sparsity, entropy):  # type: ignore[no-untyped-def]
-    """Gradients of sparsity and entropy by the logarithm of the optical thickness."""
-    left = tl.exp(-thickness)
-    # The logarithm of little is that of a series, for 1 - exp(-x) has few digits there.
-    series = thickness * (1 - thickness * (1 / 2 - thickness * (1 / 6 - thickness / 24)))
-    opacity = tl.maximum(tl.where(thickness < 1 / 16, series, 1 - left), 1e-30)
-    return thickness * left * (sparsity - entropy * (tl.log(opacity) + thickness))
-
-
-@triton.jit(do_not_specialize=["number", "terms"])
+@triton.jit(do_not_specialize=["number"])
 def _step(  # type: ignore[no-untyped-def]
-    values, sums, moments, neighbours, stamp, cascade_of, place, voxels, number, terms, unit, rule,
+    values, sums, moments, neighbours, stamp, cascade_of, place, voxels, number, unit, rule,
     CASCADES: tl.constexpr, MOMENTUM: tl.constexpr, SMOOTH: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each. MOMENTUM: Adam. SMOOTH: with total variation.
@@ -97,7 +85,6 @@ def _step(  # type: ignore[no-untyped-def]
         # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
         depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, h.min_thickness)
         g = tl.load(sums[0] + v, met, other=0).to(tl.float32) * unit * depth
-        g += _of_opacity(depth, h.sparsity, h.entropy)
         square = h.decay * tl.load(moments.square_density + v, met, other=0.0) + (1 - h.decay) * g * g
         if MOMENTUM:
             g = h.momentum * tl.load(moments.density + v, met, other=0.0) + (1 - h.momentum) * g
@@ -110,9 +97,9 @@ def _step(  # type: ignore[no-untyped-def]
         tl.store(sums[0] + v, tl.zeros_like(v), met)
         column = tl.arange(0, ROW)
         at = v[:, None] * WIDTH + column[None, :]
-        there = met[:, None] & (column < 3 * terms)[None, :]
+        there = met[:, None] & (column < WIDTH)[None, :]
         by_sh = tl.load(sums[1] + at, there, other=0).to(tl.float32) * unit
-        square = h.decay * tl.load(moments.square_sh + v, met, other=0.0) + (1 - h.decay) * tl.sum(by_sh * by_sh, 1) / (3 * terms)
+        square = h.decay * tl.load(moments.square_sh + v, met, other=0.0) + (1 - h.decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
         tl.store(moments.square_sh + v, square, met)
         if MOMENTUM:
             by_sh = h.momentum * tl.load(moments.sh + at, there, other=0.0) + (1 - h.momentum) * by_sh
@@ -127,7 +114,7 @@ def step(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], moments: Moments, stamp: Tensor, h: Hyperparameters, neighbours: Neighbours, *,
     number: int, rays: int,
 ) -> None:  # fmt: skip
-    """A step for the voxels that the last gradients, of `rays` rays and as many terms, stamped with `number`; the others stay.
+    """A step for the voxels that the last gradients, of `rays` rays, stamped with `number`; the others stay.
 
     values  density (N,) and harmonics (N, 3 K)
     """
@@ -135,10 +122,10 @@ def step(
     if h.total_variation > 0:
         neighbours.density.copy_(values[0])
     rates = (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))
-    weights = (min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy)
-    rule = Rule._make([*map(float, (*rates, *weights, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS])
+    variation = min(h.density_rate * h.total_variation, MOST_VARIATION)
+    rule = Rule._make([*map(float, (*rates, variation, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS])
     _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
-        values, sums, moments, neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, min(h.terms, g.terms), 1 / fixed_point_scale(rays), rule,
+        values, sums, moments, neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, 1 / fixed_point_scale(rays), rule,
         CASCADES=len(g.cascades.first), MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
         BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

@@ -20,7 +20,6 @@ from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.field_samples import FieldSamples
 from efficientnerf.asset.refinement import fit
 from efficientnerf.asset.refinement.error_map import count_cells
-from efficientnerf.asset.refinement.rule import Rule
 from efficientnerf.asset.refinement.schedule import PHASES, RefinementSchedule, stated_schedule
 from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 from efficientnerf.asset.refinement.targets import Targets
@@ -126,7 +125,7 @@ class Refinement:
         run = fit.optimise(
             state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
             fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed, view_dependent_lr_ratio=ratio,
-            rule=Rule(total_variation=settings.total_variation, error_map=share),
+            total_variation=settings.total_variation, error_map=share,
         )  # fmt: skip
         step_began = clock()
         for error in run:

@@ -1,4 +1,4 @@
-"""Optimiser steps of the CUDA kernels against the CPU's, and their regularisers against autograd."""
+"""Optimiser steps of the CUDA kernels against the CPU's, and total variation against autograd."""
 
 from __future__ import annotations
 
@@ -52,10 +52,7 @@ class OnDevice:
             assert not part.cpu().numpy()[met].any()  # ready for the next step
 
 
-TERMS: list[dict[str, Any]] = [
-    {}, {"momentum": 0.8}, {"total_variation": 0.7}, {"sparsity": 0.7}, {"entropy": 0.7}, {"terms": 1},
-    {"momentum": 0.6, "total_variation": 0.1, "sparsity": 0.2, "entropy": 0.3, "terms": 1},
-]  # fmt: skip
+TERMS: list[dict[str, Any]] = [{}, {"momentum": 0.8}, {"total_variation": 0.7}, {"momentum": 0.6, "total_variation": 0.1}]
 
 
 @pytest.mark.parametrize(("made", "more"), [(GRIDS[n % 2], more) for n, more in enumerate(TERMS)])
@@ -66,7 +63,6 @@ def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str
     cells = cells_of(tree)
     moments, neighbours = empty_moments(o, adam=adam), neighbours_of(cells) if smooth else NO_NEIGHBOURS
     rule = rule_of(**more)
-    width = 3 * more.get("terms", 25)
     for number in (1, 2, 3):
         records = records_of(tree, o, number)
         by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
@@ -74,7 +70,6 @@ def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str
         met = np.zeros(len(o.density), bool)
         for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
             met[records.numbers[begin:end, 0]] = True
-        by_sh[:, width:] = 0  # are not asked for
         host.step(records, host.values_of(cells, o.density, o.sh), moments, rule, neighbours)
         there.step(by_density / voxel_sides(tree), by_sh, met, number, **more)
         for ours, theirs in zip((*there.values, *there.moments), (o.density, o.sh, *moments), strict=True):
@@ -83,14 +78,8 @@ def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str
     assert len(np.unique(o.visits)) > 1  # some were not met by every bundle
 
 
-def penalty(tree: NerfTree, logarithm: torch.Tensor, kind: str) -> torch.Tensor:
+def penalty(tree: NerfTree, logarithm: torch.Tensor) -> torch.Tensor:
     """The term of weight one over all voxels, by the formula of the CPU's step; those beside each are constants."""
-    thickness = torch.exp(logarithm)
-    alpha = -torch.expm1(-thickness)
-    if kind == "sparsity":
-        return alpha.sum()
-    if kind == "entropy":
-        return (-alpha * torch.log(alpha) + torch.exp(-thickness) * thickness).sum()
     at = np.concatenate([voxel_coordinates(tree), voxel_cascades(tree)[:, None]], axis=1)
     number = {tuple(place): n for n, place in enumerate(at.tolist())}
     pairs = [
@@ -102,25 +91,6 @@ def penalty(tree: NerfTree, logarithm: torch.Tensor, kind: str) -> torch.Tensor:
     return ((logarithm[here] - logarithm.detach()[other]) ** 2).sum() / 2
 
 
-@pytest.mark.parametrize(("made", "kind"), [(GRIDS[0], "sparsity"), (GRIDS[1], "entropy")])
-def test_regularisers_are_slopes_of_their_terms(made: Callable[[], NerfTree], kind: str) -> None:
-    """Without rays' gradients; from next to nothing to opaque, on both sides of where the logarithm of an opacity is that of a series."""
-    tree = made()
-    sides = voxel_sides(tree)
-    thickness = np.random.default_rng(0).permutation(np.geomspace(2e-7, 20, len(sides)))
-    o = initial_state(replace(tree, density_values=(thickness / sides).astype(np.float32)))
-    there = OnDevice(tree, o, adam=False, smooth=False)
-    there.step(np.zeros_like(o.density), np.zeros_like(o.sh), np.ones(len(sides), bool), 1, **{kind: 0.7})
-    logarithm = torch.from_numpy(np.log(o.density.astype(np.float64) * sides)).requires_grad_()
-    (slope,) = torch.autograd.grad(0.7 * penalty(tree, logarithm, kind), logarithm)
-    size, moved = np.sqrt(there.moments.square_density.cpu().double().numpy() / (1 - rule_of().decay)), there.values[0].cpu().numpy() - o.density
-    np.testing.assert_allclose(size, slope.abs().numpy(), rtol=1e-3, atol=1e-6 * np.abs(size).max())
-    clear = size > 1e-4 * size.max()
-    assert (np.sign(moved) == -np.sign(slope.numpy()))[clear].all()
-    assert (moved > 0).any() == (kind != "sparsity")
-    np.testing.assert_array_equal(there.values[1].cpu().numpy(), o.sh)
-
-
 @pytest.mark.parametrize(("made", "weight"), [(GRIDS[0], 0.7), (GRIDS[1], 1e3)])
 def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[], NerfTree], weight: float) -> None:
     tree = made()
@@ -130,7 +100,7 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     there = OnDevice(tree, o, adam=False, smooth=True)
     there.step(np.zeros_like(o.density), np.zeros_like(o.sh), np.ones(len(sides), bool), 1, total_variation=weight)
     logarithm = torch.from_numpy(np.log(o.density.astype(np.float64) * sides)).requires_grad_()
-    (slope,) = torch.autograd.grad(penalty(tree, logarithm, "total_variation"), logarithm)
+    (slope,) = torch.autograd.grad(penalty(tree, logarithm), logarithm)
     moved = np.log(there.values[0].cpu().numpy().astype(np.float64) / o.density)
     np.testing.assert_allclose(moved, -min(0.1 * weight, MOST_VARIATION) * slope.numpy(), rtol=1e-3, atol=1e-5)
     assert not there.moments.square_density.any()

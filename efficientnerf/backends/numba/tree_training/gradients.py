@@ -75,11 +75,9 @@ class TreeValues(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """stop  transmittance below which a ray ends; min_weight: samples that weigh less absorb light, and have neither a colour nor a gradient; capacity: most
-    records of a chunk."""
+    """stop: transmittance below which a ray ends; capacity: most records of a chunk."""
 
     stop: float
-    min_weight: float
     capacity: int
 
 
@@ -194,7 +192,7 @@ def _trace_packet(number, packets, targets, limits, sh, tree, arrays, ends, left
     clear(packet, tree)
     way = clear_distance(begin, end, origins, directions, tree)
     for ray in range(begin, end):
-        left[ray - begin] = walk_ray(origins[ray], directions[ray], way, tree, limits.stop, limits.min_weight, packet)
+        left[ray - begin] = walk_ray(origins[ray], directions[ray], way, tree, limits.stop, packet)
         if left[ray - begin] < 0:
             return -1
         ends[ray - begin] = packet.state[SAMPLES]
@@ -283,7 +281,7 @@ def _forward_backward(workers, task, cells, values, packets, targets, limits, nu
 
 def forward_backward(
     cells: Cells, first: np.ndarray, origins: np.ndarray, directions: np.ndarray, bases: np.ndarray, density: np.ndarray, sh: np.ndarray, targets: RayTargets,
-    buffer: RecordBuffer, *, stop: float = EARLY_STOP, min_weight: float = 0.0,
+    buffer: RecordBuffer, *, stop: float = EARLY_STOP,
 ) -> tuple[np.ndarray, Records]:  # fmt: skip
     """Loss (R,) of rays, voxel coordinates of cascade 0, and the gradients of its sum, as records in `buffer`.
 
@@ -293,14 +291,13 @@ def forward_backward(
     density              of `dense_densities`
     sh                   (N, 3 K)
     stop                 transmittance below which a ray ends
-    min_weight           samples that weigh less absorb light, and have neither a colour nor a gradient
     """
     chunks, bins = -(-(len(first) - 1) // CHUNK), (len(sh) >> BIN_BITS) + 1
     loss, counts, begin = np.zeros(len(origins)), np.zeros(chunks, np.int64), np.zeros((chunks, bins + 1), np.int64)
     buffer.reserve(chunks)
     workers, packets, values = min(numba.get_num_threads(), max(chunks, 1)), Packets(first, origins, directions, bases), TreeValues(density, sh)
     while True:
-        limits = Limits(float(stop), float(min_weight), buffer.capacity)
+        limits = Limits(float(stop), buffer.capacity)
         _forward_backward(workers, np.zeros(1, np.int64), cells, values, packets, targets, limits, buffer.numbers, buffer.gradient, begin, counts, loss)
         if not chunks or counts.max() <= buffer.capacity:
             return loss, Records(buffer.numbers, buffer.gradient, begin, bases)

@@ -204,8 +204,8 @@ def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):  # type: ignore
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _add(point, cell, cascade, tree, packet, min_weight, state):  # type: ignore[no-untyped-def]
-    """Adds a sample that has density, and weighs at least `min_weight`, to a packet.
+def _add(point, cell, cascade, tree, packet, state):  # type: ignore[no-untyped-def]
+    """Adds a sample that has density to a packet.
 
     state  transmittance, or -1 where there is no room; number of samples; entry that the last one lay in, and its key
     """
@@ -231,20 +231,19 @@ def _add(point, cell, cascade, tree, packet, min_weight, state):  # type: ignore
     if sigma > 0:
         length = tree.step_length * tree.scale[cascade]
         alpha = np.float64(absorbed(cast_like(sigma * length, tree.one)))
-        if transmittance * alpha >= min_weight:
-            packet.light[3 * count], packet.light[3 * count + 1], packet.light[3 * count + 2] = alpha, transmittance, length
-            for n in range(8):
-                packet.met[packet.slots[at + n]] = np.uint8(1)
-            count += 1
+        packet.light[3 * count], packet.light[3 * count + 1], packet.light[3 * count + 2] = alpha, transmittance, length
+        for n in range(8):
+            packet.met[packet.slots[at + n]] = np.uint8(1)
+        count += 1
         transmittance *= 1 - alpha
     return transmittance, count, entry, key
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _add_sample(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
-    """`_add` for `march_with`; scene: the packet, and the least weight."""
+    """`_add` for `march_with`; scene: a tuple of the packet."""
     # numba takes for dead what is written to a structure that comes out of a tuple: here it is an argument.
-    return _add(point, cell, cascade, tree, scene[0], scene[1], state)
+    return _add(point, cell, cascade, tree, scene[0], state)
 
 
 _march = march_with(_add_sample)
@@ -282,13 +281,12 @@ def clear_distance(begin, end, origins, directions, tree):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, error_model="numpy")
-def walk_ray(origin, direction, clear, tree, stop, min_weight, packet):  # type: ignore[no-untyped-def]
-    """Adds the samples of a ray to a packet, those that have density and weigh at least `min_weight`; returns the transmittance behind all of them, or -1
-    where there is no room.
+def walk_ray(origin, direction, clear, tree, stop, packet):  # type: ignore[no-untyped-def]
+    """Adds the samples of a ray that have density to a packet; returns the transmittance behind all of them, or -1 where there is no room.
 
     clear  distance before which the ray meets nothing
     """
     start = 1.0, packet.state[SAMPLES], np.int64(-1), np.int64(-1)
-    transmittance, count, _last, _cell = _march(origin, direction, clear, tree, stop, (packet, min_weight), start)
+    transmittance, count, _last, _cell = _march(origin, direction, clear, tree, stop, (packet,), start)
     packet.state[SAMPLES] = count
     return transmittance

@@ -3,12 +3,9 @@
 RMSprop, or Adam (Kingma and Ba 2015) where there is a momentum, with bias corrections by how often a voxel was met. The second moment of a voxel's harmonics is
 the mean of its coefficients'. Plenoxels (Fridovich-Keil et al. 2022) are optimised with RMSprop. N voxels, K harmonics, L cascades, B bricks.
 
-A step minimises the rays' losses and, of each voxel that they met, with tau its optical thickness,
-
-    sparsity (1 - exp(-tau))  +  entropy H(1 - exp(-tau)),    H(a) = -a log a - (1 - a) log(1 - a).
-
-Then it takes  density_rate total_variation sum_n (log tau - log tau_n)  from log tau, n over the voxels beyond its faces that are stored and tau_n before the
-step: the gradient of half the squared differences, apart from the moments as the weight decay of AdamW (Loshchilov and Hutter 2019) is.
+A step minimises the rays' losses. Then it takes  density_rate total_variation sum_n (log tau - log tau_n)  from log tau, with tau the optical thickness of a
+voxel that rays met, n over the voxels beyond its faces that are stored and tau_n before the step: the gradient of half the squared differences, apart from
+the moments as the weight decay of AdamW (Loshchilov and Hutter 2019) is.
 """
 
 from __future__ import annotations
@@ -35,10 +32,11 @@ def padded(width: int) -> int:
     return -(-width // LANES) * LANES
 
 
-def rows_of(basis: np.ndarray, terms: int) -> np.ndarray:
-    """(P, padded(3 terms)) float32 of harmonics (P, K): each of the first `terms` three times, as a row of coefficients has it."""
-    rows = np.zeros((len(basis), padded(3 * terms)), np.float32)
-    rows[:, : 3 * terms].reshape(len(basis), terms, 3)[:] = basis[:, :terms, None]
+def rows_of(basis: np.ndarray) -> np.ndarray:
+    """(P, padded(3 K)) float32 of harmonics (P, K): each three times, as a row of coefficients has it."""
+    count, terms = basis.shape
+    rows = np.zeros((count, padded(3 * terms)), np.float32)
+    rows[:, : 3 * terms].reshape(count, terms, 3)[:] = basis[:, :, None]
     return rows
 
 
@@ -86,7 +84,7 @@ class StepPointers(NamedTuple):
     bases          (P, padded) of `rows_of`
     following      of `_link`
     row            (padded,) the gradient by a voxel's coefficients
-    stride, width  3 K, and three times the coefficients that have gradients
+    width          3 K
     of_*           `corrections` of the moments, and the last one of these
     """
 
@@ -95,7 +93,6 @@ class StepPointers(NamedTuple):
     bases: Any
     following: Any
     row: Any
-    stride: int
     width: int
     padded: int
     density: Any
@@ -181,17 +178,6 @@ def _gather(number, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _regularised(slope, thickness, h):  # type: ignore[no-untyped-def]
-    """The gradient by the logarithm of a voxel's optical thickness with those of sparsity and entropy."""
-    if h.sparsity > 0:
-        slope += h.sparsity * thickness * np.exp(-thickness)
-    if h.entropy > 0:
-        left = np.exp(-thickness)
-        slope += h.entropy * thickness * left * -(np.log(max(1 - left, 1e-30)) + thickness)
-    return slope
-
-
-@numba.njit(cache=True, error_model="numpy")
 def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     """A step of one voxel, whose gradient by coefficients is `p.row` and the sum of its squares `squares`."""
     decay, epsilon, momentum = h.decay, h.epsilon, h.momentum
@@ -200,7 +186,7 @@ def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     correction, voxel = np.float64(p.of_square[min(visits, p.of_square_end)]), p.sides[p.cascades[v]]
     # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
     thickness = max(p.density[v] * voxel, MIN_THICKNESS)
-    slope = _regularised(by_density / voxel * thickness, thickness, h)
+    slope = by_density / voxel * thickness
     square = decay * p.square_density[v] + (1 - decay) * slope * slope
     p.square_density[v] = np.float32(square)
     ahead = 1.0
@@ -218,7 +204,7 @@ def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     p.square_sh[v] = np.float32(square)
     scale = np.float32(-ahead / (np.sqrt(square * correction) + epsilon))
     for j in range(0, p.width, LANES):
-        by, at, count = load(p.row, j, LANES), v * p.stride + j, p.width - j
+        by, at, count = load(p.row, j, LANES), v * p.width + j, p.width - j
         if momentum > 0:
             by = load_first(p.mean_sh, at, count, LANES) * np.float32(momentum) + by * np.float32(1 - momentum)
             store_first(p.mean_sh, at, by, count)
@@ -234,16 +220,16 @@ def _fetch(v, number, p):  # type: ignore[no-untyped-def]
     prefetch(p.visits, v)
     prefetch(p.dense, p.places[v])
     prefetch(p.gradient, 4 * p.following[2 * number])
-    for j in range(0, p.stride, LANES):
-        prefetch(p.sh, v * p.stride + j)
-    prefetch(p.sh, v * p.stride + p.stride - 1)
+    for j in range(0, p.width, LANES):
+        prefetch(p.sh, v * p.width + j)
+    prefetch(p.sh, v * p.width + p.width - 1)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
+def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean):  # type: ignore[no-untyped-def]
     """See `StepPointers`."""
     return StepPointers(
-        pointer(records.numbers), pointer(records.gradient), pointer(rows), pointer(following), pointer(row), values.sh.shape[1], width, rows.shape[1],
+        pointer(records.numbers), pointer(records.gradient), pointer(rows), pointer(following), pointer(row), values.sh.shape[1], rows.shape[1],
         pointer(values.density), pointer(values.sh), pointer(values.places), pointer(values.dense), pointer(moments.density), pointer(moments.sh),
         pointer(moments.square_density), pointer(moments.square_sh), pointer(moments.visits), pointer(values.sides), pointer(values.cascades), pointer(rates),
         pointer(of_square), len(of_square) - 1, pointer(of_mean), len(of_mean) - 1, pointer(neighbours.around), neighbours.brick,
@@ -251,7 +237,7 @@ def _step_pointers(records, rows, following, row, values, moments, neighbours, r
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
+def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean):  # type: ignore[no-untyped-def]
     """Takes bins until none is left."""
     bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
     met, some, row = np.empty(size, np.int64), np.zeros(size >> 6, np.int64), np.empty(rows.shape[1], np.float32)
@@ -260,7 +246,7 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
     while slab < bins:
         low = slab << BIN_BITS
         following = _link_all(low, slab, records, head, following, some)
-        p = _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean, width)
+        p = _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean)
         count = _take_voxels(some, met)
         for n in range(count):
             v = low + met[n]
@@ -275,9 +261,9 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
+def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
-        _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean, width)
+        _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -318,11 +304,11 @@ def step(records: Records, values: Values, moments: Moments, hyperparameters: Hy
     s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
     p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
     """
-    h, count = Hyperparameters._make([*map(float, hyperparameters[:-1]), hyperparameters.terms]), records.begin.shape[1] - 1
-    terms, workers = min(h.terms, values.sh.shape[1] // 3), min(numba.get_num_threads(), count)
-    rows, rates = rows_of(records.basis, terms), np.full(padded(3 * terms), h.sh_rate * h.view_share, np.float32)
+    h, count = Hyperparameters._make(map(float, hyperparameters)), records.begin.shape[1] - 1
+    rows, workers = rows_of(records.basis), min(numba.get_num_threads(), count)
+    rates = np.full(rows.shape[1], h.sh_rate * h.view_share, np.float32)
     rates[:3] = h.sh_rate
-    _step(workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum), 3 * terms)
+    _step(workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum))
     # Not before all bins are done: total variation is that of the densities before the step.
     _copy(workers, np.zeros(1, np.int64), records, values)
 
