@@ -110,9 +110,14 @@ def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:
     """(N,) bool: voxels whose weight exceeds bake.weight_threshold, at most `most`."""
     keep = greatest > job.settings.weight_threshold
     if keep.sum() > most:
-        order = np.argsort(-greatest, kind="stable")
-        keep = np.zeros(len(keep), bool)
-        keep[order[:most]] = True
-        left_out = float(greatest[order[most]])
+        keep = greatest_of(greatest, most)
+        left_out = float(greatest[~keep].max())
         job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib allows {most:,}")
+    return keep
+
+
+def greatest_of(weight: np.ndarray, count: int) -> np.ndarray:
+    """(N,) bool: the `count` voxels of the greatest weight, the first of equals."""
+    keep = np.zeros(len(weight), bool)
+    keep[np.argsort(-weight, kind="stable")[:count]] = True
     return keep

@@ -186,9 +186,11 @@ def refined(
         weighed = min(max(settings.visibility_rays, most), 4 * len(targets.pixels))
         finish += packing_seconds(most, count_cores(), per_ray, settings.refine_rays_per_batch, weighed, sample)
     schedule = stated_schedule(steps) if seconds is None else RefinementSchedule()
-    baked = None if samples is None else _initial_density(tree, capped=bool(steps))
+    thickness = MAX_INITIAL_THICKNESS if steps else math.inf
+    bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
+    baked = None if samples is None else initial_state(bare, thickness).density
     cells = count_cells(PatchGrid(targets.host_pixels, fit.PATCH_SIDE))
-    point = _first_point(job, tree, schedule, stopwatch, cells, timed=seconds is not None, capped=bool(steps))
+    point = _first_point(job, tree, schedule, stopwatch, cells, thickness, timed=seconds is not None)
     log = RefinementLog(
         job.work / BakeOutputs.log, point.state.step, point.schedule.fraction(point.state.step), stopwatch, _previews(job, s, point, targets), clock
     )  # fmt: skip
@@ -214,19 +216,13 @@ def _unrefined(taken: int, usual: int) -> str:
     return f"{done}: the asset is hardly better than it was baked. Give more time (--budget) or fewer voxels (bake.max_mib), or run it while nothing else does."
 
 
-def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, *, timed: bool, capped: bool) -> Point:
+def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, thickness: float, *, timed: bool) -> Point:
     """Where an earlier attempt stopped, or else the beginning."""
     found = checkpoint.restored(job, tree, schedule, HOLD if timed else None, cells=cells)
     if found is None:
-        return Point(initial_state(tree, MAX_INITIAL_THICKNESS if capped else math.inf), schedule)
+        return Point(initial_state(tree, thickness), schedule)
     stopwatch.set(found.seconds)
     return found
-
-
-def _initial_density(tree: NerfTree, *, capped: bool) -> np.ndarray:
-    """(N,) the densities that the refinement of a tree begins with."""
-    bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
-    return initial_state(bare, MAX_INITIAL_THICKNESS if capped else math.inf).density
 
 
 def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
