@@ -22,11 +22,12 @@ from efficientnerf.asset.file import serialisation
 from efficientnerf.geometry.spaces import NdcSpace, Space
 from efficientnerf.model import Model
 from efficientnerf.settings import resolved
-from stages.bake.resolution import MAX_CASCADES, MAX_CELLS, MAX_OVERSHOOT, MAX_RESOLUTION, MIN_RESOLUTION, Choice, finest_resolution, timed_mib, usual_mib
+from stages.bake.resolution import MAX_CELLS, MAX_OVERSHOOT, MAX_RESOLUTION, MIN_RESOLUTION, Choice, finest_resolution, mib_for_voxels, timed_mib, usual_mib
 from stages.bake.settings import BakeSettings
 from stages.evaluate.views import constant_background
 from stages.io.scene import Scene
 
+MAX_CASCADES = 8
 ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
@@ -161,8 +162,7 @@ def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: in
         space=space, background=background, resolution=resolution, fixed=bool(side), least_cells=least_cells, most_cells=most_cells,
         at_centres=trained is not None and trained == side and space is m.space,
         min_views=resolved(m.settings.min_views) or 0 if m.space.contracted else 0,
-        # Bytes of a packed asset beyond the usual size go into finer codes, and not into more voxels unless these are stated. docs/experiments/packed.md
-        max_mib=mib, mib=min(mib, usual) if packed and not side else mib, usual_mib=usual, timed=timed,
+        max_mib=mib, mib=mib_for_voxels(mib, usual, packed=packed, fixed=bool(side)), usual_mib=usual, timed=timed,
         degree=m.fine.degree, layout=settings.layout, brick_size=brick, environment_size=settings.environment_size if whole else 0,
         min_component=settings.min_component if s.background is None else 0.0,
         refine_steps=resolved(settings.refine_steps) if seconds is None else None, seconds=seconds, view_dependent_lr_ratio=ratio, error_map=error_map,

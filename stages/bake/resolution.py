@@ -22,8 +22,8 @@ MIN_RESOLUTION = 32  # voxels along the longest side
 VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
 MAX_RESOLUTION = 1024
 MAX_MIB = 38
-# Of unbounded scenes: most cascades; the share of what the field shows that may lie beyond the last, in the environment map; coarse cells of all of them.
-MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
+# Of unbounded scenes: the share of what the field shows that may lie beyond the last cascade, in the environment map; coarse cells of all cascades.
+MAX_BEYOND, MAX_CELLS = 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
 NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
 # With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of an unbounded scene
@@ -90,6 +90,12 @@ def usual_mib(s: Scene, *, packed: bool = False) -> float:
         across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
         mib = int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
     return math.ceil(mib / 3) if packed else mib
+
+
+def mib_for_voxels(mib: float, usual: float, *, packed: bool, fixed: bool) -> float:
+    """MiB that voxels are chosen by: bytes of a packed asset beyond the usual size go into finer codes, unless its resolution is stated. See
+    docs/experiments/packed.md."""
+    return min(mib, usual) if packed and not fixed else mib
 
 
 def timed_mib(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:

@@ -5,7 +5,7 @@ All voxels compete for the asset's size by the weight that they have in some pix
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,18 +21,16 @@ from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job
 from stages.bake.plan import Bake, SceneBake, coarse_cells, grid_over
 from stages.bake.resolution import MAX_OVERSHOOT, MIN_RESOLUTION, OVERSHOOT, Choice, affordable_resolution
-from stages.bake.scratch import read_arrays, write_arrays
+from stages.bake.scratch import rendered_once
 from stages.bake.settings import BakeSettings
-from stages.bake.whole_scene import Cascades, Surroundings, boxes_of
+from stages.bake.whole_scene import CENTRES_PER_BLOCK, Cascades, Surroundings, boxes_of
 from stages.framing.view_coverage import count_views, has_min_views, kept_pixels
 from stages.io import scene
 from stages.io.scene import Scene
-from stages.scratch import unusable
 
 # In normalised device coordinates a voxel that fewer training images have in view counts so many times as much: what shows there at the borders of other views
 # is faint in the field. docs/experiments/bake-resolution.md
 WELL_SEEN_VIEWS, FEW_VIEWS_RATIO = 4, 30.0  # of fewer than 7 training images half of them: else all voxels would be seen by few
-CENTRES_PER_BLOCK = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,21 +157,14 @@ def seen_by_few(job: Job, s: Scene, ndc: Ndc, points: np.ndarray) -> np.ndarray:
 def _visibility(job: Job, m: Model, pixels: Pixels, grid: Grid, space: Space) -> Visibility:
     """The visibility of voxels, computed or from an earlier attempt."""
     settings: BakeSettings = job.settings
-    kinds = {"cells": ("int64", 1), "greatest": ("float32", 2)}
-    stored = read_arrays(job.work / "visibility", kinds, job.warn)
-    if stored is not None:
-        found = Visibility(**{name: np.array(part) for name, part in stored.items()})
-        if _fits(found, coarse_cells([grid]), settings.brick_size**3):
-            return found
-        job.warn(unusable(job.work / "visibility", "of another grid"))
 
-    def progress(done: int, total: int) -> None:
-        job.progress(done, total, "rendering for visible voxels")
-        job.safe_point()
+    def fits(found: Visibility) -> bool:
+        return _fits(found, coarse_cells([grid]), settings.brick_size**3)
 
-    visibility = bake.visible_voxels(m, pixels, *grid, settings.brick_size, settings.visibility_rays, progress, space)
-    write_arrays({name: getattr(visibility, name) for name in kinds}, job.work / "visibility")
-    return visibility
+    def measured(progress: Callable[[int, int], None]) -> Visibility:
+        return bake.visible_voxels(m, pixels, *grid, settings.brick_size, settings.visibility_rays, progress, space)
+
+    return rendered_once(job, "visibility", Visibility, {"cells": ("int64", 1), "greatest": ("float32", 2)}, fits, measured)
 
 
 def _fits(found: Visibility, cells: int, per_cell: int) -> bool:

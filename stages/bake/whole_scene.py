@@ -9,7 +9,7 @@ N voxels, P rays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,13 +35,11 @@ from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.bake.plan import SceneBake, nested_grids
 from stages.bake.resolution import MAX_BEYOND, finest_of_cascades
-from stages.bake.scratch import read_arrays, write_arrays
-from stages.bake.settings import BakeSettings
+from stages.bake.scratch import rendered_once
 from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
 from stages.io import scene
 from stages.io.json_file import read_json
 from stages.io.scene import Scene
-from stages.scratch import unusable
 from stages.train.priors import filled_points
 
 # Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned
@@ -81,7 +79,11 @@ class Cascades:
 
     def __init__(self, job: Job, plan: SceneBake, m: Model, s: Scene, pixels: Pixels) -> None:
         self.job, self.plan, self.s, self.pixels = job, plan, s, pixels
-        self.samples = _samples(job, m, pixels)
+        own = job.settings
+        self.samples = rendered_once(
+            job, "samples", FieldSamples, KINDS, lambda found: fits(found, pixels),
+            lambda progress: field_samples(m, pixels, own.visibility_rays, own.weight_threshold, progress),
+        )  # fmt: skip
         job.safe_point()
         self.region = region_of(self.samples, pixels, s, job.inputs["poses"])
         self.bounds = np.asarray(self.region.bounds, np.float64) if plan.box is None else plan.box
@@ -150,25 +152,6 @@ def bounds_are_given(poses: Path) -> bool:
         raise CorruptArtifact(str(error)) from error
     framing = report.get("framing") if isinstance(report, dict) else None
     return isinstance(framing, dict) and framing.get("bounds_from") == "given"
-
-
-def _samples(job: Job, m: Model, pixels: Pixels) -> FieldSamples:
-    """The field's samples, taken or from an earlier attempt."""
-    settings: BakeSettings = job.settings
-    stored = read_arrays(job.work / "samples", KINDS, job.warn)
-    if stored is not None:
-        found = FieldSamples(**{name: np.array(part) for name, part in stored.items()})
-        if fits(found, pixels):
-            return found
-        job.warn(unusable(job.work / "samples", "of other images, or not in order"))
-
-    def progress(done: int, total: int) -> None:
-        job.progress(done, total, "rendering for visible voxels")
-        job.safe_point()
-
-    samples = field_samples(m, pixels, settings.visibility_rays, settings.weight_threshold, progress)
-    write_arrays({field.name: getattr(samples, field.name) for field in fields(samples)}, job.work / "samples")
-    return samples
 
 
 def fits(samples: FieldSamples, pixels: Pixels) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 from efficientnerf.settings import resolved
 from stages.bake.refine.refinement import usual_steps
-from stages.bake.resolution import MAX_MIB
+from stages.bake.resolution import MAX_MIB, mib_for_voxels
 from stages.memory.need import libraries
 
 SLOWER = 1.5  # by `preflight.REFERENCE`, of the machine that the processor seconds below were taken on
@@ -68,8 +68,8 @@ def bytes_of(settings: Mapping[str, Any]) -> int:
 
 
 def _voxels(bake: Any) -> int:
-    """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.budget_of`)."""
+    """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.usual_mib`)."""
     packed, stated = bake.layout == "packed", resolved(bake.max_mib)
     usual = MAX_MIB / 3 if packed else MAX_MIB
-    mib = usual if stated is None else min(stated, usual) if packed and bake.resolution == "auto" else stated
+    mib = mib_for_voxels(usual if stated is None else stated, usual, packed=packed, fixed=resolved(bake.resolution) is not None)
     return int(mib * 2**20 / (PACKED_BYTES_A_VOXEL if packed else BYTES_A_VOXEL))
