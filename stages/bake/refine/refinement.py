@@ -166,7 +166,7 @@ def refined(
 ) -> tuple[NerfTree, dict[str, Any]]:
     """The refined tree of at most as many voxels as the asset holds, and the entries of the report; the log, the curve and the previews are written."""
     settings, seconds = job.settings, plan.seconds
-    samples, capacity = voxels.surroundings and voxels.surroundings.samples, plan.capacity(coarse_cells(voxels.grids))
+    samples, capacity = None if voxels.surroundings is None else voxels.surroundings.samples, plan.capacity(coarse_cells(voxels.grids))
     most = min(len(tree.density_values), capacity)
     steps = plan.refine_steps
     if steps is None:
