@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.capture.forward_facing import ForwardFacing
-from stages.io.scene import Scene
+from stages.io.scene import Scene, views_of
 
 MIN_RESOLUTION = 32  # voxels along the longest side
 # docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background, of an unbounded scene (its innermost cascade), and in
@@ -22,8 +22,9 @@ MIN_RESOLUTION = 32  # voxels along the longest side
 VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
 MAX_RESOLUTION = 1024
 MAX_MIB = 38
-# Of unbounded scenes: the share of what the field shows that may lie beyond the last cascade, in the environment map; coarse cells of all cascades.
-MAX_BEYOND, MAX_CELLS = 0.01, 2**24
+# Of unbounded scenes: bytes for each pixel of the training images; MiB at most, where these are more than MAX_MIB (docs/experiments/bake-resolution.md); the
+# share of what the field shows that may lie beyond the last cascade, in the environment map; coarse cells of all cascades.
+SCENE_BYTES, SCENE_MAX_MIB, MAX_BEYOND, MAX_CELLS = 0.7, 76, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
 NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
 # With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of an unbounded scene
@@ -81,14 +82,21 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
 
 
+def scene_mib(pixels: int) -> float:
+    """MiB that the asset of an unbounded scene may have where none are stated: the more pixels its training images have, the more voxels these tell apart."""
+    return float(np.clip(SCENE_BYTES * pixels / 2**20, MAX_MIB, SCENE_MAX_MIB))
+
+
 def usual_mib(s: Scene, *, packed: bool = False) -> float:
-    """MiB that an asset may have where nothing is stated: MAX_MIB. In normalised device coordinates, where nothing is empty
+    """MiB that an asset may have where none are stated: MAX_MIB, or `scene_mib` of an unbounded scene. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
     large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
-    mib = MAX_MIB
+    mib: float = MAX_MIB
     if s.forward is not None:
         across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
         mib = int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
+    elif s.background is None:
+        mib = scene_mib(sum(view.camera.width * view.camera.height for view in views_of(s, "train")))
     return math.ceil(mib / 3) if packed else mib
 
 
