@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from efficientnerf.asset import economy
 from efficientnerf.asset.cascades import subset
 from efficientnerf.asset.economy import economised
@@ -20,6 +18,7 @@ from efficientnerf.asset.refinement.quantised import refit
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
+from stages.bake.pruning import greatest_of
 from stages.bake.refine.refinement import ERROR_RAYS, targets_on_device
 from stages.bake.refine.timing import PACKING_TRIES, REFIT_STEPS
 from stages.train.log import psnr_of
@@ -68,7 +67,7 @@ def _coded(job: Job, tree: NerfTree, targets: Targets, size: int) -> NerfTree:
         else:
             low = rate
             if rate >= COARSEST:
-                keep = _heaviest(weight, int(len(weight) * 0.96 * max(0.1, (size - FIXED) / (took - FIXED))))
+                keep = greatest_of(weight, int(len(weight) * 0.96 * max(0.1, (size - FIXED) / (took - FIXED))))
                 tree, weight, low, high = subset(tree, keep), weight[keep], None, None
                 known, rate, before = economy.economy_of(tree, weight), COARSEST, None
                 continue
@@ -90,10 +89,3 @@ def _steepness(before: tuple[int, float] | None, now: tuple[int, float]) -> floa
     if before is None or before[0] == now[0]:
         return STEEPNESS
     return min(max(math.log(now[1] / before[1]) / math.log(before[0] / now[0]), LEAST_STEEPNESS), MOST_STEEPNESS)
-
-
-def _heaviest(weight: np.ndarray, count: int) -> np.ndarray:
-    """(N,) bool: the `count` voxels of the greatest weight, the first of equals."""
-    keep = np.zeros(len(weight), bool)
-    keep[np.argsort(-weight, kind="stable")[:count]] = True
-    return keep

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import torch
 
-from efficientnerf.asset.bake import grid_of
-from efficientnerf.asset.file.serialisation import bytes_per_voxel, most_voxels
+from efficientnerf.asset.file.serialisation import bytes_per_voxel
 from efficientnerf.asset.refinement.error_map import MAX_CELLS
 from efficientnerf.asset.refinement.fit import PATCH_SIDE
 from efficientnerf.model import Model
-from efficientnerf.settings import resolved
+from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.training.pixels import PixelRows, Pixels
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
 from stages.artifacts import BakeInputs
-from stages.bake.plan import Plan
-from stages.bake.resolution import MAX_CASCADES, size_limits
-from stages.bake.resolution import MAX_CELLS as MAX_COARSE_CELLS
+from stages.bake.plan import Bake, SceneBake, bake_plan, coarse_cells
 from stages.bake.settings import BakeSettings
-from stages.bake.voxels import MAX_OVERSHOOT, finest_choice
-from stages.bake.whole_scene import grids_of
+from stages.bake.voxels import Voxels
 from stages.cores import count_cores
-from stages.evaluate.views import constant_background
 from stages.io.field_file import load_renderer
 from stages.io.refined_cameras import load_scene
-from stages.io.scene import Scene, View, views_of
+from stages.io.scene import View, views_of
 from stages.memory.forecast import Known
 from stages.memory.need import MIB, Need, has_room, libraries, refuse_what_does_not_fit
 from stages.train.data import channels_of, count_pixels
@@ -65,109 +60,83 @@ def free_on_device(device: str) -> int:
 
 
 def needed(
-    settings: BakeSettings, m: Model, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, whole: bool, device: str
+    settings: BakeSettings, plan: Bake, m: Model, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, device: str
 ) -> Need:
     """Memory to bake a model.
 
     channels  of the pixels
     voxels    that are baked
-    cells     coarse cells of the finest grids in question
+    cells     coarse cells of all grids
     bricks    that are reached by samples, at most
     stored    whether the pixels are in a file
-    whole     whether the scene is unbounded
     """
-    pixels, harmonics = pixels_needed(views, channels, stored=stored), (m.fine.degree + 1) ** 2
+    pixels, harmonics = pixels_needed(views, channels, stored=stored), harmonics_count(plan.degree)
     rays = min(settings.visibility_rays, count_pixels(tuple(views)))
     return Need({
         PIXELS: pixels[PIXELS],
-        "voxels": max(voxels_needed(voxels, harmonics, packed=settings.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
-        "the grid": CELL * cells + BRICK_VOXEL * settings.brick_size**3 * bricks,
-        "rays": (SCENE_RAY if whole else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
+        "voxels": max(voxels_needed(voxels, harmonics, packed=plan.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
+        "the grid": CELL * cells + BRICK_VOXEL * plan.brick_size**3 * bricks,
+        "rays": (SCENE_RAY if isinstance(plan, SceneBake) else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
         "the error map": ERROR_CELL * min(MAX_CELLS, count_pixels(tuple(views)) // PATCH_SIDE),
-        "the field": 3 * 4 * parameters(m.settings) + DENSITY_VOXEL * (resolved(m.settings.occupancy_resolution) or 192) ** 3 // 4,
+        "the field": 3 * 4 * parameters(m.settings) + DENSITY_VOXEL * m.voxels.side**3 // 4,
         "libraries": libraries(device),
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Model, s: Scene, views: tuple[View, ...], mib: float, *, whole: bool) -> PixelRows | None:
+def most_needed(settings: BakeSettings, plan: Bake, m: Model, views: Sequence[View], channels: int, voxels: int, *, stored: bool, device: str) -> Need:
+    """Memory to bake at most so many voxels, before they are counted."""
+    bricks = min(plan.most_cells, voxels // 8)
+    return needed(settings, plan, m, views, channels, voxels=voxels, cells=plan.most_cells, bricks=bricks, stored=stored, device=device)
+
+
+def rows_for_baking(job: Job, plan: Bake, m: Model, views: tuple[View, ...]) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit with the voxels.
 
     The number of voxels is not known yet: what would not fit without any is refused here, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     settings, channels = job.settings, channels_of(job.inputs["poses"], views)
-    finest, voxels, at_most = most_needed(settings, m, s, views, channels, mib, whole, job.device)
-    stored = not has_room(job, at_most(voxels, stored=False))
+    at_most = partial(most_needed, settings, plan, m, views, channels, device=job.device)
+    stored = not has_room(job, at_most(plan.most_voxels, stored=False))
+    finest = plan.resolution.resolution
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
-    if job.memory is not None and (most := at_most(voxels, stored=stored).total) > job.memory.bytes:
-        job.warn(f"an asset of {mib:g} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. It is refused"
+    if job.memory is not None and (most := at_most(plan.most_voxels, stored=stored).total) > job.memory.bytes:
+        job.warn(f"an asset of {plan.mib:g} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. It is refused"
                  " once its voxels are counted, before they are baked, if it does not fit; with a lower bake.max_mib it surely fits.")  # fmt: skip
     return rows
 
 
-def most_needed(
-    settings: BakeSettings, m: Model, s: Scene, views: Sequence[View], channels: int, mib: float, whole: bool, device: str
-) -> tuple[int, int, Callable[..., Need]]:
-    """Most memory to bake a model, before its voxels are counted.
-
-    mib      that the asset may have
-    returns  voxels along the finest grid in question; how many are baked at most; and `needed` as a function of (voxels, stored=)
-    """
-    finest, cells = _finest_cells(settings, m, s, whole=whole)
-    room = most_voxels(int(mib * MIB), settings.layout, m.fine.degree, (1, 1, 1), settings.brick_size)
-
-    def at_most(voxels: int, *, stored: bool) -> Need:
-        bricks = min(cells, voxels // 8)
-        return needed(settings, m, views, channels, voxels=voxels, cells=cells, bricks=bricks, stored=stored, whole=whole, device=device)
-
-    return finest, min(MAX_OVERSHOOT * room, cells * settings.brick_size**3), at_most
-
-
-def _finest_cells(settings: BakeSettings, m: Model, s: Scene, *, whole: bool) -> tuple[int, int]:
-    """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
-    bounds, discretise = m.space.bounds, resolved(m.settings.discretise)
-    finest = finest_choice(settings, m.settings, s).resolution
-    if not whole:
-        return finest, math.prod(grid_of(bounds, finest, settings.brick_size)[0])
-    count = resolved(settings.cascades) or MAX_CASCADES
-    cells = sum(math.prod(shape) for shape, _, _ in grids_of(bounds, finest, settings.brick_size, count, None))
-    stated = resolved(settings.resolution) or resolved(settings.max_resolution) or discretise
-    return finest, cells if stated else min(cells, 2 * MAX_COARSE_CELLS)  # coarse cells are more by those that make grids fit each other
-
-
-def refuse_more_than_fits(job: Job, m: Model, views: tuple[View, ...], pixels: Pixels, plan: Plan, mib: float) -> None:
+def refuse_more_than_fits(job: Job, plan: Bake, m: Model, views: tuple[View, ...], pixels: Pixels, voxels: Voxels) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
     pixels  as they were placed
     """
-    whole, voxels = plan.samples is not None, plan.voxels
-    grid = {"voxels": voxels, "cells": plan.cells, "bricks": plan.bricks}
+    grid = {"voxels": voxels.count, "cells": coarse_cells(voxels.grids), "bricks": voxels.bricks}
     stored = isinstance(pixels.images, PixelFile)
-    need = needed(job.settings, m, views, pixels.images.shape[1], **grid, stored=stored, whole=whole, device=job.device)
-    harmonics = (m.fine.degree + 1) ** 2
-    remedy = f"Lower bake.max_mib ({mib:g}) or bake.resolution ({plan.choice.resolution}): {voxels:,} voxels with {harmonics} harmonics are too many."
-    refuse_what_does_not_fit(job, need, remedy)
+    need = needed(job.settings, plan, m, views, pixels.images.shape[1], **grid, stored=stored, device=job.device)
+    many = f"{voxels.count:,} voxels with {harmonics_count(plan.degree)} harmonics are too many"
+    refuse_what_does_not_fit(job, need, f"Lower bake.max_mib ({plan.mib:g}) or bake.resolution ({voxels.choice.resolution}): {many}.")
 
 
 def memory_needed(known: Known) -> Need:
     """Most memory of the stage bake, before its voxels are counted."""
-    return _before(known)[-1]
+    plan, m, views = _before(known)
+    channels = channels_of(known.inputs(BakeInputs).poses.folder, views)
+    return most_needed(known.settings["bake"], plan, m, views, channels, plan.most_voxels, stored=False, device=known.device)
 
 
 def space_needed(known: Known) -> int:
     """The field's samples, the values of the voxels as they are baked, a checkpoint of their refinement, two while it is replaced, and the asset."""
-    own, (degree, whole, mib, rays, voxels, _) = known.settings["bake"], _before(known)
-    values, voxels = 4 * (1 + 3 * (degree + 1) ** 2), min(voxels, SHOWN * rays)
-    checkpoints = 1 if own.refine_steps != "auto" and own.refine_steps * own.refine_rays_per_batch < SHORT else 2
-    asset = min(int(mib * MIB), 2 * bytes_per_voxel(own.layout, degree) * voxels)
-    return (values + checkpoints * (values + WRITTEN)) * voxels + asset + whole * WRITTEN_RAY * rays + known.pictures()
+    own, (plan, _, views) = known.settings["bake"], _before(known)
+    rays = min(own.visibility_rays, count_pixels(views))
+    values, voxels = 4 * (1 + 3 * harmonics_count(plan.degree)), min(plan.most_voxels, SHOWN * rays)
+    checkpoints = 1 if plan.refine_steps is not None and plan.refine_steps * own.refine_rays_per_batch < SHORT else 2
+    asset = min(int(plan.mib * MIB), 2 * bytes_per_voxel(plan.layout, plan.degree) * voxels)
+    return (values + checkpoints * (values + WRITTEN)) * voxels + asset + isinstance(plan, SceneBake) * WRITTEN_RAY * rays + known.pictures()
 
 
-def _before(known: Known) -> tuple[int, bool, float, int, int, Need]:
-    """(degree of the harmonics, whether the scene is unbounded, MiB of the asset, visibility rays, voxels, what these take of memory), each at most."""
-    own, inputs = known.settings["bake"], known.inputs(BakeInputs)
+def _before(known: Known) -> tuple[Bake, Model, tuple[View, ...]]:
+    """The plan, the model and the training views."""
+    inputs = known.inputs(BakeInputs)
     m, s = load_renderer(inputs.train.folder).model, load_scene(inputs.poses.folder, inputs.train.folder)
-    views, whole = views_of(s, "train"), constant_background(s) is None
-    mib = size_limits(own, s, known.device, count_cores(), whole=whole, discretise=resolved(m.settings.discretise))[1]
-    _, voxels, at_most = most_needed(own, m, s, views, channels_of(inputs.poses.folder, views), mib, whole, known.device)
-    return m.fine.degree, whole, mib, min(own.visibility_rays, count_pixels(views)), voxels, at_most(voxels, stored=False)
+    return bake_plan(known.settings["bake"], m, s, known.device, count_cores()), m, views_of(s, "train")

@@ -1,47 +1,213 @@
-"""The voxels to bake: of one grid, or of the cascades of an unbounded scene."""
+"""What is decided before an asset is baked: `bake_plan` resolves settings, field and scene to numbers, as one of three types.
+
+    ObjectBake  one grid over the field's box, before a constant background
+    SceneBake   nested grids around a foreground region, and an environment map: an unbounded scene
+    NdcBake     one grid in normalised device coordinates: a forward-facing scene
+
+What comes after takes this plan, and compares no setting with "auto".
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from efficientnerf.asset.field_samples import FieldSamples, Grid
-from efficientnerf.asset.tree import Region
-from efficientnerf.geometry.spaces import Space
-from stages.bake.resolution import Choice
+from efficientnerf.asset.bake import grid_of
+from efficientnerf.asset.cascades import cascade_grids
+from efficientnerf.asset.field_samples import Grid
+from efficientnerf.asset.file import serialisation
+from efficientnerf.geometry.spaces import NdcSpace, Space
+from efficientnerf.model import Model
+from efficientnerf.settings import resolved
+from stages.bake.resolution import MAX_CELLS, MAX_OVERSHOOT, MAX_RESOLUTION, MIN_RESOLUTION, Choice, finest_resolution, mib_for_voxels, timed_mib, usual_mib
+from stages.bake.settings import BakeSettings
+from stages.evaluate.views import constant_background
+from stages.io.scene import Scene
+
+MAX_CASCADES = 8
+ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
+UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
+
+
+def coarse_cells(grids: Sequence[Grid]) -> int:
+    """Coarse cells of nested grids."""
+    return sum(math.prod(shape) for shape, _, _ in grids)
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Voxels that are baked.
-
-    space        the field's, in the frame that the voxels are cubes of
-    grids        nested, the innermost first; one unless the scene is unbounded
-    indices      coordinates (N, 3) of the voxels in each of them
-    bricks       coarse cells that hold a sample, of all grids
-    seen         of unbounded scenes, for each grid (N, 2) what rays saw of the voxels (`efficientnerf.asset.field_samples.seen_weights`)
-    samples      what the field shows along training rays, of unbounded scenes alone, as the next two
-    region       the foreground
-    environment  (H, 2 H, 3) what lies beyond all grids
+class _Bake:
+    """
+    space              the field's, in the frame that the voxels are cubes of
+    background         constant sRGB colour that the asset is composited with; None: its environment map
+    resolution         voxels along the longest side: those stated, or the most in question; of a scene an estimate until its foreground region is known
+    fixed              whether they are stated
+    least_cells, most_cells
+                       coarse cells of all grids, at the least resolution in question and at the greatest
+    at_centres         whether the field was trained on the centres of the innermost grid's voxels
+    min_views          training images that have a voxel in view at least, in contracted space; 0: any number
+    max_mib            of the file
+    mib                that voxels are chosen by
+    usual_mib          of both without bake.time_budget
+    timed              whether they follow from bake.time_budget
+    degree             of the harmonics
+    layout, brick_size, environment_size
+                       that the file has, the last in rows, 0 without an environment map
+    min_component      size below which components are dropped, over that of the largest one
+    refine_steps       stated; None: as many as usual for the voxels that there will be
+    seconds            of the stage, in place of steps; None: it may take any time
+    view_dependent_lr_ratio, error_map
+                       of the refinement
     """
 
-    choice: Choice
     space: Space
-    grids: list[Grid]
-    indices: list[np.ndarray]
-    bricks: int
-    seen: list[np.ndarray] | None = None
-    samples: FieldSamples | None = None
-    region: Region | None = None
-    environment: np.ndarray | None = None
+    background: tuple[float, float, float] | None
+    resolution: Choice
+    fixed: bool
+    least_cells: int
+    most_cells: int
+    at_centres: bool
+    min_views: int
+    max_mib: float
+    mib: float
+    usual_mib: float
+    timed: bool
+    degree: int
+    layout: str
+    brick_size: int
+    environment_size: int
+    min_component: float
+    refine_steps: int | None
+    seconds: float | None
+    view_dependent_lr_ratio: float
+    error_map: float
 
     @property
-    def voxels(self) -> int:
-        return sum(map(len, self.indices))
+    def least(self) -> int:
+        """The least resolution in question."""
+        return self.resolution.resolution if self.fixed else MIN_RESOLUTION
+
+    def capacity(self, cells: int) -> int:
+        """Voxels that the asset holds besides so many coarse cells."""
+        size = int(self.mib * 2**20)
+        return serialisation.most_voxels(size, self.layout, self.degree, (cells, 1, 1), self.brick_size, environment=self.environment_size)
 
     @property
-    def cells(self) -> int:
-        """Coarse cells of all grids."""
-        return sum(math.prod(shape) for shape, _, _ in self.grids)
+    def most_voxels(self) -> int:
+        """Voxels that are baked at most."""
+        return min(MAX_OVERSHOOT * self.capacity(1), self.most_cells * self.brick_size**3)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectBake(_Bake):
+    """A bounded scene before a constant background."""
+
+
+@dataclass(frozen=True, eq=False)
+class NdcBake(_Bake):
+    """A forward-facing scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBake(_Bake):
+    """An unbounded scene.
+
+    box             (2, 3) that the innermost grid covers where the field was trained on voxels, whose corner is one of theirs; None: the foreground region's
+    cascades        how many nested grids there are, at least and at most
+    max_resolution  stated; None: as many as MAX_CELLS of all grids allow
+    """
+
+    box: np.ndarray | None
+    cascades: tuple[int, int]
+    max_resolution: int | None
+
+
+Bake = ObjectBake | SceneBake | NdcBake
+
+
+def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: int) -> Bake:
+    """What is to be baked of a model of a scene.
+
+    device, cores  that it is refined on: they count where the size follows from bake.time_budget
+    """
+    background, packed, space, brick = constant_background(s), settings.layout == "packed", _space(settings, m), settings.brick_size
+    whole, max_resolution = background is None, resolved(settings.max_resolution)
+    stated, trained = resolved(settings.resolution), resolved(m.settings.discretise)
+    side = stated or trained
+    if side:
+        resolution = Choice(side, "bake.resolution" if stated else "train.discretise")
+    else:
+        resolution = finest_resolution(s, max_resolution or MAX_RESOLUTION)
+    cascades = (1, MAX_CASCADES) if (count := resolved(settings.cascades)) is None else (count, count)
+    if whole:  # of the region no more is known than that its longest side has so many voxels
+        least_cells = -(-(side or MIN_RESOLUTION) // brick)
+        most_cells = coarse_cells(nested_grids(space.bounds, resolution.resolution, brick, cascades[1], None))
+        if not side and not max_resolution:
+            most_cells = min(most_cells, 2 * MAX_CELLS)  # more by those that make grids fit each other
+    else:
+        least_cells, most_cells = (coarse_cells([grid_over(space, at, brick)]) for at in (side or MIN_RESOLUTION, resolution.resolution))
+
+    mib, usual, seconds = resolved(settings.max_mib), usual_mib(s, packed=packed), resolved(settings.time_budget)
+    timed = mib is None and seconds is not None and device == "cpu"
+    if mib is None:
+        mib = timed_mib(usual, seconds, cores, whole=whole, packed=packed) if seconds is not None and timed else usual
+    ratio, error_map = resolved(settings.view_dependent_lr_ratio), resolved(settings.error_map)
+    if ratio is None:
+        ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if s.background is None else 1.0
+    if error_map is None:
+        error_map = ERROR_MAP if s.forward is None else 0.0
+    common = _Bake(
+        space=space, background=background, resolution=resolution, fixed=bool(side), least_cells=least_cells, most_cells=most_cells,
+        at_centres=trained is not None and trained == side and space is m.space,
+        min_views=resolved(m.settings.min_views) or 0 if m.space.contracted else 0,
+        max_mib=mib, mib=mib_for_voxels(mib, usual, packed=packed, fixed=bool(side)), usual_mib=usual, timed=timed,
+        degree=m.fine.degree, layout=settings.layout, brick_size=brick, environment_size=settings.environment_size if whole else 0,
+        min_component=settings.min_component if s.background is None else 0.0,
+        refine_steps=resolved(settings.refine_steps) if seconds is None else None, seconds=seconds, view_dependent_lr_ratio=ratio, error_map=error_map,
+    )  # fmt: skip
+    if whole:
+        return SceneBake(**vars(common), box=np.asarray(m.space.bounds, np.float64) if trained else None, cascades=cascades, max_resolution=max_resolution)
+    return ObjectBake(**vars(common)) if s.forward is None else NdcBake(**vars(common))
+
+
+def _space(settings: BakeSettings, m: Model) -> Space:
+    """The field's space, in a frame where voxels are cubes."""
+    space, depth = m.space, resolved(settings.ndc_voxel_depth)
+    if not isinstance(space, NdcSpace):
+        return space
+    if depth is None:
+        depth = 1.0 if resolved(m.settings.discretise) else space.voxel_depth
+    return space if depth == 1 else space.with_voxel_depth(depth)
+
+
+def unused_settings(settings: BakeSettings, m: Model, plan: Bake) -> Iterator[str]:
+    """Warnings about settings that have no use, or that bake other voxels than the field was trained on."""
+    depth, trained = resolved(settings.ndc_voxel_depth), resolved(m.settings.discretise)
+    other = f"but the field was trained on train.discretise={trained}: on other voxels than are baked"
+    if depth is not None and not isinstance(m.space, NdcSpace):
+        yield "bake.ndc_voxel_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes"
+    elif depth is not None and depth != 1 and trained:
+        yield f"bake.ndc_voxel_depth={depth:g}, {other}"
+    if settings.lookup == "nearest" and trained and trained != plan.resolution.resolution:
+        yield f"bake.resolution={plan.resolution.resolution}, {other}"
+
+
+def grid_over(space: Space, resolution: int, brick: int) -> Grid:
+    """The grid over a space's box, with so many voxels along its longest side."""
+    shape, voxel = grid_of(space.bounds, resolution, brick)
+    return shape, voxel, np.asarray(space.bounds[0], np.float64)
+
+
+def nested_grids(bounds: np.ndarray, resolution: int, brick: int, count: int, lattice: np.ndarray | None) -> list[Grid]:
+    """Nested grids of which the innermost covers `bounds` with `resolution` voxels along its longest side.
+
+    lattice  (3,) a corner of some voxel of that grid; None: they lie about the centre
+    """
+    voxel = float((bounds[1] - bounds[0]).max()) / resolution
+    if lattice is None:
+        return cascade_grids(bounds, voxel, brick, count)
+    grids = cascade_grids(np.stack([bounds[0] - voxel / 2, bounds[1] + voxel / 2]), voxel, brick, count)
+    offset = (grids[0][2] - lattice) / voxel
+    return [(shape, side, low + (np.round(offset) - offset) * voxel) for shape, side, low in grids]

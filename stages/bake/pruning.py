@@ -20,6 +20,7 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.bake.holes import find_holes, voxels_of_holes
+from stages.bake.plan import Bake, NdcBake
 from stages.bake.voxels import FEW_VIEWS_RATIO, seen_by_few
 from stages.io.scene import Scene
 
@@ -45,27 +46,26 @@ class Pruned:
 
 
 def prune(
-    job: Job, s: Scene, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None, baked: np.ndarray | None
+    job: Job, s: Scene, plan: Bake, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None = None, baked: np.ndarray | None = None
 ) -> tuple[RefinementState, Pruned]:
     """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most. In an unbounded
     scene, voxels stay without which a ray would end in a hole. In normalised device coordinates voxels that few images have in view count more.
 
-    baked  (N,) densities before the first step, of an unbounded scene
+    samples, baked  of an unbounded scene: of its field, and (N,) densities before the first step
     """
     state.to_host()
-    greatest = greatest_weights(job, state, targets)
-    if state.tree.ndc is not None:
+    greatest = greatest_weights(job, plan, state, targets)
+    if isinstance(plan, NdcBake):
         greatest[of_few_views(job, s, state.tree)] *= FEW_VIEWS_RATIO
     keep = heaviest(job, greatest, most)
     if not keep.any():
         return state, Pruned()
     if samples is None:
-        if state.tree.background is None:
-            keep &= ~small_components(state.tree, keep, job.settings.min_component)
+        keep &= ~small_components(state.tree, keep, plan.min_component)
         return subset_state(state, keep, subset(state.tree, keep)), Pruned()
 
     assert baked is not None
-    keep &= ~unsupported_components(state.tree, keep, job.settings.min_component, samples)
+    keep &= ~unsupported_components(state.tree, keep, plan.min_component, samples)
     holes, pruned_share = find_holes(job, subset(state.tree, keep), samples)
     needed = voxels_of_holes(state.tree, samples, holes)
     restored = needed & ~keep
@@ -79,15 +79,15 @@ def prune(
     return subset_state(state, keep, tree), Pruned(pruned_share, find_holes(job, tree, samples)[1], int((restored & keep).sum()))
 
 
-def count_rays(job: Job, ndc: bool, voxels: int, targets: Targets) -> int:
+def count_rays(job: Job, plan: Bake, voxels: int, targets: Targets) -> int:
     """Training rays that are rendered to find which of so many voxels show."""
-    per_voxel = NDC_RAYS_PER_VOXEL if ndc else RAYS_PER_VOXEL
+    per_voxel = NDC_RAYS_PER_VOXEL if isinstance(plan, NdcBake) else RAYS_PER_VOXEL
     return min(max(job.settings.visibility_rays, int(per_voxel * voxels)), 4 * len(targets.pixels))
 
 
-def greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.ndarray:
+def greatest_weights(job: Job, plan: Bake, state: RefinementState, targets: Targets) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of many training pixels."""
-    count = count_rays(job, state.tree.ndc is not None, len(state.density), targets)
+    count = count_rays(job, plan, len(state.density), targets)
 
     def progress(done: int, total: int) -> None:
         job.progress(done, total, "rendering for voxel weights")
@@ -110,9 +110,14 @@ def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:
     """(N,) bool: voxels whose weight exceeds bake.weight_threshold, at most `most`."""
     keep = greatest > job.settings.weight_threshold
     if keep.sum() > most:
-        order = np.argsort(-greatest, kind="stable")
-        keep = np.zeros(len(keep), bool)
-        keep[order[:most]] = True
-        left_out = float(greatest[order[most]])
+        keep = greatest_of(greatest, most)
+        left_out = float(greatest[~keep].max())
         job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib allows {most:,}")
+    return keep
+
+
+def greatest_of(weight: np.ndarray, count: int) -> np.ndarray:
+    """(N,) bool: the `count` voxels of the greatest weight, the first of equals."""
+    keep = np.zeros(len(weight), bool)
+    keep[np.argsort(-weight, kind="stable")[:count]] = True
     return keep

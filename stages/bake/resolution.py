@@ -14,9 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.capture.forward_facing import ForwardFacing
-from efficientnerf.settings import resolved
-from pipeline.errors import UsageError
-from stages.bake.settings import BakeSettings
 from stages.io.scene import Scene, views_of
 
 MIN_RESOLUTION = 32  # voxels along the longest side
@@ -25,15 +22,16 @@ MIN_RESOLUTION = 32  # voxels along the longest side
 VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
 MAX_RESOLUTION = 1024
 MAX_MIB = 38
-# Of an unbounded scene: bytes for each pixel of its training images; MiB at most, where these are more than MAX_MIB. docs/experiments/bake-resolution.md
-SCENE_BYTES, SCENE_MAX_MIB = 0.7, 76
-# Of unbounded scenes: most cascades; the share of what the field shows that may lie beyond the last, in the environment map; coarse cells of all of them.
-MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
+# Of unbounded scenes: bytes for each pixel of the training images; MiB at most, where these are more than MAX_MIB (docs/experiments/bake-resolution.md); the
+# share of what the field shows that may lie beyond the last cascade, in the environment map; coarse cells of all cascades.
+SCENE_BYTES, SCENE_MAX_MIB, MAX_BEYOND, MAX_CELLS = 0.7, 76, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
 NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
 # With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of an unbounded scene
 # takes fewer rays. docs/experiments/tree-training.md
 TIMED_MIB, SCENE_TIMED_MIB, MIN_TIMED_MIB = 0.115, 0.23, 2.0
+MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: of which the refinement keeps the heaviest
+OVERSHOOT = 1.7  # the same where the resolution is chosen: few of the dilated voxels show. docs/experiments/bake-resolution.md
 MIN_FILL = 0.93  # of the size that is used, at least
 MAX_TRIES = 4
 
@@ -46,9 +44,8 @@ class Choice:
     why: str
 
 
-def finest_resolution(s: Scene, most: int | None) -> Choice:
-    """Voxels along the longest side of the box, so that a voxel covers half a pixel at the box's centre, for the median camera; at most `most` of them, or
-    MAX_RESOLUTION where it is None.
+def finest_resolution(s: Scene, most: int = MAX_RESOLUTION) -> Choice:
+    """Voxels along the longest side of the box, so that a voxel covers half a pixel at the box's centre, for the median camera; at most `most` of them.
 
     In normalised device coordinates, where a pixel is as wide at any depth, a voxel is as wide as 4/3 of a pixel.
     """
@@ -58,7 +55,7 @@ def finest_resolution(s: Scene, most: int | None) -> Choice:
     else:
         wide, share = pixel_at_centre(s, s.bounds), VOXEL_PIXELS
         side = float((s.bounds[1] - s.bounds[0]).max())
-    return _resolved(side / (share * wide), share, MAX_RESOLUTION if most is None else most)
+    return _resolved(side / (share * wide), share, most)
 
 
 def finest_of_cascades(s: Scene, bounds: np.ndarray, count: int, brick: int, most: int | None) -> Choice:
@@ -90,53 +87,29 @@ def scene_mib(pixels: int) -> float:
     return float(np.clip(SCENE_BYTES * pixels / 2**20, MAX_MIB, SCENE_MAX_MIB))
 
 
-def budget_of(s: Scene, stated: float | None, *, packed: bool = False) -> float:
-    """MiB that an asset may have: those stated, or else MAX_MIB, or `scene_mib` of an unbounded scene. In normalised device coordinates, where nothing is empty
+def usual_mib(s: Scene, *, packed: bool = False) -> float:
+    """MiB that an asset may have where none are stated: MAX_MIB, or `scene_mib` of an unbounded scene. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
     large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
-    if stated is None and packed:
-        return math.ceil(budget_of(s, None) / 3)
-    if stated is not None:
-        return stated
-    if s.forward is None:
-        pixels = sum(view.camera.width * view.camera.height for view in views_of(s, "train"))
-        return MAX_MIB if s.background is not None else scene_mib(pixels)
-    across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
-    return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
+    mib: float = MAX_MIB
+    if s.forward is not None:
+        across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
+        mib = int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
+    elif s.background is None:
+        mib = scene_mib(sum(view.camera.width * view.camera.height for view in views_of(s, "train")))
+    return math.ceil(mib / 3) if packed else mib
 
 
-def refuse_without_room(settings: BakeSettings, mib: float, resolution: int, room: int, *, environment: bool) -> None:
-    """UsageError where an asset of so many MiB cannot hold one voxel besides its coarse cells at the least resolution in question, and, of an unbounded
-    scene, its environment map. Otherwise all voxels would be dropped, and the field would seem empty."""
-    if room > 0:
-        return
-    beside, lower = f"the coarse cells of {resolution} voxels along the longest side", [] if resolution <= MIN_RESOLUTION else [
-        "bake.resolution" if settings.resolution != "auto" else "train.discretise"
-    ]
-    if environment:
-        beside += f" and an environment map of {settings.environment_size} rows"
-        lower.append(f"bake.environment_size ({settings.environment_size})")
-    remedy = "Raise bake.max_mib (--target-mib)" + (f", or lower {' or '.join(lower)}" if lower else "")
-    raise UsageError(f"bake.max_mib={mib:.3g}: has no space for voxels besides {beside}. {remedy}.")
+def mib_for_voxels(mib: float, usual: float, *, packed: bool, fixed: bool) -> float:
+    """MiB that voxels are chosen by: bytes of a packed asset beyond the usual size go into finer codes, unless its resolution is stated. See
+    docs/experiments/packed.md."""
+    return min(mib, usual) if packed and not fixed else mib
 
 
-def timed_budget(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:
+def timed_mib(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:
     """MiB of those that an asset may have, which can be refined in so many seconds: fewer voxels that rays have met often are better than more of them."""
     timed = max(MIN_TIMED_MIB, (SCENE_TIMED_MIB if whole else TIMED_MIB) * seconds * cores)
     return min(mib, timed / 3 if packed else timed)
-
-
-def size_limits(settings: BakeSettings, s: Scene, device: str, cores: int, *, whole: bool, discretise: int | None = None) -> tuple[float, float]:
-    """MiB that an asset may have; and those that its voxels are chosen by: where the size is left to us, no more than can be refined in bake.time_budget. A
-    packed asset has no more voxels than the default size would give it, unless bake.resolution or train.discretise is stated: bytes beyond
-    that go into finer codes. See docs/experiments/packed.md."""
-    packed, seconds = settings.layout == "packed", resolved(settings.time_budget)
-    mib = budget_of(s, resolved(settings.max_mib), packed=packed)
-    if settings.max_mib != "auto" and packed and (resolved(settings.resolution) or discretise) is None:
-        return mib, min(mib, budget_of(s, None, packed=True))
-    if seconds is None or settings.max_mib != "auto" or device != "cpu":
-        return mib, mib
-    return mib, timed_budget(mib, seconds, cores, whole=whole, packed=packed)
 
 
 def ndc_pixel(s: Scene, forward: ForwardFacing) -> float:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
 from pipeline.files import atomic
-from stages.scratch import Warn, note, noted
+from pipeline.stage import Job
+from stages.scratch import Warn, note, noted, unusable
+
+T = TypeVar("T")
 
 
 def write_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
@@ -46,6 +49,26 @@ def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]], warn: Warn)
                 raise ValueError(f"{output.name} is no array of {dtype} with {dimensions} dimensions")
 
     return None if noted(_note(path), list[str], warn, check) is None else arrays
+
+
+def rendered_once(
+    job: Job, name: str, kind: type[T], kinds: Mapping[str, tuple[str, int]], fits: Callable[[T], bool], render: Callable[[Callable[[int, int], None]], T]
+) -> T:
+    """What `render` makes of the field: a `kind` of the arrays `kinds`, as for `read_arrays`; that of an earlier attempt where it `fits`."""
+    stored = read_arrays(job.work / name, kinds, job.warn)
+    if stored is not None:
+        found = kind(**{part: np.array(values) for part, values in stored.items()})
+        if fits(found):
+            return found
+        job.warn(unusable(job.work / name, "of other images or another grid"))
+
+    def progress(done: int, total: int) -> None:
+        job.progress(done, total, "rendering for visible voxels")
+        job.safe_point()
+
+    found = render(progress)
+    write_arrays({part: getattr(found, part) for part in kinds}, job.work / name)
+    return found
 
 
 def _note(path: Path) -> Path:

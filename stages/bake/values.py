@@ -17,15 +17,16 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model
 from pipeline.stage import Job
-from stages.bake.plan import Plan
+from stages.bake.plan import Bake
 from stages.bake.scratch import read_arrays, write_arrays
 from stages.bake.settings import BakeSettings
+from stages.bake.voxels import Voxels
 from stages.io.scene import Scene
 from stages.scratch import once, unusable
 
 
 def baked_values(
-    job: Job, m: Model, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space, name: str = "block"
+    job: Job, m: Model, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Density (N,) and harmonics (N, K, 3) of voxels (N, 3); blocks of an earlier attempt are read.
 
@@ -57,18 +58,18 @@ def baked_values(
     return density, sh
 
 
-def baked_tree(job: Job, m: Model, s: Scene, plan: Plan, metadata: dict[str, Any]) -> NerfTree:
+def baked_tree(job: Job, m: Model, s: Scene, plan: Bake, voxels: Voxels, metadata: dict[str, Any]) -> NerfTree:
     """The tree with the field's values."""
     settings: BakeSettings = job.settings
-    trees = []
-    for n, ((shape, voxel, low), indices) in enumerate(zip(plan.grids, plan.indices, strict=True)):
-        samples = 0 if m.settings.discretise == plan.choice.resolution and plan.space is m.space and not n else settings.samples_per_voxel
-        density, sh = baked_values(job, m, indices, voxel, low, samples, plan.space, f"cascade{n}" if plan.samples is not None else "block")
-        if plan.seen is not None:
-            density = density_as_seen(density, plan.seen[n], voxel)
+    trees, around = [], voxels.surroundings
+    for n, ((shape, voxel, low), indices) in enumerate(zip(voxels.grids, voxels.indices, strict=True)):
+        samples = 0 if plan.at_centres and not n else settings.samples_per_voxel
+        density, sh = baked_values(job, m, indices, voxel, low, samples, plan.space, "block" if around is None else f"cascade{n}")
+        if around is not None:
+            density = density_as_seen(density, around.seen[n], voxel)
         one = tree_from_voxels(
             shape, voxel, low, indices, density, sh,
             brick=settings.brick_size, background=s.background, metadata=metadata, ndc=plan.space.ndc, lookup=settings.lookup, step_size=settings.step_size,
         )  # fmt: skip
         trees.append(one)
-    return trees[0] if plan.samples is None else replace(nested(trees, plan.environment), region=plan.region)
+    return trees[0] if around is None else replace(nested(trees, around.environment), region=around.region)

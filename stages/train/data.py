@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +24,6 @@ POINTS_AT_ONCE = 2**16  # observed by equally many, whose cameras are compared
 CUT_SHARE = 0.25  # of a view's range that stated planes leave out, from which a warning says so: the corners of the scene bounds are mostly empty
 GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their integer parts, fill an interval evenly
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
-
-
-def with_camera_refinement(settings: TrainSettings) -> TrainSettings:
-    """The settings with "on" or "off" for `camera_refinement`."""  # docs/experiments/photographs.md
-    choice = "off" if settings.camera_refinement == "auto" else settings.camera_refinement
-    return replace(settings, camera_refinement=choice)
 
 
 def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None, trained: Path | None = None) -> Pixels:

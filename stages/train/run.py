@@ -41,7 +41,7 @@ from stages.train.budget import UNKNOWN, Budget, training_budget
 from stages.train.checkpoints import Checkpoints
 from stages.train.checks.watch import Watch
 from stages.train.checks.wrong_views import cameras_of, draw_wrong_views, findings_of, left_out_of, train_and_check
-from stages.train.data import count_pixels, depth_range, pixels_of, sparse_depth_of, with_camera_refinement
+from stages.train.data import count_pixels, depth_range, pixels_of, sparse_depth_of
 from stages.train.exposure import begin_exposure, exposure_facts, saved_exposure
 from stages.train.hash_resolution import with_auto_sizes
 from stages.train.log import TrainLog
@@ -64,7 +64,7 @@ def trained(job: Job) -> bool:
     folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
     s = (watch := Watch(job, scene.load(folder), folder)).scene
     views = scene.views_of(s, "train")
-    settings, space = with_camera_refinement(with_auto_sizes(watch.settings, s, count_pixels(views))), field_file.space_of(s)
+    settings, space = with_auto_sizes(watch.settings, s, count_pixels(views)), field_file.space_of(s)
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views, rows_for_training(job, folder, views, settings, space))
     near, far = depth_range(s, pixels, settings, job.warn)

@@ -11,7 +11,7 @@ from typing import Any
 
 from efficientnerf.settings import resolved
 from stages.bake.refine.refinement import usual_steps
-from stages.bake.resolution import MAX_MIB, scene_mib
+from stages.bake.resolution import MAX_MIB, mib_for_voxels, scene_mib
 from stages.memory.need import libraries
 
 SLOWER = 1.5  # by `preflight.REFERENCE`, of the machine that the processor seconds below were taken on
@@ -73,11 +73,11 @@ def _training_pixels(megapixels: float) -> int:
 
 
 def _voxels(bake: Any, pixels: int | None) -> int:
-    """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.budget_of`).
+    """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.usual_mib`).
 
     pixels  of all training images of an unbounded scene; None: of another scene
     """
     packed, stated = bake.layout == "packed", resolved(bake.max_mib)
     usual = (MAX_MIB if pixels is None else scene_mib(pixels)) / (3 if packed else 1)
-    mib = usual if stated is None else min(stated, usual) if packed and bake.resolution == "auto" else stated
+    mib = mib_for_voxels(usual if stated is None else stated, usual, packed=packed, fixed=resolved(bake.resolution) is not None)
     return int(mib * 2**20 / (PACKED_BYTES_A_VOXEL if packed else BYTES_A_VOXEL))

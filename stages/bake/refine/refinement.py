@@ -26,19 +26,19 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.settings import resolved
 from efficientnerf.training.patches import PatchGrid
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs
 from stages.bake import pruning
 from stages.bake.holes import find_holes
 from stages.bake.memory import free_on_device, needed_on_device
+from stages.bake.plan import Bake, SceneBake, coarse_cells
 from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint
 from stages.bake.refine.checkpoint import Point
 from stages.bake.refine.log import RefinementLog
 from stages.bake.refine.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, packing_seconds, timed_schedule
-from stages.bake.settings import BakeSettings
+from stages.bake.voxels import Voxels
 from stages.cores import count_cores
 from stages.io.scene import Scene
 from stages.train.budget import Budget
@@ -51,15 +51,13 @@ TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
 MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, (6, 15)  # see `usual_steps`
 UNREFINED = 0.1  # of the steps that are usual: with fewer the asset is hardly refined
-ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
-UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
 
 @dataclass(eq=False)
 class Refinement:
     """A refinement that is going on.
 
-    capacity  voxels that the asset holds
+    most      voxels that the asset holds
     budget    seconds of the stage up to the end of the last step, or None
     per_ray   seconds that measuring the error of a ray took
     samples   of the field, for unbounded scenes: they restore what was dropped wrongly
@@ -68,8 +66,9 @@ class Refinement:
 
     job: Job
     scene: Scene
+    plan: Bake
     targets: Targets
-    capacity: int
+    most: int
     stopwatch: Stopwatch
     point: Point
     log: RefinementLog
@@ -106,7 +105,7 @@ class Refinement:
     def _pruning_seconds(self) -> float:
         """About how many seconds it takes to find which voxels show."""
         state = self.point.state
-        return pruning.count_rays(self.job, state.tree.ndc is not None, len(state.density), self.targets) * self.per_ray * WEIGHT_SECONDS
+        return pruning.count_rays(self.job, self.plan, len(state.density), self.targets) * self.per_ray * WEIGHT_SECONDS
 
     def _take_steps(self) -> None:
         """Take the steps that are left of the phase, with checkpoints on the way and where it is stopped."""
@@ -117,15 +116,10 @@ class Refinement:
         phase, end = PHASES[number].name, point.schedule.begin(number + 1)
         if state.step >= end:
             return
-        ratio, share = resolved(settings.view_dependent_lr_ratio), resolved(settings.error_map)
-        if ratio is None:
-            ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if state.tree.background is None else 1.0
-        if share is None:
-            share = 0.0 if state.tree.ndc is not None else ERROR_MAP
         run = fit.optimise(
             state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
-            fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed, view_dependent_lr_ratio=ratio,
-            total_variation=settings.total_variation, error_map=share,
+            fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed,
+            view_dependent_lr_ratio=self.plan.view_dependent_lr_ratio, total_variation=settings.total_variation, error_map=self.plan.error_map,
         )  # fmt: skip
         step_began = clock()
         for error in run:
@@ -163,19 +157,19 @@ class Refinement:
     def _prune(self) -> None:
         """Drop voxels that do not show."""
         point = self.point
-        point.state, point.pruned = pruning.prune(self.job, self.scene, point.state, self.targets, self.capacity, self.samples, self.baked)
+        point.state, point.pruned = pruning.prune(self.job, self.scene, self.plan, point.state, self.targets, self.most, self.samples, self.baked)
 
 
 def refined(
-    job: Job, s: Scene, tree: NerfTree, targets: Targets, capacity: int, stopwatch: Stopwatch, samples: FieldSamples | None = None
+    job: Job, s: Scene, plan: Bake, voxels: Voxels, tree: NerfTree, targets: Targets, stopwatch: Stopwatch
 ) -> tuple[NerfTree, dict[str, Any]]:
-    """The refined tree of at most `capacity` voxels, and the entries of the report; the log, the curve and the previews are written.
-
-    samples  of the field, for unbounded scenes: they restore what was dropped wrongly
-    """
-    settings = job.settings
+    """The refined tree of at most as many voxels as the asset holds, and the entries of the report; the log, the curve and the previews are written."""
+    settings, seconds = job.settings, plan.seconds
+    samples, capacity = None if voxels.surroundings is None else voxels.surroundings.samples, plan.capacity(coarse_cells(voxels.grids))
     most = min(len(tree.density_values), capacity)
-    steps, seconds = refinement_steps(settings, most, len(targets.pixels) if _is_whole(tree) else None), resolved(settings.time_budget)
+    steps = plan.refine_steps
+    if steps is None:
+        steps = usual_steps(most, settings.refine_rays_per_batch, len(targets.pixels) if isinstance(plan, SceneBake) else None)
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets)
@@ -187,20 +181,22 @@ def refined(
         fit.error(tree, targets, timed, settings.seed)  # again: kernels were loaded meanwhile
     per_ray = (clock() - began) / timed
     finish = measuring + FINISH_SECONDS_PER_VOXEL * most
-    if settings.layout == "packed":
+    if plan.layout == "packed":
         weighed = min(max(settings.visibility_rays, most), 4 * len(targets.pixels))
         finish += packing_seconds(most, count_cores(), per_ray, settings.refine_rays_per_batch, weighed, sample)
     schedule = stated_schedule(steps) if seconds is None else RefinementSchedule()
-    baked = None if samples is None else _initial_density(tree, capped=bool(steps))
+    thickness = MAX_INITIAL_THICKNESS if steps else math.inf
+    bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
+    baked = None if samples is None else initial_state(bare, thickness).density
     cells = count_cells(PatchGrid(targets.host_pixels, fit.PATCH_SIDE))
-    point = _first_point(job, tree, schedule, stopwatch, cells, timed=seconds is not None, capped=bool(steps))
+    point = _first_point(job, tree, schedule, stopwatch, cells, thickness, timed=seconds is not None)
     log = RefinementLog(
         job.work / BakeOutputs.log, point.state.step, point.schedule.fraction(point.state.step), stopwatch, _previews(job, s, point, targets), clock
     )  # fmt: skip
     if point.state.step == 0:
         log.begin(point.state, PHASES[0].name, before)
     del tree  # the state has values of its own
-    made = Refinement(job, s, targets, capacity, stopwatch, point, log, None if seconds is None else seconds - finish, per_ray, samples, baked)
+    made = Refinement(job, s, plan, targets, capacity, stopwatch, point, log, None if seconds is None else seconds - finish, per_ray, samples, baked)
     tree = made.run()
     if point.state.step < UNREFINED * steps:
         job.warn(_unrefined(point.state.step, steps))
@@ -219,19 +215,13 @@ def _unrefined(taken: int, usual: int) -> str:
     return f"{done}: the asset is hardly better than it was baked. Give more time (--budget) or fewer voxels (bake.max_mib), or run it while nothing else does."
 
 
-def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, *, timed: bool, capped: bool) -> Point:
+def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, thickness: float, *, timed: bool) -> Point:
     """Where an earlier attempt stopped, or else the beginning."""
     found = checkpoint.restored(job, tree, schedule, HOLD if timed else None, cells=cells)
     if found is None:
-        return Point(initial_state(tree, MAX_INITIAL_THICKNESS if capped else math.inf), schedule)
+        return Point(initial_state(tree, thickness), schedule)
     stopwatch.set(found.seconds)
     return found
-
-
-def _initial_density(tree: NerfTree, *, capped: bool) -> np.ndarray:
-    """(N,) the densities that the refinement of a tree begins with."""
-    bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
-    return initial_state(bare, MAX_INITIAL_THICKNESS if capped else math.inf).density
 
 
 def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
@@ -275,18 +265,6 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
         " they are refined on the CPU, which takes longer (lower bake.max_mib or bake.resolution for the device)"
     )
     return targets
-
-
-def _is_whole(tree: NerfTree) -> bool:
-    """Whether the scene is unbounded, in contracted space."""
-    return tree.background is None and tree.ndc is None
-
-
-def refinement_steps(settings: BakeSettings, voxels: int, pixels: int | None) -> int:
-    """Steps of the refinement; the usual ones where bake.time_budget stands in place of a number of them. Arguments as of `usual_steps`."""
-    if settings.time_budget == "off" and (stated := resolved(settings.refine_steps)) is not None:
-        return stated
-    return usual_steps(voxels, settings.refine_rays_per_batch, pixels)
 
 
 def usual_steps(voxels: int, rays: int, pixels: int | None) -> int:

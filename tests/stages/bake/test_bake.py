@@ -26,7 +26,7 @@ from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
-from stages.bake import memory, resolution, whole_scene
+from stages.bake import memory, plan, resolution
 from stages.bake import run as bake
 from stages.bake.refine import checkpoint, refinement
 from stages.bake.settings import BakeSettings
@@ -272,26 +272,30 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
     monkeypatch.setattr(resolution, "VOXEL_PIXELS", 0.2)
     sizes = {}
     for room in (10**7, 20_000):
-        for module in (serialisation, whole_scene):
-            monkeypatch.setattr(module, "most_voxels", lambda *asked, room=room, **beside: room)
+        monkeypatch.setattr(serialisation, "most_voxels", lambda *asked, room=room, **beside: room)
         made = job(tmp_path / str(room), fitted, **inputs)
         run(made)
         report = json.loads((made.out / "report.json").read_text())
         sizes[room] = report["voxels_along_longest_side"], report["optimisation"]["voxels_baked"], report["voxels"]
         assert max(report["resolution"]) >= report["voxels_along_longest_side"] > max(report["resolution"]) - 4
-    assert sizes[10**7][0] == resolution.finest_resolution(load(inputs["poses"]), None).resolution > sizes[20_000][0] >= 32
+    assert sizes[10**7][0] == resolution.finest_resolution(load(inputs["poses"])).resolution > sizes[20_000][0] >= 32
     assert 10_000 < sizes[20_000][1] <= 2 * 20_000
     assert sizes[20_000][2] <= 20_000 < sizes[10**7][2]
 
 
-def test_steps_of_the_fit_follow_the_voxels_or_what_was_asked_for() -> None:
-    chosen = BakeSettings(refine_rays_per_batch=1000)
-    assert [refinement.refinement_steps(chosen, voxels, None) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
-    assert [refinement.refinement_steps(chosen, 10**6, pixels) for pixels in (10**5, 10**7, 10**9)] == [6000, 10000, 15000]
-    asked = dataclasses.replace(chosen, refine_steps=7)
-    assert {refinement.refinement_steps(asked, 10**7, pixels) for pixels in (None, 10**9)} == {7}
+def plan_of(inputs: dict[str, Path], settings: BakeSettings, **trained: Any) -> plan.Bake:
+    m = load_renderer(inputs["train"]).model
+    m.settings = dataclasses.replace(m.settings, **trained)
+    return plan.bake_plan(settings, m, load(inputs["poses"]), "cpu", 2)
+
+
+def test_steps_of_the_fit_follow_the_voxels_or_what_was_asked_for(inputs: dict[str, Path]) -> None:
+    assert [refinement.usual_steps(voxels, 1000, None) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
+    assert [refinement.usual_steps(10**6, 1000, pixels) for pixels in (10**5, 10**7, 10**9)] == [6000, 10000, 15000]
     for steps in (0, 7):  # a time budget takes the place of any number, of none too: what is thick is learned then as ever
-        assert refinement.refinement_steps(dataclasses.replace(asked, refine_steps=steps, time_budget=40.0), 10**6, None) == 15000
+        assert plan_of(inputs, BakeSettings(refine_steps=steps)).refine_steps == steps
+        assert plan_of(inputs, BakeSettings(refine_steps=steps, time_budget=40.0)).refine_steps is None
+    assert plan_of(inputs, BakeSettings()).refine_steps is None
 
 
 @pytest.mark.parametrize(("layout", "most"), [("compact", 1), ("sparse", 1), ("compact", 64)])
@@ -319,13 +323,18 @@ def test_a_packed_asset_keeps_to_a_part_of_a_mib(inputs: dict[str, Path], tmp_pa
 
 
 def test_bytes_beyond_the_usual_size_of_a_packed_asset_give_no_more_voxels(inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resolution, "budget_of", lambda s, stated, packed=False: stated or (0.018 if packed else 3 * 0.018))
-    s, stated = load(inputs["poses"]), BakeSettings(layout="packed", max_mib=0.2)
-    assert resolution.size_limits(stated, s, "cpu", 2, whole=False) == (0.2, 0.018)
-    assert resolution.size_limits(dataclasses.replace(stated, max_mib=0.01), s, "cpu", 2, whole=False) == (0.01, 0.01)
+    monkeypatch.setattr(plan, "usual_mib", lambda s, packed=False: 0.018 if packed else 3 * 0.018)
+    stated = BakeSettings(layout="packed", max_mib=0.2)
+
+    def sizes(settings: BakeSettings, **trained: Any) -> tuple[float, float]:
+        made = plan_of(inputs, settings, **trained)
+        return made.max_mib, made.mib
+
+    assert sizes(stated) == (0.2, 0.018)
+    assert sizes(dataclasses.replace(stated, max_mib=0.01)) == (0.01, 0.01)
     for more in (dataclasses.replace(stated, resolution=40), dataclasses.replace(stated, layout="compact")):
-        assert resolution.size_limits(more, s, "cpu", 2, whole=False) == (0.2, 0.2)
-    assert resolution.size_limits(stated, s, "cpu", 2, whole=False, discretise=20) == (0.2, 0.2)
+        assert sizes(more) == (0.2, 0.2)
+    assert sizes(stated, discretise=20) == (0.2, 0.2)
 
 
 def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: Path, inputs: dict[str, Path]) -> None:

@@ -15,7 +15,7 @@ from efficientnerf.geometry.spaces import NdcSpace
 from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.pruning import NDC_RAYS_PER_VOXEL
-from stages.bake.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, budget_of, finest_resolution, ndc_pixel
+from stages.bake.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, finest_resolution, ndc_pixel, usual_mib
 from stages.bake.settings import BakeSettings
 from stages.io.field_file import load_renderer
 from stages.io.scene import load
@@ -74,10 +74,9 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
 
 def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:
     small, large, huge = (forward_facing(side) for side in (200, 1000, 4000))
-    assert budget_of(small, None) == NDC_MIN_MIB
-    assert budget_of(huge, None) == NDC_MAX_MIB
+    assert usual_mib(small) == NDC_MIN_MIB
+    assert usual_mib(huge) == NDC_MAX_MIB
     across, down = (large.forward.bounds[1] - large.forward.bounds[0])[:2] / ndc_pixel(large, large.forward)
-    assert budget_of(large, None) == int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
-    assert budget_of(huge, 7) == 7
-    assert budget_of(load(poses(tmp_path)), None) == MAX_MIB
-    assert finest_resolution(huge, None).resolution == 1024
+    assert usual_mib(large) == int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
+    assert usual_mib(load(poses(tmp_path))) == MAX_MIB
+    assert finest_resolution(huge).resolution == 1024

@@ -14,14 +14,17 @@ from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import NdcSpace
+from efficientnerf.model import model
 from pipeline.stage import Job
 from stages.bake import pruning
+from stages.bake.plan import bake_plan
 from stages.bake.settings import BakeSettings
 from stages.bake.voxels import FEW_VIEWS_RATIO, WELL_SEEN_VIEWS, by_views, seen_by_few
 from stages.framing.scene_bounds import in_view
 from stages.framing.view_coverage import count_views, shows
 from stages.io.field_file import space_of
 from stages.io.scene import Scene
+from tests.efficientnerf.balls import settings
 from tests.stages.balls import job
 from tests.stages.forward_facing import forward_facing
 
@@ -108,7 +111,7 @@ def test_what_few_views_show_is_dropped_last(
     capture: tuple[Scene, NdcSpace, tuple[int, int, int], float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
     s, _, _, voxel = capture
-    tree = replace(tree_of(capture), background=(0.0, 0.0, 0.0))
+    s, tree = replace(s, background=(0.0, 0.0, 0.0)), replace(tree_of(capture), background=(0.0, 0.0, 0.0))
     assert tree.ndc is not None
     coordinates = voxel_coordinates(tree)
     few = few_by_projection(s, tree.ndc, (coordinates // BRICK + 0.5) * (BRICK * voxel) + tree.bounds_min)
@@ -116,7 +119,8 @@ def test_what_few_views_show_is_dropped_last(
     np.testing.assert_array_equal(few, seen_by_few(made(tmp_path), s, tree.ndc, (coordinates // BRICK + 0.5) * (BRICK * voxel) + tree.bounds_min))
     weights = np.random.default_rng(3).uniform(0, 2 * THRESHOLD, len(few)).astype(np.float32)
     monkeypatch.setattr(pruning, "greatest_weights", lambda *_: weights.copy())
-    state, _ = pruning.prune(made(tmp_path), s, initial_state(tree), None, most, None, None)  # type: ignore[arg-type]
+    plan = bake_plan(BakeSettings(), model(space_of(s), settings(), None), s, "cpu", 2)
+    state, _ = pruning.prune(made(tmp_path), s, plan, initial_state(tree), None, most)  # type: ignore[arg-type]
     counted = np.where(few, FEW_VIEWS_RATIO, 1) * weights
     keep = counted > THRESHOLD
     if keep.sum() > most:
