@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import to_builtins
 
 from efficientnerf.geometry.cameras import resized
 from efficientnerf.settings import resolved
@@ -156,7 +157,7 @@ def _format_of(capture: Capture) -> str:
 def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
     """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
     renders = _may_be_renders(capture)
-    use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, small, job.safe_point)
+    use = find_mask_use(capture, mask_choice(job.settings, capture.provenance), renders, small, job.safe_point)
     for sentence in use.sentences:
         job.say(sentence)
     for sentence in doubts(use):
@@ -256,7 +257,7 @@ def _write_report(path: Path, capture: Capture, scene: Scene, facts: dict[str, d
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "background": capture.background,
         **facts,
-        "facts": capture.facts,
+        "facts": to_builtins(capture.provenance) | capture.facts,
         "warnings": list(notes),
     }
     write_json(path, report, default=str)

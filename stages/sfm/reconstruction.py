@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
+from msgspec import convert, structs, to_builtins
 
 from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from stages.cores import count_cores
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import Capture, Lens, Photo, Provenance, SparsePoints
 from stages.sfm import ladder, mapping, matches, process
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
@@ -32,12 +33,12 @@ from stages.sfm.images import Callables, Masks, WorkImage, prepare_images
 from stages.sfm.intrinsics.own import with_own_intrinsics
 from stages.verdict.looks import look_at_all
 from stages.verdict.parallax import parallax
-from stages.verdict.verdict import CROPPED, LENS, MOVING, OWN_INTRINSICS, WITHOUT_TEXTURE, ZOOMED, failed
+from stages.verdict.verdict import WITHOUT_TEXTURE, failed
 
 WAIT = 0.05  # seconds between two checks of a lock
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
 FEW_FEATURES = 50  # of a photograph, below which it has too little detail
-OWN_LENSES = {ladder.EACH: ZOOMED, ladder.CROPPED: CROPPED}  # by step
+OWN_LENSES: dict[str, Lens] = {ladder.EACH: "zoomed", ladder.CROPPED: "cropped"}  # by step
 OTHER_FOCAL = 1.2  # times a focal length: that of another lens
 MAX_NAMES = 8  # photographs that an error lists by name
 
@@ -171,13 +172,13 @@ def reconstruct(
     rejected = [*unreadable, *_unregistered(place, images, models)]
     if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
         raise BadInput(_failure(folder, _paths(folder, names), work, images, found, rejected, matching))
-    facts = _facts_of_matching(images, found, matching)
+    provenance = _provenance(images, found, matching)
     model = models[0] if found.rung == ladder.CROPPED else mapping.bundle_adjusted(place, images, models[0], safe_point)
     if found.rung not in OWN_LENSES:
-        model, facts[OWN_INTRINSICS] = with_own_intrinsics(images, model, safe_point)
-    if moving := mapping.moving_shares(place, images, model, safe_point):
-        facts[MOVING] = moving
-    capture = _capture(folder, place, images, model, masks, rejected, facts)
+        model, own = with_own_intrinsics(images, model, safe_point)
+        provenance = structs.replace(provenance, own_intrinsics=own)
+    provenance = structs.replace(provenance, moving_parts=mapping.moving_shares(place, images, model, safe_point))
+    capture = _capture(folder, place, images, model, masks, rejected, provenance)
     for sentence in capture.warnings:
         callables["warn"](sentence)
     return capture
@@ -196,7 +197,7 @@ def _plain(capture: Capture) -> dict[str, Any]:
         "rejected": capture.rejected,
         "warnings": capture.warnings,
         "reprojection_error": capture.reprojection_error,
-        "facts": capture.facts,
+        "provenance": to_builtins(capture.provenance),
         "overlaps": capture.overlaps,
     }
 
@@ -214,7 +215,7 @@ def _capture_from(found: Mapping[str, Any], folder: Path, paths: Mapping[str, Pa
         rejected=tuple((name, reason) for name, reason in found["rejected"]),
         warnings=tuple(found["warnings"]),
         reprojection_error=found["reprojection_error"],
-        facts=found["facts"],
+        provenance=convert(found["provenance"], Provenance),
         overlaps=tuple((first, second, count) for first, second, count in found["overlaps"]),
     )
 
@@ -263,17 +264,17 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
     return rejected
 
 
-def _facts_of_matching(images: Sequence[WorkImage], found: ladder.Found, how: str) -> dict[str, object]:
+def _provenance(images: Sequence[WorkImage], found: ladder.Found, how: str) -> Provenance:
     """How the photographs were matched, the sizes of the components of overlap and of the sub-models that add to the first, and the steps tried."""
     parts = [{image.name for image in model.images.values() if image.has_pose} for model in found.models]
-    return {
-        "matching": how,
-        "components": [len(part) for part in ladder.components(ladder.neighbours(found.work, len(images)))],
-        "models": [len(part) for part in parts if part is parts[0] or part - parts[0]],
-        "rungs": found.rungs,
-        "planar_pairs": planar_share(database_path(found.work)),
-        **({LENS: OWN_LENSES[found.rung]} if found.rung in OWN_LENSES else {}),
-    }
+    return Provenance(
+        matching=how,
+        components=[len(part) for part in ladder.components(ladder.neighbours(found.work, len(images)))],
+        models=[len(part) for part in parts if part is parts[0] or part - parts[0]],
+        rungs=found.rungs,
+        planar_pairs=planar_share(database_path(found.work)),
+        lens=OWN_LENSES.get(found.rung),
+    )
 
 
 def _overlaps(work: Path, images: Sequence[WorkImage]) -> tuple[tuple[str, str, int], ...]:
@@ -300,7 +301,7 @@ def _failure(
     registered = mapping.num_registered(found.models)
     what = f"cameras found for {registered} of {len(images)} photographs; at least {fewest} are needed."
     looks = look_at_all({image.name: work / "images" / image.file for image in images}, paths)
-    verdict = failed(what, "; ".join(hints), registered, rejected, looks, _facts_of_matching(images, found, how), _overlaps(found.work, images))
+    verdict = failed(what, "; ".join(hints), registered, rejected, looks, _provenance(images, found, how), _overlaps(found.work, images))
     write_json(work / VERDICT, {"source": str(folder), **verdict.document()})
     also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")
     return (
@@ -310,7 +311,7 @@ def _failure(
 
 
 def _capture(
-    folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Masks, rejected: list[tuple[str, str]], found: Mapping[str, object]
+    folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Masks, rejected: list[tuple[str, str]], found: Provenance
 ) -> Capture:
     by_file = {image.file: image for image in images}
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
@@ -322,14 +323,8 @@ def _capture(
     index = {image.image_id: i for i, image in enumerate(registered)}
     points = _points(model, index)
     agreement = mapping.match_agreement(work, images, model)
-    facts: dict[str, object] = {
-        "photographs": len(images),
-        "registered": len(photos),
-        "points": len(points.xyz),
-        "triangulation_angle": round(parallax(points, photos).angle, 3),
-        "pairs_agreeing": round(agreement, 4),
-        **found,
-    }
+    angle = round(parallax(points, photos).angle, 3)
+    counts = {"photographs": len(images), "registered": len(photos), "points": len(points.xyz)}
     warnings = _model_warnings(photos, points, agreement, [by_file[image.name].focal for image in registered])
     if rejected:
         warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} not registered: {_abbreviated([name for name, _ in rejected])}.")
@@ -341,7 +336,7 @@ def _capture(
         rejected=tuple(rejected),
         warnings=tuple(warnings),
         reprojection_error=float(model.compute_mean_reprojection_error()),
-        facts=facts,
+        provenance=structs.replace(found, **counts, triangulation_angle=angle, pairs_agreeing=round(agreement, 4)),
         overlaps=_overlaps(work, images),
     )
 

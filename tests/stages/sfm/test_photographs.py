@@ -74,7 +74,7 @@ def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path
     assert capture.kind == "photographs"
     assert capture.up is None
     assert not capture.metric
-    assert capture.facts["pairs_agreeing"] > 0.9  # type: ignore[operator]
+    assert capture.provenance.pairs_agreeing > 0.9
     assert max(max(seen) for seen in capture.points.tracks) < len(names)
 
 
@@ -113,8 +113,8 @@ def test_the_process_changes_no_bit(ten: tuple[list[str], Path, Capture], tmp_pa
         STILL_LIFE, names, max_side=SIDE, features=4096, matching="auto", seed=0, masks={}, work=tmp_path / "work", **quiet
     )  # fmt: skip
     assert numbers(here) == numbers(capture)
-    assert (here.facts, here.warnings, here.rejected, here.reprojection_error) == (
-        capture.facts, capture.warnings, capture.rejected, capture.reprojection_error,
+    assert (here.provenance, here.warnings, here.rejected, here.reprojection_error) == (
+        capture.provenance, capture.warnings, capture.rejected, capture.reprojection_error,
     )  # fmt: skip
 
 
