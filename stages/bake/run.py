@@ -40,13 +40,14 @@ from stages.bake.resolution import size_limits
 from stages.bake.settings import BakeSettings, refuse_nerf
 from stages.bake.values import baked_tree
 from stages.bake.voxels import choose_voxels, voxel_space, with_min_views
-from stages.bake.whole_scene import bounds_are_given, choose_scene_voxels, room_of
+from stages.bake.whole_scene import choose_scene_voxels, room_of
 from stages.compiling import compiling_kernels
 from stages.cores import count_cores, use_all_cores
 from stages.evaluate.views import constant_background
 from stages.io import scene
 from stages.io.field_file import load_renderer
 from stages.io.refined_cameras import load_scene
+from stages.io.reports import bounds_are_given
 from stages.io.scene import Scene
 from stages.scratch import note, noted
 from stages.train.data import pixels_of

@@ -36,9 +36,7 @@ from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model
 from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import Pixels
-from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs
 from stages.bake.plan import Plan
 from stages.bake.resolution import (
     MAX_BEYOND,
@@ -54,7 +52,7 @@ from stages.bake.settings import BakeSettings
 from stages.bake.voxels import MAX_OVERSHOOT, OVERSHOOT, just_below
 from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
 from stages.io import scene
-from stages.io.json_file import read_json
+from stages.io.reports import bounds_are_given
 from stages.io.scene import Scene
 from stages.scratch import unusable
 from stages.train.priors import filled_points
@@ -162,17 +160,6 @@ def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> R
     place = picture_places(samples, pixels, every)
     found = find_foreground(surface_points(samples)[every], samples.view[every], place, cameras, weights=samples.opacity[every])
     return Region(np.asarray(s.bounds, np.float64)) if found is None else found
-
-
-def bounds_are_given(poses: Path) -> bool:
-    """Whether the scene bounds of an artifact of the stage poses are a box given by hand, by its report."""
-    path = PosesOutputs(poses).report
-    try:
-        report = read_json(path, "Run the poses stage again.") if path.is_file() else {}
-    except BadInput as error:
-        raise CorruptArtifact(str(error)) from error
-    framing = report.get("framing") if isinstance(report, dict) else None
-    return isinstance(framing, dict) and framing.get("bounds_from") == "given"
 
 
 def chosen_of(seen: Sequence[Visibility], grids: Sequence[Grid], settings: BakeSettings, threshold: float) -> list[np.ndarray]:

@@ -21,6 +21,7 @@ from stages.evaluate.summary import means
 from stages.evaluate.trivial import equivalent_blur
 from stages.evaluate.views import constant_background, evenly_spaced, ground_truth
 from stages.io.png import write_png
+from stages.io.reports import BakeReport, read_report
 from stages.io.scene import Scene, View, views_of
 from stages.train.averaged import Taken
 from stages.verdict.result import ResultVerdict, camera_verdict_of, verdict_on_result
@@ -89,7 +90,7 @@ def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: Re
 def refinement_of(bake: BakeOutputs) -> dict[str, int]:
     """Steps that were taken, and the least that are usual for so many voxels and rays a step: a poor figure for want of steps needs no other
     remedy."""
-    report = read_json(bake.report)
+    report = read_report(bake.report, BakeReport)
     last = json.loads(bake.log.read_text(encoding="utf-8").splitlines()[-1])
     rays = last["rays"] or BakeSettings().refine_rays_per_batch  # 0: there was no step
-    return {"steps": report["optimisation"]["steps"], "usual_steps": usual_steps(report["voxels"], rays, 0 if "cascades" in report else None)}
+    return {"steps": report.optimisation.steps, "usual_steps": usual_steps(report.voxels, rays, None if report.cascades is None else 0)}

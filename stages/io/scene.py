@@ -31,9 +31,9 @@ from pipeline.files import is_safe_name, write_json
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import SparsePoints
-from stages.io.json_file import read_json
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha
-from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded
+from stages.io.reports import poses_report
+from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded, json_of_run
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
@@ -174,7 +174,7 @@ def load(folder: Path) -> Scene:
     path = PosesOutputs(folder).scene
     if not path.is_file():
         raise BadInput(f"{printable(path)}: no such file. Run the poses stage first.")
-    found = _json_of_run(path)
+    found = json_of_run(path, AGAIN)
     version = found.get("format") if isinstance(found, dict) else None
     if type(version) is int and version > FORMAT:
         newer = str(version) if version < 10**6 else "of many digits"
@@ -183,14 +183,6 @@ def load(folder: Path) -> Scene:
         return _scene_from(decoded(found, SceneDocument, path, AGAIN))
     except ValueError as error:
         raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {AGAIN}") from error
-
-
-def _json_of_run(path: Path) -> Any:
-    """The value in a file that a stage wrote; CorruptArtifact where it is damaged."""
-    try:
-        return read_json(path, AGAIN)
-    except BadInput as error:
-        raise CorruptArtifact(str(error)) from error
 
 
 def _scene_from(document: SceneDocument) -> Scene:
@@ -331,16 +323,9 @@ def describe(folder: Path) -> dict[str, Any]:
             "rotation": scene.world_from_capture.rotation.tolist(),
             "translation": scene.world_from_capture.translation.tolist(),
         },
-        "warnings": _report_warnings(folder),
+        "warnings": [printable(sentence, 1000) for sentence in poses_report(folder).warnings],
         "cameras": cameras,
     }
-
-
-def _report_warnings(folder: Path) -> list[str]:
-    path = PosesOutputs(folder).report
-    report = _json_of_run(path) if path.is_file() else {}
-    found = report.get("warnings", []) if isinstance(report, dict) else []
-    return [printable(sentence, 1000) for sentence in found if isinstance(sentence, str)] if isinstance(found, list) else []
 
 
 def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
-from pipeline.errors import CorruptArtifact
+from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.text import printable
+from stages.io.json_file import read_json
 
 LARGEST = 1e15  # of any number: beyond it squares lose all that they are compared with
 
@@ -84,6 +85,19 @@ class SceneDocument(Struct):
 
 
 T = TypeVar("T")
+
+
+def json_of_run(path: Path, remedy: str) -> Any:
+    """The value in a file that a stage wrote; CorruptArtifact where it is damaged."""
+    try:
+        return read_json(path, remedy)
+    except BadInput as error:
+        raise CorruptArtifact(str(error)) from error
+
+
+def read_document(path: Path, kind: type[T], remedy: str) -> T:
+    """The file that a stage wrote, as `kind`. Raises CorruptArtifact."""
+    return decoded(json_of_run(path, remedy), kind, path, remedy)
 
 
 def decoded(document: Any, kind: type[T], path: Path, remedy: str) -> T:
