@@ -1,25 +1,56 @@
-"""The reports of stages as far as a later one follows them: what they hold has no place in the other files, whose formats stay. This is the one place."""
+"""The reports and verdicts of stages as far as a later stage follows them, or the page of a run shows them: what has no place in the other files."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal
 
 from msgspec import Struct
 
 from stages.artifacts import PosesOutputs
-from stages.io.scene_schema import read_document
-
-R = TypeVar("R", bound=Struct)
+from stages.io.scene_schema import T, read_document
 
 
 class Framing(Struct, frozen=True):
     bounds_from: str = ""
 
 
+class Rejected(Struct, frozen=True):
+    """An image that was not used, and why."""
+
+    name: str = ""
+    reason: str = ""
+
+
 class PosesReport(Struct, frozen=True):
+    """`registered` are the views of the scene."""
+
+    registered: list[Any] | None = None
+    reprojection_error: float | None = None
+    rejected: list[Rejected] | None = None
+    warnings: list[str] | None = None
     framing: Framing = Framing()
-    warnings: tuple[str, ...] = ()
+
+
+class CameraProblem(Struct, frozen=True):
+    """A problem of the cameras, and what to do."""
+
+    sentence: str = ""
+    remedy: str = ""
+    grade: str = ""
+
+
+class CameraVerdict(Struct, frozen=True):
+    """The verdict on the cameras."""
+
+    grade: str = ""
+    summary: str = ""
+    problems: list[CameraProblem] = []
+
+    @property
+    def worst(self) -> CameraProblem:
+        """The first of those that the grade is of."""
+        return next((each for each in self.problems if each.grade == self.grade), CameraProblem())
 
 
 class Refinement(Struct, frozen=True):
@@ -29,7 +60,7 @@ class Refinement(Struct, frozen=True):
 class BakeReport(Struct, frozen=True):
     voxels: int
     optimisation: Refinement
-    cascades: tuple[int, ...] | None = None  # of unbounded scenes
+    cascades: list[int] | None = None  # of unbounded scenes
 
 
 class RegionReport(Struct, frozen=True):
@@ -38,13 +69,13 @@ class RegionReport(Struct, frozen=True):
     region: Literal["foreground", "all"] = "foreground"
 
 
-def read_report(path: Path, kind: type[R]) -> R:
+def read_report(path: Path, kind: type[T]) -> T:
     """What a report of that kind states. Raises CorruptArtifact."""
     return read_document(path, kind, f"Run the {path.parent.name} stage again.")
 
 
 def poses_report(poses: Path) -> PosesReport:
-    """That of the poses stage; of a scene without one the defaults. Raises CorruptArtifact."""
+    """That of the poses stage; of a scene without one an empty one. Raises CorruptArtifact."""
     path = PosesOutputs(poses).report
     return read_report(path, PosesReport) if path.is_file() else PosesReport()
 

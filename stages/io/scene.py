@@ -323,7 +323,7 @@ def describe(folder: Path) -> dict[str, Any]:
             "rotation": scene.world_from_capture.rotation.tolist(),
             "translation": scene.world_from_capture.translation.tolist(),
         },
-        "warnings": [printable(sentence, 1000) for sentence in poses_report(folder).warnings],
+        "warnings": [printable(sentence, 1000) for sentence in poses_report(folder).warnings or ()],
         "cameras": cameras,
     }
 

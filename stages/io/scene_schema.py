@@ -104,5 +104,5 @@ def decoded(document: Any, kind: type[T], path: Path, remedy: str) -> T:
     """`document`, out of a JSON file, as `kind`; CorruptArtifact names the place that does not fit."""
     try:
         return msgspec.convert(document, kind)
-    except (msgspec.ValidationError, RecursionError) as error:
+    except (msgspec.ValidationError, UnicodeEncodeError, RecursionError) as error:
         raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {remedy}") from error
