@@ -70,48 +70,31 @@ class SparsePoints:
 
 
 class Alignment(Struct, frozen=True, omit_defaults=True, kw_only=True):
-    """Cameras that were found, against positions that are known of so many photographs.
-
-    extent    of the positions, metres
-    distance  of the cameras from them, median, metres
-    used      what was taken over from them
-    """
+    """Cameras that were found, against positions that are known of so many photographs."""
 
     photographs: int
-    extent: float | None = None
-    distance: float | None = None
-    used: Literal["nothing", "scale", "scale and up", "frame"]
+    extent: float | None = None  # of the positions, metres
+    distance: float | None = None  # of the cameras from them, median, metres
+    used: Literal["nothing", "scale", "scale and up", "frame"]  # of the positions
 
 
 class Provenance(Struct, frozen=True, omit_defaults=True):
-    """How the cameras of photographs were found. report.json has it without what is not known.
-
-    pairs_agreeing  share of the verified matches that agree with the cameras
-    matching        the pairs that were matched, as the setting has it
-    components      photographs of each group that overlaps with no other, the largest first
-    models          photographs of each sub-model that adds to the first
-    rungs           of each step tried its name, the photographs with a camera then, and the share of matches that agreed
-    planar_pairs    share of the pairs whose matches one homography explains
-    lens            what each photograph has of its own: a focal length where they were zoomed, a principal point where they were cropped
-    own_intrinsics  which each photograph has of its own (`stages.sfm.intrinsics.own`), if any
-    moving_parts    name of a photograph -> share of it that moves
-    background      it stands still while the subject turns, or was left out therefore
-    """
+    """How the cameras of photographs were found. report.json has it without what is not known."""
 
     photographs: int | None = None
     registered: int | None = None
     points: int | None = None
     triangulation_angle: float | None = None
-    pairs_agreeing: float | None = None
-    matching: str | None = None
-    components: list[int] | None = None
-    models: list[int] | None = None
-    rungs: list[dict[str, str | int | float]] | None = None
-    planar_pairs: float | UnsetType | None = UNSET
-    lens: Lens | None = None
-    own_intrinsics: str | UnsetType | None = UNSET
-    moving_parts: dict[str, float] = {}
-    background: Literal["left out", "stands still"] | None = None
+    pairs_agreeing: float | None = None  # share of the verified matches that agree with the cameras
+    matching: str | None = None  # the pairs that were matched, as the setting has it
+    components: list[int] | None = None  # photographs of each group that overlaps with no other, the largest first
+    models: list[int] | None = None  # photographs of each sub-model that adds to the first
+    rungs: list[dict[str, str | int | float]] | None = None  # `stages.sfm.ladder.Found`
+    planar_pairs: float | UnsetType | None = UNSET  # share of the pairs whose matches one homography explains; None: there are no pairs
+    lens: Lens | None = None  # photographs that were zoomed have a focal length each, cropped ones a principal point
+    own_intrinsics: str | UnsetType | None = UNSET  # which each photograph has of its own (`stages.sfm.intrinsics.own`), if any
+    moving_parts: dict[str, float] = {}  # name of a photograph -> share of it that moves
+    background: Literal["left out", "stands still"] | None = None  # of a subject that turns
     stated_cameras: Alignment | None = None
     gps: Alignment | None = None
 

@@ -27,7 +27,7 @@ from stages.figures.contact_sheet import write_contact_sheet
 from stages.formats import importers
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
 from stages.framing import training_frame
-from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
+from stages.framing.mask_use import MaskUse, doubts, find_mask_use, points_of_object, without_silhouette
 from stages.io import working_images
 from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
 from stages.io.pictures import UnreadableImage
@@ -59,14 +59,15 @@ def run(job: Job) -> None:
     sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
     refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
     small = SmallPictures()
-    capture, mask_facts = with_mask_use(job, capture, small, warn)
+    capture, use = with_mask_use(job, capture, small, warn)
     capture, written = _write_images(job, capture, warn)
     judged = capture  # by all sparse points that its cameras were found with
     capture = with_points_of_object(capture, small)
     framed = training_frame.find_training_frame(
         capture, up=settings.up, box=resolved(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
     )
-    _say_what_is_cut(framed.facts.get("silhouettes_cut", ()), warn)
+    if names := framed.silhouettes_cut:
+        warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = _views(capture, written, splits, framed)
@@ -86,7 +87,7 @@ def run(job: Job) -> None:
     )
     save(scene, job.out)
     judge(job, judged, scene, _may_be_renders(capture), warn)
-    _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
+    _write_report(PosesOutputs(job.out).report, capture, scene, framed, use, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
@@ -106,11 +107,6 @@ def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], fram
         )
         for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far_planes, strict=True)
     )
-
-
-def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
-    if names:
-        warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
@@ -154,8 +150,8 @@ def _format_of(capture: Capture) -> str:
     return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
 
 
-def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
-    """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
+def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, MaskUse]:
+    """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and that meaning."""
     renders = _may_be_renders(capture)
     use = find_mask_use(capture, mask_choice(job.settings, capture.provenance), renders, small, job.safe_point)
     for sentence in use.sentences:
@@ -168,8 +164,8 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
     kept = [index for index, photo in enumerate(capture.photos) if photo.camera.name not in names]
     capture = without(capture, kept, [(name, "has no silhouette, and the others do") for name in sorted(names)])
     if not use.silhouettes:
-        return replace(capture, background=None), use.facts
-    return replace(capture, background=WHITE, silhouettes=use.silhouettes), use.facts
+        return replace(capture, background=None), use
+    return replace(capture, background=WHITE, silhouettes=use.silhouettes), use
 
 
 def with_points_of_object(capture: Capture, small: SmallPictures) -> Capture:
@@ -243,7 +239,7 @@ def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: 
     return ["test" if index in test else "train" for index in range(len(photos))]
 
 
-def _write_report(path: Path, capture: Capture, scene: Scene, facts: dict[str, dict[str, object]], notes: Sequence[str]) -> None:
+def _write_report(path: Path, capture: Capture, scene: Scene, framed: training_frame.TrainingFrame, use: MaskUse, notes: Sequence[str]) -> None:
     """Images used and rejected, splits, facts and warnings."""
     report = {
         "kind": capture.kind,
@@ -256,7 +252,8 @@ def _write_report(path: Path, capture: Capture, scene: Scene, facts: dict[str, d
         "reprojection_error": capture.reprojection_error,
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "background": capture.background,
-        **facts,
+        "framing": framed.facts,
+        "masks": use.facts,
         "facts": to_builtins(capture.provenance) | capture.facts,
         "warnings": list(notes),
     }
