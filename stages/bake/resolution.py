@@ -17,7 +17,7 @@ from efficientnerf.capture.forward_facing import ForwardFacing
 from efficientnerf.settings import resolved
 from pipeline.errors import UsageError
 from stages.bake.settings import BakeSettings
-from stages.io.scene import Scene
+from stages.io.scene import Scene, views_of
 
 MIN_RESOLUTION = 32  # voxels along the longest side
 # docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background, of an unbounded scene (its innermost cascade), and in
@@ -25,6 +25,8 @@ MIN_RESOLUTION = 32  # voxels along the longest side
 VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
 MAX_RESOLUTION = 1024
 MAX_MIB = 38
+# Of an unbounded scene: bytes for each pixel of its training images; MiB at most, where these are more than MAX_MIB. docs/experiments/bake-resolution.md
+SCENE_BYTES, SCENE_MAX_MIB = 0.7, 76
 # Of unbounded scenes: most cascades; the share of what the field shows that may lie beyond the last, in the environment map; coarse cells of all of them.
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
@@ -83,14 +85,22 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
 
 
+def scene_mib(pixels: int) -> float:
+    """MiB that the asset of an unbounded scene may have where none are stated: the more pixels its training images have, the more voxels these tell apart."""
+    return float(np.clip(SCENE_BYTES * pixels / 2**20, MAX_MIB, SCENE_MAX_MIB))
+
+
 def budget_of(s: Scene, stated: float | None, *, packed: bool = False) -> float:
-    """MiB that an asset may have: those stated, or else MAX_MIB. In normalised device coordinates, where nothing is empty
+    """MiB that an asset may have: those stated, or else MAX_MIB, or `scene_mib` of an unbounded scene. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
     large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
     if stated is None and packed:
         return math.ceil(budget_of(s, None) / 3)
-    if stated is not None or s.forward is None:
-        return MAX_MIB if stated is None else stated
+    if stated is not None:
+        return stated
+    if s.forward is None:
+        pixels = sum(view.camera.width * view.camera.height for view in views_of(s, "train"))
+        return MAX_MIB if s.background is not None else scene_mib(pixels)
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
     return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
 

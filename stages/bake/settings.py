@@ -55,8 +55,9 @@ class BakeSettings:
     max_mib: Annotated[float, Meta(ge=0.03, le=65536.0)] | Auto = setting(  # header and palette of 9 harmonics: 28 kB
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
-        " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed, whose codes"
-        " become finer with more, not its voxels; less where voxels as fine as pixels resolve are fewer, or where time_budget is too short for as many.",
+        " 0.7 bytes for each pixel of the training images of a whole scene, from 38 to 76; 34 bytes for each pixel of a forward-facing capture,"
+        " from 24 to 56; a third of that with layout packed, whose codes become finer with more, not its voxels; less where voxels"
+        " as fine as pixels resolve are fewer, or where time_budget is too short for as many.",
         unit="MiB",
     )
     layout: Literal["compact", "packed", "small", "sparse"] = setting(
@@ -117,7 +118,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=21,
+    version=22,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=ByName("stages.bake.run:run"),

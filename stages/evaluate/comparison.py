@@ -8,9 +8,9 @@ floaters  opacity of the asset nearer than the network's surfaces, less a margin
 holes_excess_error, floaters_excess_error  the asset's squared error less the network's, of those pixels and weighed by that opacity, over what `holes` and
           `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there
 
-Where training learned vignetting and response of the camera, renders are compared as that camera would show them, at the mean exposure. The exposure of a
-held-back photograph is not learned: psnr_colour_fitted is the PSNR after the affine change of the render's colours, twelve numbers a view, that fits
-the photograph best (`metrics.colour_fitted`).
+Where training learned exposure, vignetting and response, renders are compared as the camera would show them. The exposure of a held-back photograph is not
+learned but foretold by those of its neighbours (`efficientnerf.training.exposure.held_out`): psnr_colour_fitted is the PSNR after the affine change of the
+render's colours, twelve numbers a view, that fits the photograph best (`metrics.colour_fitted`).
 """
 
 from __future__ import annotations

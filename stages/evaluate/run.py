@@ -105,7 +105,7 @@ def evaluate(
     composited = surrounded and constant_background(scene) is None
     perceptual = {f"lpips_{network}": load_lpips(network, resolved(settings.lpips_weights)) for network in networks_of(settings)}
     points = observed_points(job.inputs[PosesOutputs.stage], scene, asset.reach)
-    taken = as_taken(job.inputs[TrainOutputs.stage])
+    taken = as_taken(job.inputs[TrainOutputs.stage], scene)
     figures, others = [], [name for name, known in (("splats", splats), ("sparse_points", points)) if known is not None]
     for k, view in enumerate(views):
         job.safe_point()

@@ -58,7 +58,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="evaluate",
-    version=9,
+    version=10,
     settings=EvaluateSettings,
     needs=needs_of(EvaluateInputs),
     run=ByName("stages.evaluate.run:run"),

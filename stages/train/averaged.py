@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.training.exposure.held_out import predicted_gains
 from efficientnerf.training.exposure.model import Exposure, averaged_image, image_as_taken
 from stages.io.field_file import load_exposure
-from stages.io.scene import View, read_image, read_mask
+from stages.io.scene import Scene, View, read_image, read_mask
 
 Taken = Callable[[View, np.ndarray, int], np.ndarray]
 ReadView = Callable[[View], tuple[np.ndarray, np.ndarray | None]]  # (H, W, 3 or 4) uint8, and (H, W) bool or None
@@ -35,17 +36,24 @@ def averaged_views(folder: Path, trained: Path) -> ReadView:
     return read
 
 
-def as_taken(trained: Path) -> Taken | None:
+def as_taken(trained: Path, s: Scene) -> Taken | None:
     """A function that shows a render (H, W, 3) of every stride-th pixel of a view as its camera would, by what the train stage in `trained` learned; None: it
-    learned nothing. Held-back views are exposed as on average."""
+    learned nothing. Held-back views are exposed as the nearest training photographs foretell (`predicted_gains`)."""
     known = exposures_of(trained)
     if known is None:
         return None
+    numbers, exposure = known
+    learned = exposure.log_gains().numpy()
+    gains = {name: learned[number] for name, number in numbers.items()}
+    train, others = ([view for view in s.views if (view.split == "train") is used and view.image in numbers] for used in (True, False))
+    own = np.array([gains[view.image] for view in train]).reshape(-1, 3)
+    foretold = predicted_gains(own, [view.camera for view in train], [view.camera for view in others])
+    gains |= {view.image: one for view, one in zip(others, foretold, strict=True)}
 
     def taken(view: View, image: np.ndarray, stride: int) -> np.ndarray:
-        if view.image not in known[0]:
+        if view.image not in numbers:
             return image
-        return image_as_taken(image, known[0][view.image], known[1], (view.camera.width, view.camera.height), stride)
+        return image_as_taken(image, numbers[view.image], exposure, gains[view.image], (view.camera.width, view.camera.height), stride)
 
     return taken
 

@@ -339,7 +339,8 @@ def _forecast_of_run(
     seconds = run_forecast.seconds_of(later, views=count, megapixels=megapixels, whole=whole, threads=threads, slower=_slower(small))
     stages = {"poses": about["poses_seconds"], **seconds} if seconds else None
     total = None if stages is None else round(sum(stages.values()), 1)
-    return {"stage_seconds": stages, "run_seconds": total, "run_bytes": max(about["poses_bytes"], run_forecast.bytes_of(later))}
+    needed = run_forecast.bytes_of(later, megapixels=megapixels, whole=whole)
+    return {"stage_seconds": stages, "run_seconds": total, "run_bytes": max(about["poses_bytes"], needed)}
 
 
 def count_features(rgb: np.ndarray) -> int:

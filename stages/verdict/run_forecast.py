@@ -11,7 +11,7 @@ from typing import Any
 
 from efficientnerf.settings import resolved
 from stages.bake.refine.refinement import usual_steps
-from stages.bake.resolution import MAX_MIB
+from stages.bake.resolution import MAX_MIB, scene_mib
 from stages.memory.need import libraries
 
 SLOWER = 1.5  # by `preflight.REFERENCE`, of the machine that the processor seconds below were taken on
@@ -43,7 +43,8 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
         return {}
     steps = resolved(bake.refine_steps)
     if steps is None:
-        steps = usual_steps(_voxels(bake), bake.refine_rays_per_batch, int((1 - TEST_SHARE) * 1e6 * megapixels) if whole else None)
+        pixels = _training_pixels(megapixels) if whole else None
+        steps = usual_steps(_voxels(bake, pixels), bake.refine_rays_per_batch, pixels)
     frames = turntable.frames * turntable.width * turntable.height * turntable.supersample**2 / 1e6
     processor = {
         "train": train.iterations * A_TRAIN_STEP * train.sample_batch_size / 65536,
@@ -62,14 +63,21 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
     return {stage: round(seconds, 1) for stage, seconds in found.items()}
 
 
-def bytes_of(settings: Mapping[str, Any]) -> int:
-    """At the peak of the stages after poses, where the asset is as large as it may be: baking, as a rule."""
-    return int(libraries() + BAKED_BYTES_A_VOXEL * _voxels(settings["bake"]))
+def bytes_of(settings: Mapping[str, Any], *, megapixels: float, whole: bool) -> int:
+    """At the peak of the stages after poses, where the asset is as large as it may be: baking, as a rule. Arguments as of `seconds_of`."""
+    return int(libraries() + BAKED_BYTES_A_VOXEL * _voxels(settings["bake"], _training_pixels(megapixels) if whole else None))
 
 
-def _voxels(bake: Any) -> int:
-    """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.budget_of`)."""
+def _training_pixels(megapixels: float) -> int:
+    return int((1 - TEST_SHARE) * 1e6 * megapixels)
+
+
+def _voxels(bake: Any, pixels: int | None) -> int:
+    """That the asset may hold; a packed one has a third of the bytes by default (`stages.bake.resolution.budget_of`).
+
+    pixels  of all training images of an unbounded scene; None: of another scene
+    """
     packed, stated = bake.layout == "packed", resolved(bake.max_mib)
-    usual = MAX_MIB / 3 if packed else MAX_MIB
+    usual = (MAX_MIB if pixels is None else scene_mib(pixels)) / (3 if packed else 1)
     mib = usual if stated is None else min(stated, usual) if packed and bake.resolution == "auto" else stated
     return int(mib * 2**20 / (PACKED_BYTES_A_VOXEL if packed else BYTES_A_VOXEL))

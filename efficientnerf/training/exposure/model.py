@@ -144,12 +144,12 @@ def averaged_image(image: np.ndarray, mask: np.ndarray | None, number: int, e: E
     return out, ~blind if mask is None else mask & ~blind
 
 
-def image_as_taken(image: np.ndarray, number: int, e: Exposure, size: tuple[int, int], stride: int = 1) -> np.ndarray:
+def image_as_taken(image: np.ndarray, number: int, e: Exposure, gains: np.ndarray, size: tuple[int, int], stride: int = 1) -> np.ndarray:
     """A render (H, W, 3) float32, 0-1, of every stride-th pixel of an image of size (width, height), the first in the middle of the first stride, as the camera
-    of photograph `number` would show it, exposed as on average."""
-    still = Exposure(torch.zeros_like(e.photographs), e.cameras, e.camera_of)
+    of photograph `number` would show it with the logarithms of gains (3,)."""
     with torch.no_grad():
-        seen = exposed(torch.from_numpy(image.reshape(-1, 3)), *_places_of_image(number, *size, stride), still)
+        of, average, gain = _response_and_gain(*_places_of_image(number, *size, stride), e, torch.tensor(gains, dtype=torch.float32))
+        seen = _seen(_light(torch.from_numpy(image.reshape(-1, 3)), average) * gain, of)
     return np.asarray(seen.clamp(0, 1).numpy().reshape(image.shape))
 
 
@@ -170,12 +170,13 @@ def _places_of_image(number: int, width: int, height: int, stride: int = 1) -> t
     return torch.full((x.size,), number), torch.from_numpy(squared_radius(x.ravel(), y.ravel(), width, height))
 
 
-def _response_and_gain(view: Tensor, radius: Tensor, e: Exposure) -> tuple[Tensor, Tensor, Tensor]:
-    """Response (R, 2) of the rays' cameras, that (2,) of all on average, and gains (R, 3)."""
+def _response_and_gain(view: Tensor, radius: Tensor, e: Exposure, gains: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Response (R, 2) of the rays' cameras, that (2,) of all on average, and gains (R, 3); with logarithms (3,) in place of the photographs' own."""
     cameras = torch.cat([SCALE * e.cameras[:, :OFFSET], OFFSET_SCALE * e.cameras[:, OFFSET:]], dim=1)
     of = cameras[e.camera_of[view]]  # (R, 4)
     falloff = of[:, 0] * (radius - 1 / 3) + of[:, 1] * (radius**2 - 1 / 9)
-    return of[:, SHOULDER:], cameras.mean(dim=0)[SHOULDER:], torch.exp(e.log_gains()[view] + falloff[:, None])
+    own = e.log_gains()[view] if gains is None else gains
+    return of[:, SHOULDER:], cameras.mean(dim=0)[SHOULDER:], torch.exp(own + falloff[:, None])
 
 
 def _light(colour: Tensor, response: Tensor) -> Tensor:

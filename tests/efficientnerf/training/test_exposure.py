@@ -13,6 +13,7 @@ from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.training.exposure import model as module
 from efficientnerf.training.exposure.fit import fit_exposure
+from efficientnerf.training.exposure.held_out import predicted_gains
 from efficientnerf.training.exposure.model import (
     OFFSET_SCALE,
     SCALE,
@@ -120,16 +121,33 @@ def test_a_photograph_as_if_exposed_like_the_others() -> None:
 
 
 def test_a_render_as_its_camera_shows_it() -> None:
-    """Without the photograph's own exposure; at every stride-th pixel the same as there of all."""
-    e = Exposure(random(2, 3).float(), torch.tensor([[-4.0, -1.0, 3.0, 0.0]]), torch.zeros(2, dtype=torch.int64))
+    """With gains that are given; at every stride-th pixel the same as there of all."""
+    e = Exposure(torch.zeros(2, 3), torch.tensor([[-4.0, -1.0, 3.0, 0.0]]), torch.zeros(2, dtype=torch.int64))
     image = np.random.default_rng(0).random((11, 8, 3), np.float32)
     y, x = np.divmod(np.arange(88), 8)
-    still = Exposure(torch.zeros(2, 3), e.cameras, e.camera_of)
-    expected = exposed(torch.from_numpy(image.reshape(-1, 3)), torch.zeros(88, dtype=torch.int64), torch.from_numpy(squared_radius(x, y, 8, 11)), still)
-    whole = image_as_taken(image, 1, e, (8, 11))
+    gains = np.array([0.2, -0.1, 0.0])
+    own = Exposure(torch.tensor(np.array([gains, -gains])) / SCALE, e.cameras, e.camera_of)
+    expected = exposed(torch.from_numpy(image.reshape(-1, 3)), torch.zeros(88, dtype=torch.int64), torch.from_numpy(squared_radius(x, y, 8, 11)), own)
+    whole = image_as_taken(image, 1, e, gains, (8, 11))
     np.testing.assert_allclose(whole, expected.clamp(0, 1).reshape(11, 8, 3), atol=1e-6)
     assert np.abs(whole - image).max() > 0.05
-    np.testing.assert_allclose(image_as_taken(subsample(image, 3), 0, e, (8, 11), 3), subsample(whole, 3), atol=1e-6)
+    np.testing.assert_allclose(image_as_taken(subsample(image, 3), 0, e, gains, (8, 11), 3), subsample(whole, 3), atol=1e-6)
+
+
+def test_the_exposure_of_a_held_back_photograph() -> None:
+    """Foretold by its neighbours where it changes slowly around the ring; the mean where each photograph has its own."""
+    ring = sorted(cameras(48), key=lambda camera: math.atan2(*camera.centre[:2]))
+    angle = np.array([math.atan2(*camera.centre[:2]) for camera in ring])
+    held, used = slice(3, None, 8), np.arange(48) % 8 != 3
+    some = [camera for camera, one in zip(ring, used, strict=True) if one]
+    slow = np.stack([0.3 * np.sin(angle), -0.2 * np.cos(angle), 0 * angle], axis=1)
+    slow -= slow[used].mean(axis=0)
+    found = predicted_gains(slow[used], some, ring[held])
+    assert np.abs(found - slow[held]).max() < 0.3 * np.abs(slow).max()
+    wild = np.random.default_rng(0).normal(0, 0.3, (48, 3))
+    wild -= wild[used].mean(axis=0)
+    assert ((predicted_gains(wild[used], some, ring[held]) - wild[held]) ** 2).mean() < 1.1 * (wild[held] ** 2).mean()
+    assert not predicted_gains(slow[:2], ring[:2], ring[2:]).any()  # too few
 
 
 def photographs(gains: np.ndarray) -> Pixels:

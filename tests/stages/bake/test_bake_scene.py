@@ -24,7 +24,7 @@ from pipeline.executors.memory import Limit
 from stages.artifacts import BakeOutputs, TrainOutputs
 from stages.bake import holes, pruning, resolution, whole_scene
 from stages.bake import run as bake
-from stages.bake.resolution import MAX_CELLS, MAX_MIB, budget_of, finest_of_cascades
+from stages.bake.resolution import MAX_CELLS, MAX_MIB, SCENE_BYTES, SCENE_MAX_MIB, budget_of, finest_of_cascades
 from stages.bake.settings import BakeSettings
 from stages.framing.view_coverage import close_to_path
 from stages.io.png import read_png, write_png
@@ -243,6 +243,10 @@ def test_a_scene_is_as_fine_as_pixels_cells_and_settings_allow(inputs: dict[str,
     assert finest_of_cascades(sharp, box, 4, 4, 99).resolution == 99
     assert budget_of(s, None) == MAX_MIB
     assert budget_of(s, 7) == 7
+    many = replace(s, views=s.views + tuple(replace(v, camera=replace(v.camera, width=9000, height=10000), split="train") for v in s.views[:1]))
+    assert budget_of(many, None) == pytest.approx(SCENE_BYTES * 9e7 / 2**20, rel=1e-3)
+    assert budget_of(replace(many, views=many.views + many.views[-1:]), None) == SCENE_MAX_MIB
+    assert budget_of(replace(many, background=(1.0, 1.0, 1.0)), None) == MAX_MIB
 
 
 def test_a_scene_that_does_not_fit_into_memory_is_refused_early(inputs: dict[str, Path], tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def test_renders_are_compared_as_the_camera_shows_them(tmp_path: Path, monkeypat
         return image * (1 - 0.5 * rows / view.camera.height).astype(np.float32)
 
     poses = make_scene(tmp_path / "poses", "t")
-    monkeypatch.setattr("stages.evaluate.run.as_taken", lambda trained: darker_below)
+    monkeypatch.setattr("stages.evaluate.run.as_taken", lambda trained, scene: darker_below)
     job = job_in(tmp_path, poses, settings(field_image_scale=0.34))
     measure(TREE, lambda: BallField(TREE, background=WHITE), job)
     found, view = figures_of(job), load(poses).views[0]

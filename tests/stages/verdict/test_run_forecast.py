@@ -54,4 +54,10 @@ def test_slower_machines_take_longer_and_more_cores_less() -> None:
 def test_a_packed_asset_holds_more_voxels_in_as_many_bytes_and_takes_longer() -> None:
     assert seconds(bake__layout="packed", bake__max_mib=8.0, whole=False)["bake"] > 3 * seconds(bake__max_mib=8.0, whole=False)["bake"]
     packed = {"bake": replace(DEFAULTS["bake"], layout="packed", max_mib=8.0)}
-    assert run_forecast.bytes_of(DEFAULTS | packed) > run_forecast.bytes_of(DEFAULTS | {"bake": replace(DEFAULTS["bake"], max_mib=8.0)})
+    compact = {"bake": replace(DEFAULTS["bake"], max_mib=8.0)}
+    assert run_forecast.bytes_of(DEFAULTS | packed, megapixels=6.0, whole=False) > run_forecast.bytes_of(DEFAULTS | compact, megapixels=6.0, whole=False)
+
+
+def test_large_captures_of_whole_scenes_have_larger_assets() -> None:
+    few, many = (run_forecast.bytes_of(DEFAULTS, megapixels=megapixels, whole=True) for megapixels in (6.0, 600.0))
+    assert few == run_forecast.bytes_of(DEFAULTS, megapixels=600.0, whole=False) < many
