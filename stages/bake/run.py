@@ -47,8 +47,8 @@ from stages.evaluate.views import constant_background
 from stages.io import scene
 from stages.io.field_file import load_renderer
 from stages.io.refined_cameras import load_scene
-from stages.io.reports import bounds_are_given
 from stages.io.scene import Scene
+from stages.reports import bounds_are_given
 from stages.scratch import note, noted
 from stages.train.data import pixels_of
 

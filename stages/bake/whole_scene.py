@@ -52,8 +52,8 @@ from stages.bake.settings import BakeSettings
 from stages.bake.voxels import MAX_OVERSHOOT, OVERSHOOT, just_below
 from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
 from stages.io import scene
-from stages.io.reports import bounds_are_given
 from stages.io.scene import Scene
+from stages.reports import bounds_are_given
 from stages.scratch import unusable
 from stages.train.priors import filled_points
 

@@ -21,8 +21,8 @@ from stages.evaluate.summary import means
 from stages.evaluate.trivial import equivalent_blur
 from stages.evaluate.views import constant_background, evenly_spaced, ground_truth
 from stages.io.png import write_png
-from stages.io.reports import BakeReport, CameraVerdict, read_report
 from stages.io.scene import Scene, View, views_of
+from stages.reports import BakeReport, CameraVerdict, read_report
 from stages.train.averaged import Taken
 from stages.verdict.result import ResultVerdict, verdict_on_result
 

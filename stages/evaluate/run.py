@@ -54,9 +54,9 @@ from stages.figures.plots import contact_sheet, thumbnail_of
 from stages.io.field_file import load_renderer
 from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
-from stages.io.reports import RegionReport, read_report
 from stages.io.scene import View
 from stages.memory.need import refuse_what_does_not_fit
+from stages.reports import RegionReport, read_report
 from stages.scratch import note, noted, once
 from stages.train.averaged import as_taken
 

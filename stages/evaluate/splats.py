@@ -19,8 +19,8 @@ from stages.evaluate.views import GroundTruth, constant_background
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import source_frame
-from stages.io.reports import RegionReport, read_report
 from stages.io.scene import Scene, View
+from stages.reports import RegionReport, read_report
 
 FIGURES = ("psnr", "ssim")
 

@@ -32,8 +32,8 @@ from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import SparsePoints
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha
-from stages.io.reports import poses_report
 from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded, json_of_run
+from stages.reports import poses_report
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")

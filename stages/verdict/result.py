@@ -20,7 +20,7 @@ from typing import Any
 from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
 from stages.evaluate.trivial import BLURS, equivalent_blur
 from stages.formats.importers.source import abbreviated
-from stages.io.reports import CameraVerdict
+from stages.reports import CameraVerdict
 from stages.verdict.grades import GRADES
 
 USABLE_BLUR, POOR_BLUR, FAILED_BLUR = 0.0125, 0.0225, 0.04  # of the longest side: the blur that costs as much, beyond which a result is no better

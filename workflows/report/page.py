@@ -23,7 +23,7 @@ from pipeline.run import Run, cannot_write
 from pipeline.stage import Stage
 from pipeline.text import printable
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
-from stages.io.reports import CameraVerdict, PosesReport
+from stages.reports import CameraVerdict, PosesReport
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents

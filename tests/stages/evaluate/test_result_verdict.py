@@ -16,8 +16,8 @@ from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsO
 from stages.evaluate.sparse_points import COLOURS, FARTHER, NEARER
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.capture import SparsePoints
-from stages.io.reports import CameraProblem, CameraVerdict
 from stages.io.scene import load, save, save_points
+from stages.reports import CameraProblem, CameraVerdict
 from stages.verdict.grades import GRADES
 from stages.verdict.result import ResultVerdict, verdict_on_result
 from tests.fakes import WHITE, BallField
