@@ -60,7 +60,7 @@ class Found:
 
     models: list[Any]
     work: Path
-    rungs: list[dict[str, str | int | float]]
+    rungs: list[dict[str, object]]
     rung: str = ""
 
 
