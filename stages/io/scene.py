@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -148,18 +148,8 @@ def save(scene: Scene, folder: Path) -> None:
         "up": list(scene.up),
         "bounds": scene.bounds.tolist(),
         "background": scene.background,
-        "world_from_capture": {
-            "scale": scene.world_from_capture.scale,
-            "rotation": scene.world_from_capture.rotation.tolist(),
-            "translation": scene.world_from_capture.translation.tolist(),
-        },
-        "orbit": {
-            "centre": list(scene.orbit.centre),
-            "radius": scene.orbit.radius,
-            "elevation": scene.orbit.elevation,
-            "forward_facing": scene.orbit.forward_facing,
-            "heading": scene.orbit.heading,
-        },
+        "world_from_capture": similarity_to_json(scene.world_from_capture),
+        "orbit": asdict(scene.orbit),
         "points": scene.points,
         "metric": scene.metric,
         "space": scene.space,
@@ -318,11 +308,7 @@ def describe(folder: Path) -> dict[str, Any]:
         "masks": sum(view.mask is not None for view in scene.views),
         "points": len(read_observations(folder)[0]) if scene.points else 0,
         "metric": scene.metric,
-        "world_from_capture": {
-            "scale": scene.world_from_capture.scale,
-            "rotation": scene.world_from_capture.rotation.tolist(),
-            "translation": scene.world_from_capture.translation.tolist(),
-        },
+        "world_from_capture": similarity_to_json(scene.world_from_capture),
         "warnings": [printable(sentence, 1000) for sentence in poses_report(folder).warnings or ()],
         "cameras": cameras,
     }
@@ -349,6 +335,11 @@ def _forward_from(document: SceneDocument) -> ForwardFacing | None:
     if min([forward.far - forward.ndc.near, forward.focus, *forward.tangents, *(forward.bounds[1] - forward.bounds[0])]) <= 0:
         raise ValueError("forward: no box before the reference camera")
     return forward
+
+
+def similarity_to_json(similarity: Similarity) -> dict[str, Any]:
+    """A similarity as JSON holds it."""
+    return {"scale": float(similarity.scale), "rotation": similarity.rotation.tolist(), "translation": similarity.translation.tolist()}
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
