@@ -72,7 +72,7 @@ def main() -> None:
     result: dict[str, object] = {
         "photographs": len(names),
         "registered": len(capture.photos),
-        "matches_that_agree": capture.facts["pairs_agreeing"],
+        "matches_that_agree": capture.provenance.pairs_agreeing,
         "reprojection_error_px": round(float(capture.reprojection_error or 0), 4),
         "lens": {capture.photos[0].camera.model: capture.photos[0].camera.params},
         "seconds": round(seconds, 2),

@@ -54,7 +54,7 @@ class PosesOutputs(Outputs):
     masks = Name("masks")  # 0/255 PNG, 255 = use
     points = Name("points.safetensors")  # sparse points in the training frame, where there are any
     report = Name("report.json")  # images used and rejected, framing, warnings
-    verdict = Name("verdict.json")  # stages.sfm.verdict: a grade, problems and what to do, and what is known of each photograph
+    verdict = Name("verdict.json")  # stages.verdict.verdict: a grade, problems and what to do, and what is known of each photograph
     contact_sheet = Name("contact_sheet.png")
     silhouettes = Name("silhouettes.png")  # those that were made of the foreground, over the photographs
     cameras = Name("cameras.png")  # from above and from the side

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
-
-import numpy as np
 
 from efficientnerf.capture.forward_facing import ForwardFacing
 from efficientnerf.model import Model
@@ -14,7 +13,7 @@ from pipeline.stage import Job
 from stages.artifacts import BakeInputs, inputs_of
 from stages.bake.settings import BakeSettings
 from stages.framing.captured import captured_metadata
-from stages.io.scene import Scene
+from stages.io.scene import Scene, similarity_to_json
 
 
 def sources_of(job: Job) -> dict[str, str]:
@@ -29,20 +28,9 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:
         tool = version("efficientnerf")
     except PackageNotFoundError:
         tool = "unknown"
-    similarity, orbit = s.world_from_capture, s.orbit
     return {
-        "world_from_capture": {
-            "scale": float(similarity.scale),
-            "rotation": np.asarray(similarity.rotation, np.float64).tolist(),
-            "translation": np.asarray(similarity.translation, np.float64).tolist(),
-        },
-        "orbit": {
-            "centre": [float(x) for x in orbit.centre],
-            "radius": float(orbit.radius),
-            "elevation": float(orbit.elevation),
-            "forward_facing": bool(orbit.forward_facing),
-            "heading": float(orbit.heading),
-        },
+        "world_from_capture": similarity_to_json(s.world_from_capture),
+        "orbit": asdict(s.orbit),
         "captured_path": captured_metadata([view.camera for view in s.views]),
         "metric": bool(s.metric),
         **({} if s.forward is None else {"spiral": spiral_of(s.forward)}),

@@ -35,12 +35,12 @@ from stages.bake.refine.timing import Stopwatch
 from stages.bake.settings import refuse_nerf
 from stages.bake.values import baked_tree
 from stages.bake.voxels import Voxels, choose_voxels
-from stages.bake.whole_scene import bounds_are_given
 from stages.compiling import compiling_kernels
 from stages.cores import count_cores, use_all_cores
 from stages.io import scene
 from stages.io.field_file import load_renderer
 from stages.io.refined_cameras import load_scene
+from stages.reports import bounds_are_given
 from stages.scratch import note, noted
 from stages.train.data import pixels_of
 

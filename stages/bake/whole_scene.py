@@ -30,16 +30,14 @@ from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_foreground
 from efficientnerf.model import Model
 from efficientnerf.training.pixels import Pixels
-from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs
 from stages.bake.plan import SceneBake, nested_grids
 from stages.bake.resolution import MAX_BEYOND, finest_of_cascades
 from stages.bake.scratch import rendered_once
 from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
 from stages.io import scene
-from stages.io.json_file import read_json
 from stages.io.scene import Scene
+from stages.reports import bounds_are_given
 from stages.train.priors import filled_points
 
 # Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned
@@ -143,15 +141,6 @@ def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> R
     return Region(np.asarray(s.bounds, np.float64)) if found is None else found
 
 
-def bounds_are_given(poses: Path) -> bool:
-    """Whether the scene bounds of an artifact of the stage poses are a box given by hand, by its report."""
-    path = PosesOutputs(poses).report
-    try:
-        report = read_json(path, "Run the poses stage again.") if path.is_file() else {}
-    except BadInput as error:
-        raise CorruptArtifact(str(error)) from error
-    framing = report.get("framing") if isinstance(report, dict) else None
-    return isinstance(framing, dict) and framing.get("bounds_from") == "given"
 
 
 def fits(samples: FieldSamples, pixels: Pixels) -> bool:

@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.files import Unreadable, read_json, write_json
+from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
 from stages.bake.refine.refinement import usual_steps
@@ -22,8 +22,9 @@ from stages.evaluate.trivial import equivalent_blur
 from stages.evaluate.views import constant_background, evenly_spaced, ground_truth
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, views_of
+from stages.reports import BakeReport, CameraVerdict, read_report
 from stages.train.averaged import Taken
-from stages.verdict.result import ResultVerdict, camera_verdict_of, verdict_on_result
+from stages.verdict.result import ResultVerdict, verdict_on_result
 
 TRAINING_VIEWS = 4  # that the asset is compared with, evenly spaced: enough to tell an overfit asset
 
@@ -54,24 +55,16 @@ def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job, taken: Taken
 
 def judge(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints | None, metrics: Mapping[str, Any], job: Job) -> ResultVerdict:
     """Write the verdict on a result and the picture of its sparse points; report it, with a warning for each problem."""
-    outputs = EvaluateOutputs(job.out)
+    outputs, cameras = EvaluateOutputs(job.out), PosesOutputs(job.inputs[PosesOutputs.stage]).verdict
     if points is not None:
         _draw(asset, scene, views, points, metrics, job)
-    found = verdict_on_result(metrics, camera_verdict_of(_read(job)))
+    found = verdict_on_result(metrics, read_report(cameras, CameraVerdict) if cameras.is_file() else None)
     write_json(outputs.verdict, found.document())
     job.say(found.summary(), grade=found.grade)
     for problem in found.problems:
         if problem.grade != "good":
             job.warn(problem.text())
     return found
-
-
-def _read(job: Job) -> Any:
-    """The verdict on the cameras; None where there is none."""
-    try:
-        return read_json(PosesOutputs(job.inputs[PosesOutputs.stage]).verdict)
-    except (OSError, Unreadable):
-        return None
 
 
 def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: ReliablePoints, metrics: Mapping[str, Any], job: Job) -> None:
@@ -89,7 +82,7 @@ def _draw(asset: EvaluatedAsset, scene: Scene, views: Sequence[View], points: Re
 def refinement_of(bake: BakeOutputs) -> dict[str, int]:
     """Steps that were taken, and the least that are usual for so many voxels and rays a step: a poor figure for want of steps needs no other
     remedy."""
-    report = read_json(bake.report)
+    report = read_report(bake.report, BakeReport)
     last = json.loads(bake.log.read_text(encoding="utf-8").splitlines()[-1])
     rays = last["rays"] or BakeSettings().refine_rays_per_batch  # 0: there was no step
-    return {"steps": report["optimisation"]["steps"], "usual_steps": usual_steps(report["voxels"], rays, 0 if "cascades" in report else None)}
+    return {"steps": report.optimisation.steps, "usual_steps": usual_steps(report.voxels, rays, None if report.cascades is None else 0)}

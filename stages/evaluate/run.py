@@ -32,7 +32,7 @@ from efficientnerf.asset import format
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.settings import resolved
-from pipeline.files import read_json, write_json
+from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of
 from stages.compiling import compiling_kernels
@@ -56,6 +56,7 @@ from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import View
 from stages.memory.need import refuse_what_does_not_fit
+from stages.reports import RegionReport, read_report
 from stages.scratch import note, noted, once
 from stages.train.averaged import as_taken
 
@@ -75,7 +76,7 @@ def run(job: Job) -> None:
 
     tree = format.load(inputs.bake.asset).to(job.device)
     refuse_what_does_not_fit(job, needed(tree, job.settings, inputs, job.device), "Lower poses.max_image_size or bake.max_mib.")
-    region = read_json(inputs.mesh.report).get("region", "foreground")
+    region = read_report(inputs.mesh.report, RegionReport).region
     evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree), refinement_of(inputs.bake))
 
 

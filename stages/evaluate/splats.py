@@ -12,7 +12,6 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.rendering import render
-from pipeline.files import read_json
 from stages.artifacts import SplatsOutputs
 from stages.evaluate.asset import EvaluatedAsset
 from stages.evaluate.mesh import MAX_PSNR
@@ -21,6 +20,7 @@ from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import source_frame
 from stages.io.scene import Scene, View
+from stages.reports import RegionReport, read_report
 
 FIGURES = ("psnr", "ssim")
 
@@ -39,7 +39,7 @@ class EvaluatedSplats:
 
 def load_splats(outputs: SplatsOutputs, tree: NerfTree) -> EvaluatedSplats | None:
     """The Gaussians of a run, from the file that others read; None where it made none of all that the asset shows. Raises CorruptArtifact."""
-    if not outputs.ply.is_file() or read_json(outputs.report).get("region") != "all":
+    if not outputs.ply.is_file() or read_report(outputs.report, RegionReport).region != "all":
         return None
     gaussians = moved(read_splats(outputs.ply), source_frame(tree.metadata).world_from_capture)
     facts = {"gaussians": len(gaussians), "ply_bytes": outputs.ply.stat().st_size}

@@ -12,16 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from efficientnerf.geometry.cameras import Similarity, closest_similarity
-from stages.io.capture import Capture
+from stages.io.capture import Alignment, Capture
 from stages.io.photo import read_gps_position
 from stages.io.pictures import UnreadableImage
 
 FEWEST = 6  # photographs with a position
 ROUNDS = 20
 SCALE, UP = 0.1, 0.03  # median distance to the positions over their extent, up to which the scale (or a stated frame) and the upward axis are taken from them
-STATED = "stated_cameras"  # fact of a capture
 FLAT = 0.1  # extent across the longest line through the cameras, over that along it: below, they turn about it freely
 _A, _F = 6378137.0, 1 / 298.257223563  # WGS 84: semi-major axis in metres, flattening
 
@@ -65,18 +65,18 @@ def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]
     if not positions:
         return capture, ""
     if len(positions) < max(FEWEST, len(capture.photos) / 2):
-        return _with_facts(capture, {"photographs": len(positions), "used": "nothing"}), ""
+        return _with(capture, gps=Alignment(photographs=len(positions), used="nothing")), ""
     places = enu_from_gps(np.array([positions[photo.camera.name] for photo in capture.photos if photo.camera.name in positions]))
     aligned, distance, extent, straight = _aligned(capture, [*positions], places)
-    facts: dict[str, object] = {"photographs": len(positions), "extent": round(extent, 3), "distance": round(distance, 3)}
+    found = Alignment(photographs=len(positions), extent=round(extent, 3), distance=round(distance, 3), used="nothing")
     if not distance <= SCALE * extent or aligned.scale <= 0:
-        return _with_facts(capture, facts | {"used": "nothing"}), ""
+        return _with(capture, gps=found), ""
     words = f"{len(positions)} of {len(capture.photos)} photographs have a GPS position, {distance:.2g} m from the cameras found in the median"
     if distance > UP * extent or straight:
         scaled = Similarity(aligned.scale, np.eye(3), np.zeros(3))
-        return _moved(_with_facts(capture, facts | {"used": "scale"}), scaled), f"{words}: the scale is taken from them."
+        return _moved(_with(capture, gps=structs.replace(found, used="scale")), scaled), f"{words}: the scale is taken from them."
     moved = replace(_moved(capture, aligned), up=np.array([0.0, 0.0, 1.0]))
-    return _with_facts(moved, facts | {"used": "scale and up"}), f"{words}: scale and upward axis are taken from them."
+    return _with(moved, gps=structs.replace(found, used="scale and up")), f"{words}: scale and upward axis are taken from them."
 
 
 def with_stated_cameras(capture: Capture, stated: Capture) -> tuple[Capture, str]:
@@ -85,16 +85,17 @@ def with_stated_cameras(capture: Capture, stated: Capture) -> tuple[Capture, str
     names = [photo.camera.name for photo in capture.photos if photo.camera.name in places]
     words = f"the source states cameras of {len(names)} of the {len(capture.photos)} photographs ({stated.kind})"
     if len(names) < max(FEWEST, len(capture.photos) / 2):
-        return _with_facts(capture, {"photographs": len(names), "used": "nothing"}, STATED), f"{words}: too few to be used."
+        return _with(capture, stated_cameras=Alignment(photographs=len(names), used="nothing")), f"{words}: too few to be used."
     aligned, distance, extent, straight = _aligned(capture, names, np.array([places[name] for name in names]))
-    facts: dict[str, object] = {"photographs": len(names), "extent": round(extent, 6), "distance": round(distance, 6), "used": "nothing"}
+    found = Alignment(photographs=len(names), extent=round(extent, 6), distance=round(distance, 6), used="nothing")
     if not distance <= SCALE * extent or aligned.scale <= 0:
         share = f"{distance / extent:.0%} of their extent" if extent > 0 else "they lie in one place"
-        return _with_facts(capture, facts, STATED), f"{words}, but not where they were found ({share} apart in the median): they are not used."
+        return _with(capture, stated_cameras=found), f"{words}, but not where they were found ({share} apart in the median): they are not used."
     if straight:
-        return _with_facts(capture, facts, STATED), f"{words}, along a line, which they may turn about: they are not used."
+        return _with(capture, stated_cameras=found), f"{words}, along a line, which they may turn about: they are not used."
     moved = replace(_moved(capture, aligned), up=stated.up, metric=stated.metric)
-    return _with_facts(moved, facts | {"used": "frame"}, STATED), f"{words}: their frame and scale are kept, {distance / extent:.2%} of their extent apart."
+    moved = _with(moved, stated_cameras=structs.replace(found, used="frame"))
+    return moved, f"{words}: their frame and scale are kept, {distance / extent:.2%} of their extent apart."
 
 
 def _aligned(capture: Capture, names: Sequence[str], places: np.ndarray) -> tuple[Similarity, float, float, bool]:
@@ -114,5 +115,5 @@ def _moved(capture: Capture, similarity: Similarity) -> Capture:
     return replace(capture, photos=photos, points=points, metric=True)
 
 
-def _with_facts(capture: Capture, facts: Mapping[str, object], name: str = "gps") -> Capture:
-    return replace(capture, facts={**capture.facts, name: dict(facts)})
+def _with(capture: Capture, **known: Alignment) -> Capture:
+    return replace(capture, provenance=structs.replace(capture.provenance, **known))

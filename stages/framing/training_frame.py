@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -36,6 +35,7 @@ class TrainingFrame:
     near_far_planes     (C, 2) of each photo, along the view axis, training frame
     space               "box", "contracted" or "ndc"
     forward             the forward-facing scene, for ndc alone
+    silhouettes_cut     names of the photographs whose silhouettes reach out of the bounds
     facts               how each was found, for the report
     """
 
@@ -45,7 +45,8 @@ class TrainingFrame:
     near_far_planes: np.ndarray
     space: str
     forward: ForwardFacing | None
-    facts: dict[str, Any]
+    silhouettes_cut: tuple[str, ...]
+    facts: dict[str, object]
 
 
 def find_training_frame(
@@ -87,7 +88,7 @@ def find_training_frame(
     bounds = np.stack([-half, half]) * scale
     placed = [world.camera(camera) for camera in cameras]
     orbit = orbit_of(placed, np.clip(world.points(focus), *bounds))
-    facts: dict[str, Any] = {
+    facts: dict[str, object] = {
         "up": [round(float(c), 6) for c in upward],
         "up_from": "given" if up != "auto" else "stated by the source" if capture.up is not None else "estimated from the cameras",
         "bounds_from": how,
@@ -99,7 +100,7 @@ def find_training_frame(
     space, forward, facts["space_from"] = space_of(capture, placed, world, space)
     facts["space"] = space
     planes = near_far_planes(capture, placed, world, bounds, world.points(focus) if converging else None)
-    return TrainingFrame(world, bounds, orbit, planes, space, forward, facts)
+    return TrainingFrame(world, bounds, orbit, planes, space, forward, cut, facts)
 
 
 def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choice: str) -> tuple[str, ForwardFacing | None, str]:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
 
 from efficientnerf.geometry.cameras import Camera
 
-# A fact of photographs whose background stands still while the subject turns: whether cameras were found without it.
-BACKGROUND, LEFT_OUT, SEEN = "background", "left out", "stands still"
 FOREGROUND = "foreground"  # a fact of photographs with silhouettes of it: how sure they are
+Lens = Literal["zoomed", "cropped"]
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,36 @@ class SparsePoints:
     tracks: tuple[tuple[int, ...], ...]
 
 
+class Alignment(Struct, frozen=True, omit_defaults=True, kw_only=True):
+    """Cameras that were found, against positions that are known of so many photographs."""
+
+    photographs: int
+    extent: float | None = None  # of the positions, metres
+    distance: float | None = None  # of the cameras from them, median, metres
+    used: Literal["nothing", "scale", "scale and up", "frame"]  # of the positions
+
+
+class Provenance(Struct, frozen=True, omit_defaults=True):
+    """How the cameras of photographs were found. report.json has it without what is not known."""
+
+    photographs: int | None = None
+    registered: int | None = None
+    points: int | None = None
+    triangulation_angle: float | None = None
+    pairs_agreeing: float | None = None  # share of the verified matches that agree with the cameras
+    matching: str | None = None  # the pairs that were matched, as the setting has it
+    components: list[int] | None = None  # photographs of each group that overlaps with no other, the largest first
+    models: list[int] | None = None  # photographs of each sub-model that adds to the first
+    rungs: list[dict[str, object]] | None = None  # `stages.sfm.attempts.Search`
+    planar_pairs: float | UnsetType | None = UNSET  # share of the pairs whose matches one homography explains; None: there are no pairs
+    lens: Lens | None = None  # photographs that were zoomed have a focal length each, cropped ones a principal point
+    own_intrinsics: str | UnsetType | None = UNSET  # which each photograph has of its own (`stages.sfm.intrinsics.own`), if any
+    moving_parts: dict[str, float] = {}  # name of a photograph -> share of it that moves
+    background: Literal["left out", "stands still"] | None = None  # of a subject that turns
+    stated_cameras: Alignment | None = None
+    gps: Alignment | None = None
+
+
 @dataclass(frozen=True)
 class Capture:
     """A source, read.
@@ -84,6 +115,8 @@ class Capture:
     warnings    sentences for the user
     reprojection_error  mean, pixels, where known
     metric      whether a unit of the capture's frame is known to be a metre
+    facts       what the format states besides; the report repeats it, nothing follows from it
+    provenance  how the cameras were found, of photographs that state none
     overlaps    (name, name, verified matches) of pairs of photographs, registered or not, where they were compared
     """
 
@@ -99,6 +132,7 @@ class Capture:
     reprojection_error: float | None = None
     metric: bool = False
     facts: dict[str, object] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
     rejected_files: dict[str, Path] = field(default_factory=dict)
     overlaps: tuple[tuple[str, str, int], ...] = ()
 

@@ -17,9 +17,8 @@ from pipeline.files import write_json
 from pipeline.text import printable
 from stages.artifacts import TrainOutputs
 from stages.io import scene
-from stages.io.json_file import read_json
 from stages.io.scene import Scene, View, camera_from, camera_to_json
-from stages.io.scene_schema import CameraDocument, decoded
+from stages.io.scene_schema import CameraDocument, read_document
 from stages.train import choices
 
 FORMAT = 1
@@ -45,7 +44,7 @@ def load_scene(poses: Path, train: Path) -> Scene:
     found, path = choices.load(train).scene(scene.load(poses)), TrainOutputs(train).cameras
     if not path.is_file():
         return found
-    document = decoded(read_json(path, AGAIN), RefinedDocument, path, AGAIN)
+    document = read_document(path, RefinedDocument, AGAIN)
     known = {view.image: view for view in found.views}
     if not known.keys() >= set(document.left_out):
         raise CorruptArtifact(f"{printable(path)}: views are left out that this scene has not. {AGAIN}")

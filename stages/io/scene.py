@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +31,9 @@ from pipeline.files import is_safe_name, write_json
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import SparsePoints
-from stages.io.json_file import read_json
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha
-from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded
+from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded, json_of_run
+from stages.reports import poses_report
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
@@ -148,18 +148,8 @@ def save(scene: Scene, folder: Path) -> None:
         "up": list(scene.up),
         "bounds": scene.bounds.tolist(),
         "background": scene.background,
-        "world_from_capture": {
-            "scale": scene.world_from_capture.scale,
-            "rotation": scene.world_from_capture.rotation.tolist(),
-            "translation": scene.world_from_capture.translation.tolist(),
-        },
-        "orbit": {
-            "centre": list(scene.orbit.centre),
-            "radius": scene.orbit.radius,
-            "elevation": scene.orbit.elevation,
-            "forward_facing": scene.orbit.forward_facing,
-            "heading": scene.orbit.heading,
-        },
+        "world_from_capture": similarity_to_json(scene.world_from_capture),
+        "orbit": asdict(scene.orbit),
         "points": scene.points,
         "metric": scene.metric,
         "space": scene.space,
@@ -174,7 +164,7 @@ def load(folder: Path) -> Scene:
     path = PosesOutputs(folder).scene
     if not path.is_file():
         raise BadInput(f"{printable(path)}: no such file. Run the poses stage first.")
-    found = _json_of_run(path)
+    found = json_of_run(path, AGAIN)
     version = found.get("format") if isinstance(found, dict) else None
     if type(version) is int and version > FORMAT:
         newer = str(version) if version < 10**6 else "of many digits"
@@ -183,14 +173,6 @@ def load(folder: Path) -> Scene:
         return _scene_from(decoded(found, SceneDocument, path, AGAIN))
     except ValueError as error:
         raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {AGAIN}") from error
-
-
-def _json_of_run(path: Path) -> Any:
-    """The value in a file that a stage wrote; CorruptArtifact where it is damaged."""
-    try:
-        return read_json(path, AGAIN)
-    except BadInput as error:
-        raise CorruptArtifact(str(error)) from error
 
 
 def _scene_from(document: SceneDocument) -> Scene:
@@ -326,21 +308,10 @@ def describe(folder: Path) -> dict[str, Any]:
         "masks": sum(view.mask is not None for view in scene.views),
         "points": len(read_observations(folder)[0]) if scene.points else 0,
         "metric": scene.metric,
-        "world_from_capture": {
-            "scale": scene.world_from_capture.scale,
-            "rotation": scene.world_from_capture.rotation.tolist(),
-            "translation": scene.world_from_capture.translation.tolist(),
-        },
-        "warnings": _report_warnings(folder),
+        "world_from_capture": similarity_to_json(scene.world_from_capture),
+        "warnings": [printable(sentence, 1000) for sentence in poses_report(folder).warnings or ()],
         "cameras": cameras,
     }
-
-
-def _report_warnings(folder: Path) -> list[str]:
-    path = PosesOutputs(folder).report
-    report = _json_of_run(path) if path.is_file() else {}
-    found = report.get("warnings", []) if isinstance(report, dict) else []
-    return [printable(sentence, 1000) for sentence in found if isinstance(sentence, str)] if isinstance(found, list) else []
 
 
 def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:
@@ -364,6 +335,11 @@ def _forward_from(document: SceneDocument) -> ForwardFacing | None:
     if min([forward.far - forward.ndc.near, forward.focus, *forward.tangents, *(forward.bounds[1] - forward.bounds[0])]) <= 0:
         raise ValueError("forward: no box before the reference camera")
     return forward
+
+
+def similarity_to_json(similarity: Similarity) -> dict[str, Any]:
+    """A similarity as JSON holds it."""
+    return {"scale": float(similarity.scale), "rotation": similarity.rotation.tolist(), "translation": similarity.translation.tolist()}
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
-from pipeline.errors import CorruptArtifact
+from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.text import printable
+from stages.io.json_file import read_json
 
 LARGEST = 1e15  # of any number: beyond it squares lose all that they are compared with
 
@@ -86,9 +87,22 @@ class SceneDocument(Struct):
 T = TypeVar("T")
 
 
+def json_of_run(path: Path, remedy: str) -> Any:
+    """The value in a file that a stage wrote; CorruptArtifact where it is damaged."""
+    try:
+        return read_json(path, remedy)
+    except BadInput as error:
+        raise CorruptArtifact(str(error)) from error
+
+
+def read_document(path: Path, kind: type[T], remedy: str) -> T:
+    """The file that a stage wrote, as `kind`. Raises CorruptArtifact."""
+    return decoded(json_of_run(path, remedy), kind, path, remedy)
+
+
 def decoded(document: Any, kind: type[T], path: Path, remedy: str) -> T:
     """`document`, out of a JSON file, as `kind`; CorruptArtifact names the place that does not fit."""
     try:
         return msgspec.convert(document, kind)
-    except (msgspec.ValidationError, RecursionError) as error:
+    except (msgspec.ValidationError, UnicodeEncodeError, RecursionError) as error:
         raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {remedy}") from error

@@ -8,14 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from efficientnerf.settings import resolved
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.cores import count_cores
 from stages.formats.importers import IMPORTERS, posed_format
-from stages.framing.gps import STATED, with_gps, with_stated_cameras
+from stages.framing.gps import with_gps, with_stated_cameras
 from stages.framing.mask_use import MIN_AGREEING, share_that_fits
-from stages.io.capture import BACKGROUND, FOREGROUND, LEFT_OUT, SEEN, Capture, Silhouettes
+from stages.io.capture import FOREGROUND, Capture, Provenance, Silhouettes
 from stages.io.material import photographs_of
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.reader import PhotoReader
@@ -46,7 +48,7 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     if capture is None:
         capture = _by_masks(job, find, paths, masks, given.inverted, reader)
     if seen:
-        capture = replace(capture, facts={**capture.facts, BACKGROUND: SEEN})
+        capture = replace(capture, provenance=structs.replace(capture.provenance, background="stands still"))
     capture, sentences = _in_known_frame(job, capture, paths)
     for sentence in sentences:
         job.say(sentence)
@@ -64,8 +66,8 @@ def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tu
             said.append(sentence)
         except BadInput as error:
             said.append(f"the cameras that the source states cannot be read, and are not used: {error}")
-        facts = capture.facts.get(STATED)
-        if isinstance(facts, dict) and facts["used"] != "nothing":
+        stated = capture.provenance.stated_cameras
+        if stated is not None and stated.used != "nothing":
             return capture, said
     capture, sentence = with_gps(capture, paths)
     return capture, [*said, sentence] if sentence else said
@@ -75,7 +77,7 @@ def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[st
     """The capture of photographs with these masks; with the inverted ones in their place where these are silhouettes of one thing."""
 
     def search(masks: Mapping[str, Path]) -> Capture:
-        kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, {}), reader, job.safe_point)
+        kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, Provenance()), reader, job.safe_point)
         # Alpha channels leave pixels out where these are no silhouettes.
         return _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths), reader) if kind else find("cameras", masks)
 
@@ -115,9 +117,9 @@ def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, 
     return made_masks(paths, job.settings.mask_from, job.work / "masks", **common)
 
 
-def mask_choice(settings: Any, facts: Mapping[str, object]) -> str:
+def mask_choice(settings: Any, provenance: Provenance) -> str:
     """The meaning of masks: those made of a background, or by a network, are silhouettes."""
-    made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or facts.get(BACKGROUND) == LEFT_OUT
+    made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or provenance.background == "left out"
     return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
 
 
@@ -179,12 +181,12 @@ def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path], reader:
             if turn(whole.photos) >= LEAST_TURN and _explained(whole) > _explained(alone):
                 job.say("all of the picture explains more than the subject alone, and is used")
                 return whole, False
-    return replace(alone, facts={**alone.facts, BACKGROUND: LEFT_OUT}), False
+    return replace(alone, provenance=structs.replace(alone.provenance, background="left out")), False
 
 
 def _explained(capture: Capture) -> float:
     """Photographs with a camera, times the share of the matches that agree: a background that stands still contradicts cameras that move."""
-    return len(capture.photos) * float(capture.facts["pairs_agreeing"])  # type: ignore[arg-type]
+    return len(capture.photos) * (capture.provenance.pairs_agreeing or 0.0)
 
 
 def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None], reader: PhotoReader) -> Capture:

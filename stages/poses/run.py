@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import to_builtins
 
 from efficientnerf.geometry.cameras import resized
 from efficientnerf.settings import resolved
@@ -26,7 +27,7 @@ from stages.figures.contact_sheet import write_contact_sheet
 from stages.formats import importers
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
 from stages.framing import training_frame
-from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
+from stages.framing.mask_use import MaskUse, doubts, find_mask_use, points_of_object, without_silhouette
 from stages.io import working_images
 from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
 from stages.io.pictures import UnreadableImage
@@ -58,14 +59,15 @@ def run(job: Job) -> None:
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
     refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
-    capture, mask_facts = with_mask_use(job, capture, reader, warn)
+    capture, use = with_mask_use(job, capture, reader, warn)
     capture, written = _write_images(job, capture, warn)
     judged = capture  # by all sparse points that its cameras were found with
     capture = with_points_of_object(capture, reader)
     framed = training_frame.find_training_frame(
         capture, up=settings.up, box=resolved(settings.crop_box), margin=settings.box_margin, space=settings.space, reader=reader
     )
-    _say_what_is_cut(framed.facts.get("silhouettes_cut", ()), warn)
+    if names := framed.silhouettes_cut:
+        warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = _views(capture, written, splits, framed)
@@ -85,7 +87,7 @@ def run(job: Job) -> None:
     )
     save(scene, job.out)
     judge(job, judged, scene, _may_be_renders(capture), warn)
-    _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
+    _write_report(PosesOutputs(job.out).report, capture, scene, framed, use, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
@@ -105,11 +107,6 @@ def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], fram
         )
         for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far_planes, strict=True)
     )
-
-
-def _say_what_is_cut(names: Sequence[str], warn: Any) -> None:
-    if names:
-        warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
 
 
 def read(job: Job, settings: PosesSettings, reader: PhotoReader, warn: Any) -> Capture:
@@ -153,10 +150,10 @@ def _format_of(capture: Capture) -> str:
     return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
 
 
-def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) -> tuple[Capture, dict[str, object]]:
-    """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
+def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) -> tuple[Capture, MaskUse]:
+    """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and that meaning."""
     renders = _may_be_renders(capture)
-    use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, reader, job.safe_point)
+    use = find_mask_use(capture, mask_choice(job.settings, capture.provenance), renders, reader, job.safe_point)
     for sentence in use.sentences:
         job.say(sentence)
     for sentence in doubts(use):
@@ -167,8 +164,8 @@ def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) ->
     kept = [index for index, photo in enumerate(capture.photos) if photo.camera.name not in names]
     capture = without(capture, kept, [(name, "has no silhouette, and the others do") for name in sorted(names)])
     if not use.silhouettes:
-        return replace(capture, background=None), use.facts
-    return replace(capture, background=WHITE, silhouettes=use.silhouettes), use.facts
+        return replace(capture, background=None), use
+    return replace(capture, background=WHITE, silhouettes=use.silhouettes), use
 
 
 def with_points_of_object(capture: Capture, reader: PhotoReader) -> Capture:
@@ -242,7 +239,7 @@ def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: 
     return ["test" if index in test else "train" for index in range(len(photos))]
 
 
-def _write_report(path: Path, capture: Capture, scene: Scene, facts: dict[str, dict[str, object]], notes: Sequence[str]) -> None:
+def _write_report(path: Path, capture: Capture, scene: Scene, framed: training_frame.TrainingFrame, use: MaskUse, notes: Sequence[str]) -> None:
     """Images used and rejected, splits, facts and warnings."""
     report = {
         "kind": capture.kind,
@@ -255,8 +252,9 @@ def _write_report(path: Path, capture: Capture, scene: Scene, facts: dict[str, d
         "reprojection_error": capture.reprojection_error,
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "background": capture.background,
-        **facts,
-        "facts": capture.facts,
+        "framing": framed.facts,
+        "masks": use.facts,
+        "facts": to_builtins(capture.provenance) | capture.facts,
         "warnings": list(notes),
     }
     write_json(path, report, default=str)

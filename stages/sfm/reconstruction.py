@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Unpack
 
+from msgspec import structs
+
 from pipeline.files import remove
 from stages.cores import count_cores
 from stages.io.capture import Capture
@@ -26,7 +28,6 @@ from stages.sfm.images import Callables, prepare_images
 from stages.sfm.intrinsics.own import with_own_intrinsics
 from stages.sfm.mapping import DEFAULTS, FORWARD, RELAXED
 from stages.sfm.pairs import matching_for
-from stages.verdict.verdict import MOVING, OWN_INTRINSICS
 
 # What is tried after the mapper's first run, in order, where its condition holds; a result is kept where it is better than those before it.
 #
@@ -99,18 +100,18 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
     rejected = [*unreadable, *result.unregistered(search)]
     if mapping.num_registered(search.models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
         raise result.not_found(r.folder, r.paths, search, rejected, matching)
-    facts = result.facts_of_matching(search, matching)
+    provenance = result.provenance_of(search, matching)
 
     # Bundle adjustment with a robust loss; then intrinsics for each photograph, where they explain what they were not fitted to.
     model = search.models[0]
     if search.best != CROPPED:
         model = mapping.bundle_adjusted(search.work, images, model, safe_point)
     if search.best not in (EACH, CROPPED):
-        model, facts[OWN_INTRINSICS] = with_own_intrinsics(images, model, safe_point)
+        model, own = with_own_intrinsics(images, model, safe_point)
+        provenance = structs.replace(provenance, own_intrinsics=own)
 
-    if moving := mapping.moving_shares(search.work, images, model, safe_point):
-        facts[MOVING] = moving
-    capture = result.capture_of(search, model, r.paths, r.masks, rejected, facts)
+    provenance = structs.replace(provenance, moving_parts=mapping.moving_shares(search.work, images, model, safe_point))
+    capture = result.capture_of(search, model, r.paths, r.masks, rejected, provenance)
     for sentence in capture.warnings:
         callables["warn"](sentence)
     return capture

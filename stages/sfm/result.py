@@ -9,32 +9,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from stages.formats.importers.source import abbreviated
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import Capture, Lens, Photo, Provenance, SparsePoints
 from stages.sfm import mapping
-from stages.sfm.attempts import CROPPED as OWN_PRINCIPAL_POINT
-from stages.sfm.attempts import EACH, Search
+from stages.sfm.attempts import CROPPED, EACH, Search
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import WorkImage, database_path, inlier_counts, neighbours, planar_share
 from stages.sfm.images import Masks
 from stages.sfm.pairs import components
 from stages.verdict.looks import look_at_all
 from stages.verdict.parallax import parallax
-from stages.verdict.verdict import CROPPED, LENS, WITHOUT_TEXTURE, ZOOMED, failed
+from stages.verdict.verdict import WITHOUT_TEXTURE, failed
 
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
 FEW_FEATURES = 50  # of a photograph, below which it has too little detail
-OWN_LENSES = {EACH: ZOOMED, OWN_PRINCIPAL_POINT: CROPPED}  # by attempt
+OWN_LENSES: dict[str, Lens] = {EACH: "zoomed", CROPPED: "cropped"}  # by attempt
 OTHER_FOCAL = 1.2  # times a focal length: that of another lens
 MAX_NAMES = 8  # photographs that an error lists by name
 Rejected = Sequence[tuple[str, str]]  # name and reason of each
 
 
-def capture_of(search: Search, model: Any, paths: Mapping[str, Path], masks: Masks, rejected: Rejected, facts: Mapping[str, object]) -> Capture:
+def capture_of(search: Search, model: Any, paths: Mapping[str, Path], masks: Masks, rejected: Rejected, found: Provenance) -> Capture:
     """The capture of a model that was adjusted, of the photographs of a search."""
     by_file = {image.file: image for image in search.images}
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
@@ -45,13 +45,8 @@ def capture_of(search: Search, model: Any, paths: Mapping[str, Path], masks: Mas
     )
     points = _points(model, {image.image_id: i for i, image in enumerate(registered)})
     agreement = mapping.match_agreement(search.work, model)
-    of_cameras: dict[str, object] = {
-        "photographs": len(search.images),
-        "registered": len(photos),
-        "points": len(points.xyz),
-        "triangulation_angle": round(parallax(points, photos).angle, 3),
-        "pairs_agreeing": round(agreement, 4),
-    }
+    angle = round(parallax(points, photos).angle, 3)
+    counts = {"photographs": len(search.images), "registered": len(photos), "points": len(points.xyz)}
     warnings = _model_warnings(photos, points, agreement, [source.focal for source in sources])
     if rejected:
         which = abbreviated([name for name, _ in rejected], MAX_NAMES)
@@ -64,22 +59,22 @@ def capture_of(search: Search, model: Any, paths: Mapping[str, Path], masks: Mas
         rejected=tuple(rejected),
         warnings=tuple(warnings),
         reprojection_error=float(model.compute_mean_reprojection_error()),
-        facts=of_cameras | dict(facts),
+        provenance=structs.replace(found, **counts, triangulation_angle=angle, pairs_agreeing=round(agreement, 4)),
         overlaps=_overlaps(search.work, search.images),
     )
 
 
-def facts_of_matching(search: Search, matching: str) -> dict[str, object]:
+def provenance_of(search: Search, matching: str) -> Provenance:
     """How the photographs were matched, the sizes of the components of overlap and of the sub-models that add to the first, and the attempts."""
     parts = [{image.name for image in model.images.values() if image.has_pose} for model in search.models]
-    return {
-        "matching": matching,
-        "components": [len(part) for part in components(neighbours(search.work, len(search.images)))],
-        "models": [len(part) for part in parts if part is parts[0] or part - parts[0]],
-        "rungs": search.tried,
-        "planar_pairs": planar_share(database_path(search.work)),
-        **({LENS: OWN_LENSES[search.best]} if search.best in OWN_LENSES else {}),
-    }
+    return Provenance(
+        matching=matching,
+        components=[len(part) for part in components(neighbours(search.work, len(search.images)))],
+        models=[len(part) for part in parts if part is parts[0] or part - parts[0]],
+        rungs=search.tried,
+        planar_pairs=planar_share(database_path(search.work)),
+        lens=OWN_LENSES.get(search.best),
+    )
 
 
 def too_few(folder: Path, images: Sequence[WorkImage], unreadable: Rejected) -> BadInput:
@@ -100,7 +95,7 @@ def not_found(folder: Path, paths: Mapping[str, Path], search: Search, rejected:
     fewest = max(mapping.MIN_MODEL_SIZE, -(-len(images) // 2))
     what = f"cameras found for {registered} of {len(images)} photographs; at least {fewest} are needed."
     looks = look_at_all({image.name: search.base / "images" / image.file for image in images}, paths)
-    verdict = failed(what, "; ".join(hints), registered, rejected, looks, facts_of_matching(search, matching), _overlaps(search.work, images))
+    verdict = failed(what, "; ".join(hints), registered, rejected, looks, provenance_of(search, matching), _overlaps(search.work, images))
     write_json(search.base / VERDICT, {"source": str(folder), **verdict.document()})
     also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")
     return BadInput(

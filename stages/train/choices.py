@@ -15,9 +15,8 @@ import numpy as np
 from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
 from stages.artifacts import TrainOutputs
-from stages.io.json_file import read_json
 from stages.io.scene import Scene
-from stages.io.scene_schema import decoded
+from stages.io.scene_schema import read_document
 
 FORMAT = 1
 AGAIN = "Train again."
@@ -76,4 +75,4 @@ def load(train: Path) -> TrainingChoices:
     path = TrainOutputs(train).choices
     if not path.is_file():
         return TrainingChoices()
-    return decoded(read_json(path, AGAIN), _Document, path, AGAIN).choices
+    return read_document(path, _Document, AGAIN).choices

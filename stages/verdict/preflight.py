@@ -127,7 +127,7 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
         "left_aside": [] if posed else source.warnings(),
         "sizes": sorted({f"{a}x{b}" for a, b in (each.size for each in small.values())}),
         "overlapping": round(_share_in_largest(len(small), overlaps), 3),
-        **_layout(list(small), overlaps),
+        "closed": _is_closed(len(small), overlaps),
         "forecast": about,
     }
     return Verdict(ordered[0].grade if ordered else "good", ordered, figures, {name: each.figures() for name, each in seen.items()})
@@ -208,11 +208,9 @@ def _share_in_largest(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> flo
     return len(_groups(count, overlaps)[0]) / count
 
 
-def _layout(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) -> dict[str, Any]:
-    """What the photographs probably show: one after the other round something, or all of them the same."""
-    if len(names) < 4 or not overlaps:
-        return {"closed": None}
-    return {"closed": any(j - i > len(names) // 2 for i, j in overlaps)}
+def _is_closed(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> bool | None:
+    """Whether the photographs lead round something, one after the other; None where that is not known."""
+    return any(j - i > count // 2 for i, j in overlaps) if count >= 4 and overlaps else None
 
 
 def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) -> list[Problem]:

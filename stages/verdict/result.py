@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
 from stages.evaluate.trivial import BLURS, equivalent_blur
 from stages.formats.importers.source import abbreviated
+from stages.reports import CameraVerdict
 from stages.verdict.grades import GRADES
 
 USABLE_BLUR, POOR_BLUR, FAILED_BLUR = 0.0125, 0.0225, 0.04  # of the longest side: the blur that costs as much, beyond which a result is no better
@@ -62,15 +63,6 @@ class ResultProblem:
     def text(self) -> str:
         """All of it in a line."""
         return f"{self.sentence} {self.cause} {self.remedy} ({self.picture})"
-
-
-@dataclass(frozen=True)
-class CameraVerdict:
-    """Of the verdict on the cameras its grade, and the sentence and the remedy of the worst problem, where it has one."""
-
-    grade: str
-    sentence: str = ""
-    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -227,7 +219,7 @@ def _cause(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: Came
     if gap is not None and gap < LARGE_GAP:
         return "The network had more: it was lost in baking.", "Give the asset more voxels (bake.max_mib) or more steps (bake.refine_steps).", strip
     if cameras is not None and cameras.grade in ("poor", "failed"):
-        return f"The cameras are {cameras.grade}: {cameras.sentence}", cameras.remedy, f"{PosesOutputs.stage}/{PosesOutputs.cameras}"
+        return f"The cameras are {cameras.grade}: {cameras.worst.sentence}", cameras.worst.remedy, f"{PosesOutputs.stage}/{PosesOutputs.cameras}"
     train = figures["train_psnr"]
     if train is not None and train - figures["psnr"] > OVERFIT:
         cause = f"Views that training saw are right ({train:.1f} dB), and others not: too few photographs, cameras that are off, or something that moved."
@@ -350,14 +342,5 @@ def _of_cameras(cameras: CameraVerdict | None) -> list[ResultProblem]:
     if cameras is None or cameras.grade not in ("poor", "failed"):
         return []
     picture = f"{PosesOutputs.stage}/{PosesOutputs.cameras}"
-    sentence = f"The cameras are {cameras.grade}: {cameras.sentence}"
-    return [ResultProblem("cameras", "usable", sentence, "The photographs, as the verdict on the cameras has it.", cameras.remedy, picture)]
-
-
-def camera_verdict_of(document: Any) -> CameraVerdict | None:
-    """Of the document of poses/verdict.json; None where it says nothing that can be read."""
-    if not isinstance(document, dict) or document.get("grade") not in GRADES:
-        return None
-    problems: Sequence[Any] = document.get("problems") or ()
-    worst: Mapping[str, Any] = next((each for each in problems if each.get("grade") == document["grade"]), {})
-    return CameraVerdict(document["grade"], worst.get("sentence", ""), worst.get("remedy", ""))
+    sentence = f"The cameras are {cameras.grade}: {cameras.worst.sentence}"
+    return [ResultProblem("cameras", "usable", sentence, "The photographs, as the verdict on the cameras has it.", cameras.worst.remedy, picture)]

@@ -13,20 +13,20 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from msgspec import to_builtins
 
 from efficientnerf.geometry.cameras import Camera
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
-from stages.io.capture import BACKGROUND, LEFT_OUT, Capture
+from stages.io.capture import Capture, Provenance
 from stages.verdict import looks as looks_of
 from stages.verdict.grades import GRADES
 from stages.verdict.looks import Look
 from stages.verdict.parallax import Parallax, parallax
 
-LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose photographs have focal lengths, or principal points, of their own
-OWN_INTRINSICS = "own_intrinsics"  # fact: which of them each photograph has of its own (`stages.sfm.intrinsics.own`), or None
-MOVING = "moving_parts"  # fact: name of a photograph -> share of it that moves
-# Facts of a capture that stand among the figures.
-FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, OWN_INTRINSICS, "gps", "stated_cameras", BACKGROUND)
+# Of a capture's provenance, that stand among the figures.
+FIGURES = (
+    "matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", "lens", "own_intrinsics", "gps", "stated_cameras", "background",
+)  # fmt: skip
 NEAREST = 3  # registered photographs that are listed for one that is not registered
 FEW = 12  # views all round a subject
 FEW_POINTS = 60  # sparse points of a photograph, below which its pose is doubtful
@@ -113,7 +113,7 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
     names = [photo.camera.name for photo in capture.photos]
     total = max(len(names) + len(capture.rejected), in_folder or 0)
     seen = None if capture.points is None or not any(capture.points.tracks) else parallax(capture.points, capture.photos)
-    counts = points_of_images(capture)
+    counts, provenance = points_of_images(capture), to_builtins(capture.provenance)
     figures: dict[str, Any] = {
         "photographs": total,
         "registered": len(names),
@@ -121,7 +121,7 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
         "triangulation_angle": None if seen is None else round(seen.angle, 2),
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "points_per_image": None if counts is None else float(np.median(counts)),
-        **{key: capture.facts[key] for key in FACTS if key in capture.facts},
+        **{key: provenance[key] for key in FIGURES if key in provenance},
         "sharpness": round(float(np.median([each.sharpness for each in looks.values()])), 3) if looks else None,
     }
     problems = [
@@ -145,14 +145,14 @@ def failed(
     registered: int,
     rejected: Sequence[tuple[str, str]],
     looks: Mapping[str, Look],
-    facts: dict[str, object],
+    provenance: Provenance,
     overlaps: tuple[tuple[str, str, int], ...],
 ) -> Verdict:
     """The verdict on photographs that no cameras were found of."""
-    capture = Capture(kind="photographs", photos=(), background=None, rejected=tuple(rejected), facts=facts, overlaps=overlaps)
+    capture = Capture(kind="photographs", photos=(), background=None, rejected=tuple(rejected), provenance=provenance, overlaps=overlaps)
     others = [*_of_matches(capture, flat=True), *_of_parts(capture), *of_looks(looks), *of_sizes(looks)]
     problems = (Problem("failed", "failed", sentence, remedy, tuple(name for name, _ in rejected)), *others)
-    return Verdict("failed", problems, {"photographs": len(looks), "registered": registered, **facts}, _rows(capture, looks, None))
+    return Verdict("failed", problems, {"photographs": len(looks), "registered": registered, **to_builtins(provenance)}, _rows(capture, looks, None))
 
 
 def _of_registration(capture: Capture, registered: int, total: int, in_folder: int | None) -> list[Problem]:
@@ -184,25 +184,25 @@ def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
         sentence = f"{len(bare)} {words} {WITHOUT_TEXTURE}: {abbreviated(list(bare))}."
         remedy = "Photograph a subject with texture in good light; put a patterned cloth or newspaper under a plain one."
         found.append(Problem("without texture", "poor", sentence, remedy, bare))
-    planar = capture.facts.get("planar_pairs")
+    planar, background = capture.provenance.planar_pairs, capture.provenance.background
     if flat and isinstance(planar, float) and planar > MOST_PLANAR:
         sentence = f"In {planar:.0%} of the pairs one homography explains all matches: the camera only turned on the spot, or all is one flat thing."
         found.append(Problem("one place", "poor", sentence, "Move round the subject between photographs; turning the camera alone shows no depth."))
-    if BACKGROUND in capture.facts:
-        found.append(_of_background(capture.facts[BACKGROUND] == LEFT_OUT))
+    if background is not None:
+        found.append(_of_background(background == "left out"))
     return found
 
 
 def _of_lens(capture: Capture) -> list[Problem]:
     """Of photographs that were found to have focal lengths or principal points of their own, unknown to EXIF data."""
     cameras = [photo.camera for photo in capture.photos]
-    if capture.facts.get(LENS) == ZOOMED:
+    if capture.provenance.lens == "zoomed":
         groups = zooms({camera.name: 1000.0 * camera.intrinsics["fx"] / max(camera.width, camera.height) for camera in cameras})
         rest = tuple(sorted(name for _, names in groups[1:] for name in names))
         words = ", ".join(f"{len(names)} at {focal:.0f} px" for focal, names in groups)
         sentence = f"The zoom changed between photographs (of a longest side of 1000 px {words}); another than most {plural(len(rest), 'have', 'has')}"
         found = Problem("zoom", "good", f"{sentence} {abbreviated(list(rest))}.", "Use one lens at one zoom, and keep EXIF data.", rest)
-    elif capture.facts.get(LENS) == CROPPED:
+    elif capture.provenance.lens == "cropped":
         rest = tuple(camera.name for camera in cameras if _off_middle(camera) > OFF_MIDDLE)
         sentence = f"{len(rest)} {plural(len(rest), 'photographs were', 'photograph was')} cropped: what the lens looks at is not in the middle of"
         found = Problem("cropped", "good", f"{sentence} {abbreviated(list(rest))}.", "Give the photographs as they were taken.", rest)
@@ -213,11 +213,10 @@ def _of_lens(capture: Capture) -> list[Problem]:
 
 def _of_moving_parts(capture: Capture) -> list[Problem]:
     """Of photographs in which something moves while the rest stands still."""
-    shares = capture.facts.get(MOVING)
-    if not isinstance(shares, dict) or not shares or BACKGROUND in capture.facts:
+    shares, agreeing = capture.provenance.moving_parts, capture.provenance.pairs_agreeing
+    if not shares or capture.provenance.background is not None:
         return []
-    agreeing = capture.facts.get("pairs_agreeing")
-    large = float(np.median(list(shares.values()))) > LARGE_PART and isinstance(agreeing, float) and agreeing < DOUBTFUL
+    large = float(np.median(list(shares.values()))) > LARGE_PART and agreeing is not None and agreeing < DOUBTFUL
     names, most = tuple(sorted(shares)), max(shares.values())
     of = f"{len(names)} of {len(capture.photos)} photographs"
     sentence = f"Something moves between photographs while the rest stands still, over {most:.0%} of a picture at most, in {of}: {abbreviated(list(names))}."
@@ -259,13 +258,12 @@ def _of_background(left_out: bool) -> Problem:
 
 
 def _of_parts(capture: Capture) -> list[Problem]:
-    components, models = (capture.facts.get(key) for key in ("components", "models"))
-    parts = [count for count in components if count >= MIN_IMAGES] if isinstance(components, list) else []
+    parts, models = [count for count in capture.provenance.components or () if count >= MIN_IMAGES], capture.provenance.models or ()
     found = []
     if len(parts) > 1:
         sentence = f"The photographs fall into {len(parts)} groups that do not overlap, of {', '.join(map(str, parts))}; the largest is used."
         found.append(Problem("components", "usable", sentence, MORE_PHOTOGRAPHS))
-    if isinstance(models, list) and len(models) > 1:
+    if len(models) > 1:
         sentence = f"There are {len(models)} sub-models, of {', '.join(map(str, models))} photographs; the largest is used."
         found.append(Problem("sub-models", "good", sentence, MORE_PHOTOGRAPHS))
     return found
@@ -273,11 +271,11 @@ def _of_parts(capture: Capture) -> list[Problem]:
 
 def _of_geometry(capture: Capture, seen: Parallax | None, counts: np.ndarray | None) -> list[Problem]:
     found = []
-    agreeing = capture.facts.get("pairs_agreeing")
-    if isinstance(agreeing, float) and agreeing < 0.8:
+    agreeing = capture.provenance.pairs_agreeing
+    if agreeing is not None and agreeing < 0.8:
         sentence = f"Only {agreeing:.0%} of the matches agree with the cameras: repeated structure may have folded the scene."
         found.append(Problem("folded", "poor", sentence, "Look at cameras.png. Photographs with more of the surroundings tell repeated parts apart."))
-    elif isinstance(agreeing, float) and agreeing < DOUBTFUL:
+    elif agreeing is not None and agreeing < DOUBTFUL:
         sentence = f"Only {agreeing:.0%} of the matches agree with the cameras, as where photographs were zoomed, cropped or blurred, or where something moved."
         found.append(Problem("disagreement", "usable", sentence, "Look at cameras.png. Use one lens at one zoom, and photographs as they were taken."))
     if seen is not None and seen.small:
@@ -301,12 +299,12 @@ def _of_geometry(capture: Capture, seen: Parallax | None, counts: np.ndarray | N
 
 def _of_gps(capture: Capture) -> list[Problem]:
     """Why GPS positions are not used. This lowers no grade, and is usual indoors or round a small subject."""
-    gps = capture.facts.get("gps")
-    if not isinstance(gps, dict) or gps["used"] != "nothing":
+    gps = capture.provenance.gps
+    if gps is None or gps.used != "nothing":
         return []
-    words = f"{gps['photographs']} of {len(capture.photos)} photographs {plural(gps['photographs'], 'have', 'has')} a GPS position"
-    if "distance" in gps:
-        words += f", {gps['distance']:.2g} m from the cameras found in the median: too far for an extent of {gps['extent']:.2g} m, and not used."
+    words = f"{gps.photographs} of {len(capture.photos)} photographs {plural(gps.photographs, 'have', 'has')} a GPS position"
+    if gps.distance is not None:
+        words += f", {gps.distance:.2g} m from the cameras found in the median: too far for an extent of {gps.extent:.2g} m, and not used."
     else:
         words += ": too few to be used."
     return [Problem("gps", "good", words, "Nothing need be done: a phone's positions are metres off. Lengths are in no unit then, and up is estimated.")]
@@ -355,12 +353,12 @@ def of_sizes(looks: Mapping[str, Look]) -> list[Problem]:
 
 def _rows(capture: Capture, looks: Mapping[str, Look], counts: np.ndarray | None) -> dict[str, dict[str, Any]]:
     """Of each photograph what is known of it."""
-    same, moving = looks_of.duplicates(looks), capture.facts.get(MOVING)
+    same, moving = looks_of.duplicates(looks), capture.provenance.moving_parts
     registered = {photo.camera.name for photo in capture.photos}
     rows: dict[str, dict[str, Any]] = {}
     for index, photo in enumerate(capture.photos):
         rows[photo.camera.name] = {"registered": True, "points": None if counts is None else int(counts[index])}
-        if isinstance(moving, dict) and photo.camera.name in moving:
+        if photo.camera.name in moving:
             rows[photo.camera.name]["moving"] = moving[photo.camera.name]
     for name, reason in capture.rejected:
         near = sorted(((n, b if a == name else a) for a, b, n in capture.overlaps if name in (a, b)), reverse=True)

@@ -83,22 +83,6 @@ class Metrics(msgspec.Struct):
     views: list[ViewQuality] = []
 
 
-class Rejected(msgspec.Struct):
-    """An image that was not used, and why."""
-
-    name: str = ""
-    reason: str = ""
-
-
-class PosesReport(msgspec.Struct):
-    """The report of the stage poses, as far as it is shown; `registered` are its views."""
-
-    registered: list[Any] | None = None
-    reprojection_error: float | None = None
-    rejected: list[Rejected] | None = None
-    warnings: list[str] | None = None
-
-
 class ResultProblem(msgspec.Struct):
     """A problem of a result: its cause, what to do, and the picture in the run that shows it."""
 
@@ -119,22 +103,6 @@ class ResultVerdict(msgspec.Struct):
     def is_as_bad_as(self, grade: str) -> bool:
         """Whether the grade is this one, or worse."""
         return self.grade in GRADES[GRADES.index(grade) :]
-
-
-class CameraProblem(msgspec.Struct):
-    """A problem of the cameras, and what to do."""
-
-    sentence: str = ""
-    remedy: str = ""
-    grade: str = ""
-
-
-class CameraVerdict(msgspec.Struct):
-    """The verdict on the cameras, as far as it is shown."""
-
-    grade: str = ""
-    summary: str = ""
-    problems: list[CameraProblem] = []
 
 
 def read(path: Path, kind: type[T]) -> tuple[T, dict[str, Any]] | None:

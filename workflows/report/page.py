@@ -23,10 +23,11 @@ from pipeline.run import Run, cannot_write
 from pipeline.stage import Stage
 from pipeline.text import printable
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
+from stages.reports import CameraVerdict, PosesReport
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents
-from workflows.report.documents import CameraVerdict, Damaged, Metrics, PosesReport, Quality, ResultVerdict
+from workflows.report.documents import Damaged, Metrics, Quality, ResultVerdict
 from workflows.report.signature import write_page
 from workflows.report.summary import against_network, quality_in_words, split_of
 

@@ -17,8 +17,9 @@ from stages.evaluate.sparse_points import COLOURS, FARTHER, NEARER
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.capture import SparsePoints
 from stages.io.scene import load, save, save_points
+from stages.reports import CameraProblem, CameraVerdict
 from stages.verdict.grades import GRADES
-from stages.verdict.result import CameraVerdict, ResultVerdict, verdict_on_result
+from stages.verdict.result import ResultVerdict, verdict_on_result
 from tests.fakes import WHITE, BallField
 from tests.stages.evaluate.balls import TREE, figures_of, job_in, make_scene, measure, problems_of, settings, verdict_of
 from tests.stages.evaluate.results import WORSE, a_result, worse
@@ -67,7 +68,7 @@ def test_worse_figures_never_give_a_better_grade(seed: int) -> None:
     rng = random.Random(seed)
     found, grades = a_result(rng.uniform(10.0, 30.0)), []
     for _ in range(40):
-        verdict = verdict_on_result(found, CameraVerdict("usable", "S.", "R."))
+        verdict = verdict_on_result(found, CameraVerdict("usable", "", [CameraProblem("S.", "R.", "usable")]))
         check(verdict)
         grades.append(GRADES.index(verdict.grade))
         found = worse(found, rng.choice(list(WORSE)))
@@ -76,7 +77,7 @@ def test_worse_figures_never_give_a_better_grade(seed: int) -> None:
 
 def test_worse_cameras_never_give_a_better_grade() -> None:
     for psnr in (29.4, 24.0, 22.0, 12.0):
-        grades = [GRADES.index(verdict_on_result(a_result(psnr), CameraVerdict(grade, "S.", "R.")).grade) for grade in GRADES]
+        grades = [GRADES.index(verdict_on_result(a_result(psnr), CameraVerdict(grade, "", [CameraProblem("S.", "R.", grade)])).grade) for grade in GRADES]
         assert grades == sorted(grades)
 
 

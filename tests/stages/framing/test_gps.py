@@ -113,7 +113,7 @@ def test_exact_positions_give_metres_and_the_upward_axis(tmp_path: Path) -> None
     found, sentence = with_gps(given, files)
     assert found.metric
     np.testing.assert_array_equal(found.up, [0, 0, 1])
-    assert found.facts["gps"]["used"] == "scale and up"  # type: ignore[index]
+    assert found.provenance.gps.used == "scale and up"
     assert "scale and upward axis" in sentence
     true = np.linalg.norm(CIRCLE[:, None] - CIRCLE[None], axis=2)
     np.testing.assert_allclose(lengths(found), true, rtol=0.01, atol=0.01)
@@ -136,7 +136,7 @@ def test_positions_that_say_nothing_change_nothing(tmp_path: Path, extent: float
             write(file, tags(HOME + np.array([offset[1] / metres, offset[0] / metres / 0.56, offset[2]])))
     found, sentence = with_gps(given, files)
     assert (found.metric, found.up) == (False, None)
-    assert found.facts["gps"]["used"] == "nothing"  # type: ignore[index]
+    assert found.provenance.gps.used == "nothing"
     assert sentence == "", "the terminal need not have it"
     (problem,) = (each for each in verdict_on(found, {}).problems if each.what == "gps")
     assert problem.grade == "good"
@@ -158,7 +158,7 @@ def test_found_cameras_come_into_the_frame_of_stated_ones(tmp_path: Path) -> Non
     drifted = 0.1 * CIRCLE + np.random.default_rng(3).normal(0, 0.05, CIRCLE.shape)  # the phone's tracking
     drifted[5] += 3.0  # which was lost once
     found, sentence = with_stated_cameras(given, stated_for(given, drifted))
-    assert (found.metric, found.facts["stated_cameras"]["used"]) == (True, "frame")  # type: ignore[index]
+    assert (found.metric, found.provenance.stated_cameras.used) == (True, "frame")
     np.testing.assert_array_equal(found.up, [0, 1, 0])
     centres = np.array([photo.camera.centre for photo in found.photos])
     np.testing.assert_allclose(centres, 0.1 * CIRCLE, atol=0.06)
@@ -174,6 +174,6 @@ def test_stated_cameras_that_do_not_agree_change_nothing(tmp_path: Path, places:
     other = np.random.default_rng(3).normal(0, 30, true.shape) if places == "other" else true
     stated = stated_for(given, other)
     found, sentence = with_stated_cameras(given, Capture("polycam", stated.photos[:known], None, up=stated.up, metric=True))
-    assert (found.metric, found.up, found.facts["stated_cameras"]["used"]) == (False, None, "nothing")  # type: ignore[index]
+    assert (found.metric, found.up, found.provenance.stated_cameras.used) == (False, None, "nothing")
     assert why in sentence
     np.testing.assert_array_equal(lengths(found), lengths(given))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BadInput, UsageError
+from stages.io.capture import Provenance
 from stages.io.png import read_png, write_png
 from stages.masking.made import masks_by_network
 from stages.masking.photographs import mask_choice
@@ -76,7 +77,7 @@ def test_masks_are_files_at_the_size_of_their_photographs_and_silhouettes(tmp_pa
     expected = (scene() == [220, 40, 60]).all(-1)
     assert mask.shape == expected.shape
     assert ((mask > 127) & expected).sum() / ((mask > 127) | expected).sum() > 0.85
-    assert mask_choice(PosesSettings(mask_model="net.onnx"), {}) == "silhouette"
+    assert mask_choice(PosesSettings(mask_model="net.onnx"), Provenance()) == "silhouette"
     with pytest.raises(BadInput, match="no photograph shows a subject"):
         made({"b.png": tmp_path / "b.png"}, tmp_path / "net.onnx", tmp_path / "masks", told)
 

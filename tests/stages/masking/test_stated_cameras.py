@@ -39,7 +39,7 @@ def test_cameras_come_into_the_frame_of_those_that_are_stated(tmp_path: Path) ->
     capture, said = _in_known_frame(job_of(source), found_for(stated), files)
     for photo, true in zip(capture.photos, stated.photos, strict=True):
         np.testing.assert_allclose(photo.camera.world_from_camera, true.camera.world_from_camera, atol=1e-6)
-    assert capture.facts["stated_cameras"]["used"] == "frame"  # type: ignore[index]
+    assert capture.provenance.stated_cameras.used == "frame"
     assert len(said) == 1
     assert "6 of the 6 photographs (colmap)" in said[0]
 

@@ -13,7 +13,7 @@ from benchmarks.poses import aligned_errors
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from pipeline.stage import Job
-from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo
+from stages.io.capture import Capture, Photo, Provenance
 from stages.io.png import write_png
 from stages.io.reader import PhotoReader
 from stages.masking.photographs import _of_turning_subject, mask_choice
@@ -50,9 +50,9 @@ def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Pa
     events: list[dict[str, Any]] = []
     job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=folder, stage="poses", report=events.append)
     capture = read(job, PosesSettings(), PhotoReader(tmp_path / "photographs"), job.warn)
-    assert capture.facts[BACKGROUND] == LEFT_OUT
+    assert capture.provenance.background == "left out"
     assert any("the background stands still" in event.get("text", "") for event in events)
-    assert mask_choice(job.settings, capture.facts) == "silhouette"
+    assert mask_choice(job.settings, capture.provenance) == "silhouette"
     assert len(capture.photos) >= 0.9 * COUNT
     assert all(photo.mask is not None for photo in capture.photos)
     true = np.array([cameras[int(Path(photo.camera.name).stem)].centre for photo in capture.photos])
@@ -113,11 +113,11 @@ def test_few_photographs_by_the_subject_alone_leave_no_others_out(
         count, agreeing, degrees = wanted
         round_it = turntables.cameras(count, degrees * count / (count - 1))
         photos = tuple(Photo(camera, tmp_path / camera.name, masks.get(camera.name)) for camera in round_it)
-        return Capture(kind="photographs", photos=photos, background=None, facts={"pairs_agreeing": agreeing})
+        return Capture(kind="photographs", photos=photos, background=None, provenance=Provenance(pairs_agreeing=agreeing))
 
     job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=tmp_path, stage="poses")
     capture, seen = _of_turning_subject(job, find, paths, PhotoReader())
     assert not seen
     assert len(capture.photos) == (alone[0] if used == "cameras_of_subject" else whole[0])
-    assert (capture.facts.get(BACKGROUND) == LEFT_OUT) == (used == "cameras_of_subject")
+    assert (capture.provenance.background == "left out") == (used == "cameras_of_subject")
     assert searched == (["cameras_of_subject"] if whole is None else ["cameras_of_subject", "cameras"])

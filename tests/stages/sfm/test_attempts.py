@@ -190,7 +190,7 @@ def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> 
             faint = np.asarray(image.filter(ImageFilter.GaussianBlur(1.0)), np.float32) * 0.15 + 85
             (Image.fromarray(faint.astype(np.uint8)) if name == names[2] else image).save(tmp_path / name, quality=95)
     capture = find_cameras(tmp_path, names, work=tmp_path / "work", max_side=360, warn=lambda *a, **k: None, **QUIET)
-    rungs = {rung["rung"]: rung["registered"] for rung in capture.facts["rungs"]}  # type: ignore[attr-defined]
+    rungs = {rung["rung"]: rung["registered"] for rung in capture.provenance.rungs}
     assert rungs["exhaustive"] == rungs["wider matching"] == 5
     assert rungs["more features"] == 6
     errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))

@@ -170,7 +170,7 @@ def test_cameras_are_found_where_sift_finds_none(tmp_path: Path) -> None:
     asked: dict[str, Any] = {"max_side": 480, "features": 24, **QUIET}
     networks = detector(tmp_path / "d.onnx"), matcher(tmp_path / "m.onnx")
     capture = find_cameras(STILL_LIFE, names, work=tmp_path / "work", networks=networks, **asked)
-    rungs: list[dict[str, Any]] = capture.facts["rungs"]  # type: ignore[assignment]
+    rungs: list[dict[str, Any]] = capture.provenance.rungs
     first = next(number for number, rung in enumerate(rungs) if rung["rung"] in (attempts.NETWORK, attempts.NETWORK_ANEW))
     assert max(rung["registered"] for rung in rungs[:first]) < 3
     assert len(capture.photos) == 6
@@ -196,7 +196,7 @@ def test_a_photograph_without_sift_features_gets_its_camera(tmp_path: Path, monk
     asked = [Request(STILL_LIFE, paths, tmp_path / f"with {threads}", 360, 4096, threads=threads, networks=networks) for threads in (1, 2)]
     found = [reconstruct(request, **QUIET) for request in asked]
     assert [name for name, _ in usual.rejected] == [names[2]]
-    before, after = (list(capture.facts["rungs"]) for capture in (usual, found[0]))  # type: ignore[call-overload]
+    before, after = (list(capture.provenance.rungs) for capture in (usual, found[0]))
     assert after[: len(before)] == before, "what is tried before it is the same"
     assert found[0].rejected == ()
     assert errors_of(found[0], truth).max() < 0.02

@@ -75,7 +75,7 @@ def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path
     assert capture.kind == "photographs"
     assert capture.up is None
     assert not capture.metric
-    assert capture.facts["pairs_agreeing"] > 0.9  # type: ignore[operator]
+    assert capture.provenance.pairs_agreeing > 0.9
     assert max(max(seen) for seen in capture.points.tracks) < len(names)
 
 
@@ -112,8 +112,8 @@ def test_the_process_changes_no_bit(ten: tuple[list[str], Path, Capture], tmp_pa
     quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
     here = reconstruct(Request(STILL_LIFE, {name: STILL_LIFE / name for name in names}, tmp_path / "work", SIDE, 4096), **quiet)
     assert numbers(here) == numbers(capture)
-    assert (here.facts, here.warnings, here.rejected, here.reprojection_error) == (
-        capture.facts, capture.warnings, capture.rejected, capture.reprojection_error,
+    assert (here.provenance, here.warnings, here.rejected, here.reprojection_error) == (
+        capture.provenance, capture.warnings, capture.rejected, capture.reprojection_error,
     )  # fmt: skip
 
 

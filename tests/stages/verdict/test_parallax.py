@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Camera
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import Capture, Photo, Provenance, SparsePoints
 from stages.verdict.parallax import SMALL_ANGLE, parallax
 from stages.verdict.verdict import verdict_on
 
@@ -83,8 +83,8 @@ def inward() -> tuple[SparsePoints, list[Photo]]:
 
 
 def verdict_words(points: SparsePoints, photos: list[Photo]) -> set[str]:
-    facts: dict[str, object] = {"pairs_agreeing": 0.97, "planar_pairs": 0.9, "components": [len(photos)], "models": [len(photos)]}
-    return {each.what for each in verdict_on(Capture("photographs", tuple(photos), None, points=points, facts=facts), {}).problems}
+    found = Provenance(pairs_agreeing=0.97, planar_pairs=0.9, components=[len(photos)], models=[len(photos)])
+    return {each.what for each in verdict_on(Capture("photographs", tuple(photos), None, points=points, provenance=found), {}).problems}
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 3])

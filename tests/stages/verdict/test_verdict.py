@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from efficientnerf.geometry.cameras import Camera
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import Capture, Lens, Photo, Provenance, SparsePoints
 from stages.verdict import looks, pictures
 from stages.verdict.grades import GRADES
 from stages.verdict.looks import Look, look
@@ -87,7 +88,7 @@ def capture(count: int = 24, radius: float = 4.0, **changes: object) -> Capture:
         photos.append(Photo(Camera(f"{k:02d}.jpg", 640, 480, "SIMPLE_PINHOLE", (500.0, 320.0, 240.0), pose), Path("none")))
     xyz = np.random.default_rng(0).normal(0, 1, (200, 3))
     points = SparsePoints(xyz, np.zeros((200, 3), np.uint8), np.ones(200), tuple(tuple(range(count)) for _ in range(200)))
-    given: dict[str, object] = {"reprojection_error": 0.5, "facts": {"pairs_agreeing": 0.97, "components": [count], "models": [count]}}
+    given: dict[str, object] = {"reprojection_error": 0.5, "provenance": Provenance(pairs_agreeing=0.97, components=[count], models=[count])}
     return Capture(kind="photographs", photos=tuple(photos), background=None, points=points, **(given | changes))  # type: ignore[arg-type]
 
 
@@ -118,10 +119,10 @@ LOST = tuple((f"lost{k}.jpg", "overlaps no other photograph well enough") for k 
         ({"rejected": LOST[:1]}, "not registered", "good"),
         ({"rejected": LOST[:6]}, "not registered", "usable"),
         ({"rejected": LOST}, "not registered", "poor"),
-        ({"facts": {"pairs_agreeing": 0.6}}, "folded", "poor"),
-        ({"facts": {"pairs_agreeing": 0.9}}, "disagreement", "usable"),
-        ({"facts": {"components": [24, 7, 1]}}, "components", "usable"),
-        ({"facts": {"models": [24, 5]}}, "sub-models", "good"),
+        ({"provenance": Provenance(pairs_agreeing=0.6)}, "folded", "poor"),
+        ({"provenance": Provenance(pairs_agreeing=0.9)}, "disagreement", "usable"),
+        ({"provenance": Provenance(components=[24, 7, 1])}, "components", "usable"),
+        ({"provenance": Provenance(models=[24, 5])}, "sub-models", "good"),
         ({"radius": 0.05}, "parallax", "poor"),
         ({"count": 5}, "few", "usable"),
         ({"reprojection_error": 3.0}, "reprojection error", "usable"),
@@ -207,8 +208,8 @@ def lens(**changes: float) -> tuple[float, ...]:
 
 
 def test_photographs_that_were_zoomed_or_cropped_are_named() -> None:
-    def with_lenses(fact: str | None, others: dict[int, tuple[float, ...]]) -> Verdict:
-        made = capture(facts={"pairs_agreeing": 0.98} | ({"lens": fact} if fact else {}))
+    def with_lenses(own: Lens | None, others: dict[int, tuple[float, ...]]) -> Verdict:
+        made = capture(provenance=Provenance(pairs_agreeing=0.98, lens=own))
         photos = [replace(photo, camera=replace(photo.camera, params=others.get(k, photo.camera.params))) for k, photo in enumerate(made.photos)]
         return verdict_on(replace(made, photos=tuple(photos)), sharp(NAMES))
 
@@ -223,19 +224,19 @@ def test_photographs_that_were_zoomed_or_cropped_are_named() -> None:
 
 
 def test_photographs_in_which_something_moves_are_named() -> None:
-    def moving(count: int, first: float = 0.02, **facts: object) -> Verdict:
+    def moving(count: int, first: float = 0.02, agreeing: float = 0.97, **known: Any) -> Verdict:
         shares = {name: first + 0.01 * k for k, name in enumerate(NAMES[:count])}
-        return verdict_on(capture(facts={"pairs_agreeing": 0.97, "moving_parts": shares} | facts), sharp(NAMES))
+        return verdict_on(capture(provenance=Provenance(pairs_agreeing=agreeing, moving_parts=shares, **known)), sharp(NAMES))
 
     found = moving(3)
     assert [(problem.what, problem.grade, problem.images) for problem in found.problems] == [("moving parts", "usable", tuple(NAMES[:3]))]
     assert "masks/" in found.problems[0].remedy
     assert [row.get("moving") for row in found.document()["images"].values()] == [0.02, 0.03, 0.04] + [None] * 21
     assert moving(2).grade == "good"
-    assert moving(3, pairs_agreeing=0.9).grade == moving(3, first=0.1).grade == "usable"
-    doubtful = moving(3, first=0.1, pairs_agreeing=0.9)
+    assert moving(3, agreeing=0.9).grade == moving(3, first=0.1).grade == "usable"
+    doubtful = moving(3, first=0.1, agreeing=0.9)
     assert [(problem.what, problem.grade) for problem in doubtful.problems] == [("moving parts", "poor"), ("disagreement", "usable")]
-    assert "moving parts" not in [problem.what for problem in moving(24, background="in the picture").problems]  # the subject turned
+    assert "moving parts" not in [problem.what for problem in moving(24, background="stands still").problems]  # the subject turned
 
 
 BARE = tuple((f"bare{k}.jpg", "only 3 features detected: blurred, dark or without texture") for k in range(4))
@@ -245,19 +246,19 @@ def test_cameras_that_only_turned_and_photographs_without_texture_are_named() ->
     def words(found: Verdict) -> list[str]:
         return [problem.what for problem in found.problems]
 
-    flat = {"planar_pairs": 0.95}
+    flat = Provenance(planar_pairs=0.95)
     assert "one place" in words(failed("none.", "try.", 0, LOST, {}, flat, ()))
-    assert "one place" in words(verdict_on(capture(radius=0.05, facts=flat), sharp(NAMES)))
-    assert words(verdict_on(capture(facts=flat), sharp(NAMES))) == []  # a wall seen from all sides has depth all the same
-    assert "one place" not in words(failed("none.", "try.", 0, LOST, {}, {"planar_pairs": 0.3}, ()))
-    bare = failed("none.", "try.", 0, BARE, {}, {}, ())
+    assert "one place" in words(verdict_on(capture(radius=0.05, provenance=flat), sharp(NAMES)))
+    assert words(verdict_on(capture(provenance=flat), sharp(NAMES))) == []  # a wall seen from all sides has depth all the same
+    assert "one place" not in words(failed("none.", "try.", 0, LOST, {}, Provenance(planar_pairs=0.3), ()))
+    bare = failed("none.", "try.", 0, BARE, {}, Provenance(), ())
     assert "without texture" in words(bare)
     assert bare.problems[1].images == tuple(name for name, _ in BARE)
     assert "without texture" not in words(verdict_on(capture(rejected=BARE[:1]), sharp(NAMES)))
 
 
 def test_problems_are_in_order_and_the_worst_is_the_grade() -> None:
-    found = verdict_on(capture(rejected=LOST[:6], facts={"pairs_agreeing": 0.5}), sharp(NAMES, **{"05.jpg": {"sharpness": 0.1}}))
+    found = verdict_on(capture(rejected=LOST[:6], provenance=Provenance(pairs_agreeing=0.5)), sharp(NAMES, **{"05.jpg": {"sharpness": 0.1}}))
     places = [GRADES.index(problem.grade) for problem in found.problems]
     assert places == sorted(places, reverse=True)
     assert (found.grade, len(places)) == ("poor", 3)
