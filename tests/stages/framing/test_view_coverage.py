@@ -17,6 +17,7 @@ from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
 from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
+from stages.bake.settings import BakeSettings
 from stages.framing.view_coverage import (
     before_near,
     cells_before_near,
@@ -184,7 +185,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, min
     train.run(trained)
     made = job(
         tmp_path / "bake",
-        bake.BakeSettings(resolution=32, visibility_rays=5000, samples_per_voxel=2, refine_steps=4, refine_rays_per_batch=1024),
+        BakeSettings(resolution=32, visibility_rays=5000, samples_per_voxel=2, refine_steps=4, refine_rays_per_batch=1024),
         poses=tmp_path / "poses",
         train=trained.out,
     )
