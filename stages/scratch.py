@@ -81,7 +81,7 @@ def same_as(expected: T) -> Callable[[T, Collection[str]], None]:
 
 def unusable(path: Path, reason: object) -> str:
     """The warning about a piece of scratch that does not count."""
-    return f"{path.name} of an earlier attempt can't be used ({printable(reason, 200)}); what it stands for is made again"
+    return f"{path.name} of an earlier attempt can't be used ({printable(reason, 200)}); it is made again"
 
 
 def once(warn: Warn) -> Warn:

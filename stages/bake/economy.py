@@ -45,7 +45,7 @@ def packed_tree(job: Job, tree: NerfTree, targets: Targets, size: int) -> tuple[
         coded, targets, REFIT_STEPS, rounds=REFIT_ROUNDS, rays=settings.refine_rays_per_batch, seed=settings.seed, safe_point=job.safe_point,
     )  # fmt: skip
     psnr = psnr_of(fit.error(found, targets, min(ERROR_RAYS, 4 * len(targets.pixels)), settings.seed))
-    job.say(f"tables are fitted to the images in {REFIT_STEPS} steps: {psnr:.2f} dB over training pixels")
+    job.say(f"fitted tables to the images in {REFIT_STEPS} steps: {psnr:.2f} dB over training pixels")
     return found, psnr
 
 
@@ -79,7 +79,7 @@ def _coded(job: Job, tree: NerfTree, targets: Targets, size: int) -> NerfTree:
             break
     if best is None:
         lower = "bake.resolution" if tree.environment is None else "bake.resolution or bake.environment_size"
-        job.warn(f"the asset takes {took / 2**20:.2f} MiB, more than bake.max_mib: give it a lower {lower}")
+        job.warn(f"the asset takes {took / 2**20:.2f} MiB, more than bake.max_mib. Lower {lower}.")
         return found
     return best
 

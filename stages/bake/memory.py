@@ -101,8 +101,8 @@ def rows_for_baking(job: Job, plan: Bake, m: Model, views: tuple[View, ...]) -> 
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
     if job.memory is not None and (most := at_most(plan.most_voxels, stored=stored).total) > job.memory.bytes:
-        job.warn(f"an asset of {plan.mib:g} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. It is refused"
-                 " once its voxels are counted, before they are baked, if it does not fit; with a lower bake.max_mib it surely fits.")  # fmt: skip
+        job.warn(f"an asset of {plan.mib:g} MiB may need {size_text(most)} of memory; the limit is {size_text(job.memory.bytes)}. If it does not fit,"
+                 " it is refused after its voxels are counted, before they are baked. Lower bake.max_mib to be sure.")  # fmt: skip
     return rows
 
 

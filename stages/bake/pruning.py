@@ -112,7 +112,7 @@ def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:
     if keep.sum() > most:
         keep = greatest_of(greatest, most)
         left_out = float(greatest[~keep].max())
-        job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib allows {most:,}")
+        job.say(f"voxels with a weight of at most {left_out:.3g} in every pixel are left out: bake.max_mib allows {most:,} voxels")
     return keep
 
 

@@ -88,7 +88,7 @@ def with_noted_size(job: Job, plan: Bake) -> Bake:
     if found is not None:
         return replace(plan, mib=found, max_mib=found)
     if plan.mib < plan.usual_mib:
-        job.say(f"of {plan.usual_mib:g} MiB, about {plan.mib:.3g} can be refined in {plan.seconds:g} s")
+        job.say(f"about {plan.mib:.3g} of the usual {plan.usual_mib:g} MiB can be refined in {plan.seconds:g} s")
     note(job.work / SIZE_NOTE, plan.mib)
     return plan
 

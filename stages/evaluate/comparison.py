@@ -98,7 +98,7 @@ def evaluate_view(
             metrics["asset_with_network_background"] = {**compare(other, truth, upsample(seen.inside_opacity, stride, **size) >= 0.5), **size}
         images += [to_uint8(small.colour), to_uint8(render), error_map(render, small.colour)]
     if metrics["asset"]["psnr"] is None:
-        job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
+        job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is not part of the means")
     return metrics, [*images, to_uint8(image), error_map(image, truth.colour)]
 
 
@@ -209,7 +209,7 @@ def clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
     """Clipped to 0-1; pixels that are not finite count as black, with a warning."""
     bad = int((~np.isfinite(image)).any(axis=-1).sum())
     if bad:
-        job.warn(f"{what} is not finite at {bad} pixels; they count as black")
+        job.warn(f"{what} is not finite at {bad} pixels, which count as black")
     return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
 
 

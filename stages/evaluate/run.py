@@ -96,7 +96,7 @@ def evaluate(
     scene = load_scene(job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage])
     views, split = evaluation_views(scene)
     if split == "train":
-        job.warn("the scene has no test or validation views: the metrics are of views that training saw")
+        job.warn("the scene has no test or validation views; metrics are computed on training views")
     load_field, warn = cache(load_field), once(job.warn)
     drawn = evenly_spaced(len(views), None if settings.field_views == "all" else settings.field_views)
     stride = _field_stride([views[k] for k in drawn], resolved(settings.field_image_scale))

@@ -22,25 +22,23 @@ NETWORKS = ("alex", "vgg")  # of LPIPS
 class EvaluateSettings:
     """How much is measured."""
 
-    field_views: PositiveInt | Literal["all"] = setting(16, "Number of test views that the field is rendered for, spread evenly.", advanced=True)
+    field_views: PositiveInt | Literal["all"] = setting(16, "Number of test views, spread evenly, that are rendered from the field.", advanced=True)
     field_image_scale: Annotated[float, Meta(ge=0.01, le=1.0)] | Auto = setting(
         "auto",
-        f"Scale of the pixel grid on which the field is rendered; auto: at most {MAX_FIELD_IMAGE_SIZE} along the longest side, and about "
-        f"{MAX_FIELD_RAYS} pixels in all.",
+        f"Scale of the images that are rendered from the field; auto: at most {MAX_FIELD_IMAGE_SIZE} pixels along the longest side, and about"
+        f" {MAX_FIELD_RAYS} pixels in all.",
         advanced=True,
     )
     field_background_rays: PositiveInt = setting(
-        500_000,
-        "Total number of rays through the field for the surroundings of the other views, in unbounded scenes whose asset holds none.",
-        advanced=True,
+        500_000, "Total number of rays through the field for the surroundings of the other views, in unbounded scenes whose asset has none.", advanced=True
     )
     strips: Literal["on", "off"] = setting(
-        "on", "Whether photograph, network, asset and mesh are shown side by side at full size, for the worst, the median and the best view."
+        "on", "Whether to show photograph, network, asset and mesh side by side at full size, for the worst, the median and the best view."
     )
     captured_path_frames: Annotated[int, Meta(ge=1, le=9999)] | Off = setting(90, "Number of frames of the video along the captured cameras; off: none.")
-    lpips: Literal["off", "alex", "vgg", "both"] = setting("off", "Network of LPIPS, where that is measured too; its weights are files of their own.")
+    lpips: Literal["off", "alex", "vgg", "both"] = setting("off", "Network of LPIPS, if that is measured too; its weights are separate files.")
     lpips_weights: str = setting(
-        "auto", "Folder with the weights of LPIPS; auto: torch's cache and the package torchmetrics, which are searched in any case.", advanced=True
+        "auto", "Folder of the LPIPS weights; auto: torch's cache and the package torchmetrics, which are always searched.", advanced=True
     )
 
 

@@ -64,7 +64,7 @@ def write_strips(
         entries.append({"which": which, "file": path.name, **entry})
     job.progress(len(chosen), len(chosen))
     if rays:
-        job.say(f"strips: the network at {rays} pixels in {time.monotonic() - started:.0f} s (evaluate.strips=off leaves them out)")
+        job.say(f"strips: the network at {rays} pixels in {time.monotonic() - started:.0f} s (skip with evaluate.strips=off)")
     return entries
 
 

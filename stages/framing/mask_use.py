@@ -250,5 +250,5 @@ def doubts(use: MaskUse) -> list[str]:
     """Warnings about silhouettes that do not fit to the others', or to the cameras that were found."""
     sentences = [f"{kind}: {why}." for kind, why in use.reasons.items() if why.endswith(WRONG_CAMERAS)]
     if use.doubtful:
-        sentences.append(f"the silhouettes of {len(use.doubtful)} photographs do not fit to the others': {abbreviated(use.doubtful)}.")
+        sentences.append(f"the silhouettes of {len(use.doubtful)} photographs do not fit the others': {abbreviated(use.doubtful)}.")
     return sentences

@@ -101,7 +101,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
         job.say(f"{about['video']}: {about['chosen']} of {about['frames']} frames chosen", video=about["video"], chosen=about["chosen"])
     if len(found.paths) + len(chosen.paths) < MIN_IMAGES:
         raise BadInput(
-            f"{job.source}: {len(chosen.paths)} frames that differ; at least {MIN_IMAGES} are needed, and 50 or more all round a subject are better."
+            f"{job.source}: {len(chosen.paths)} frames that differ; at least {MIN_IMAGES} are needed, and 50 or more from all sides are better."
             " Walk round the subject while filming."
         )
     _write_record(job, chosen.record, chosen.paths)
@@ -124,13 +124,13 @@ def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material
             with contextlib.suppress(UnreadableImage):  # reported where it is read
                 width, height = read_header(path).size
                 if width != 2 * height:
-                    raise BadInput(f"{name}: {width}x{height} pixels; a picture of 360 degrees is twice as wide as high. Without --lens it is a photograph.")
+                    raise BadInput(f"{name}: {width}x{height} pixels; a 360-degree image is twice as wide as high. Omit --lens to read it as a photograph.")
             panoramas[name] = path
     if not panoramas:
         return found
     if masked := panoramas.keys() & found.masks.keys():
-        warn(f"{len(masked)} masks of 360-degree pictures are not used.")
-    job.say(f"{len(panoramas)} 360-degree pictures are cut into {VIEWS} views each")
+        warn(f"{len(masked)} masks of 360-degree images are not used.")
+    job.say(f"{len(panoramas)} 360-degree images are cut into {VIEWS} views each")
     views = views_of(panoramas, max_side=max_side, work=job.work / "panoramas", safe_point=job.safe_point, progress=job.progress, warn=warn)
     left = {name: path for name, path in found.paths.items() if name not in panoramas}
     return Material(left | views, {name: mask for name, mask in found.masks.items() if name not in panoramas})

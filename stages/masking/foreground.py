@@ -46,8 +46,8 @@ OUTSIDE = np.array([255, 0, 255])  # of silhouettes in the sheet
 MOST_SHEET = 60
 
 REMEDY = (
-    "Photograph it from all round, whole in nearly all pictures, free of other things; or give masks of your own in a folder masks/. Without --mask all of the"
-    " scene is trained, and --region foreground shows and exports the subject with what it stands on."
+    "Photograph it from all sides, complete in nearly all images, with nothing in front of it; or give your own masks in a folder masks/. Without --mask the"
+    " whole scene is trained, and --region foreground shows and exports the subject and what it stands on."
 )
 
 
@@ -69,7 +69,7 @@ def with_foreground_masks(job: Job, capture: Capture, warn: Any) -> Capture:
         made = _made_anew(job, capture, images, folder)
         note(folder / "made.json", msgspec.to_builtins(made), [folder / file for file in made.masks.values()])
     masks = {name: folder / file for name, file in made.masks.items()}
-    job.say(f"silhouettes of the foreground: {len(masks)} of {len(capture.photos)} photographs, overlap with their visual hull {made.facts['overlap']:.0%}")
+    job.say(f"foreground silhouettes: {len(masks)} of {len(capture.photos)} photographs, overlap with their visual hull {made.facts['overlap']:.0%}")
     photos = tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in capture.photos)
     _draw(photos, images, PosesOutputs(job.out).silhouettes)
     return replace(capture, photos=photos, facts={**capture.facts, FOREGROUND: made.facts})
@@ -81,7 +81,7 @@ def _made_anew(job: Job, capture: Capture, images: list[np.ndarray], folder: Pat
 
     @compiling_kernels
     def make(job: Job) -> None:
-        refuse_what_does_not_fit(job, first_training_needed(len(images), SIDE, FIRST, RAYS), "Leave --mask foreground away.")
+        refuse_what_does_not_fit(job, first_training_needed(len(images), SIDE, FIRST, RAYS), "Omit --mask foreground.")
         field = first_field(job, capture, images)
         found.append(_made(job, capture, field, _subject(field), folder))
 
@@ -93,7 +93,7 @@ def _refuse_other_masks(photos: Sequence[Photo]) -> None:
     own = [photo.camera.name for photo in photos if photo.mask is not None or _has_alpha(photo)]
     if own:
         text = f"--mask {FOREGROUND}: {len(own)} of {len(photos)} photographs have a mask or an alpha channel already: {abbreviated(own)}."
-        raise UsageError(f"{text} Leave --mask away, which uses these, or take them out.")
+        raise UsageError(f"{text} Omit --mask to use these, or remove them.")
 
 
 def _has_alpha(photo: Photo) -> bool:

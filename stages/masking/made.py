@@ -72,9 +72,9 @@ def _all_made(
             write_mask(mask, (photo.width, photo.height), found[name])
     if not found:
         article = "such a background" if what == "such background" else f"a {what}"
-        raise BadInput(f"{option}: no photograph shows {article}. Choose another, or leave {option.split()[0]} away.")
+        raise BadInput(f"{option}: no photograph shows {article}. Choose another, or omit {option.split()[0]}.")
     if without:
-        warn(f"{option}: no {what} in {len(without)} of {len(names)} photographs, as in {without[0]}: they get no mask", images=without)
+        warn(f"{option}: no {what} in {len(without)} of {len(names)} photographs, such as {without[0]}; they get no mask", images=without)
     return found
 
 

@@ -65,7 +65,7 @@ def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tu
             capture, sentence = with_stated_cameras(capture, IMPORTERS[name].read(source, job.settings))
             said.append(sentence)
         except BadInput as error:
-            said.append(f"the cameras that the source states cannot be read, and are not used: {error}")
+            said.append(f"the source's cameras cannot be read and are not used: {error}")
         stated = capture.provenance.stated_cameras
         if stated is not None and stated.used != "nothing":
             return capture, said
@@ -165,21 +165,21 @@ def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path], reader:
     masks = masks_of_turning_subject(paths, job.work / "masks", reader, safe_point=job.safe_point, progress=job.progress)
     if not masks:
         return None, False
-    job.say("the background stands still from photograph to photograph: cameras are looked for by the subject alone; --mask off uses all of the picture")
+    job.say("the background stands still between photographs: cameras are estimated from the subject alone; --mask off uses the full images")
     try:
         alone = find("cameras_of_subject", masks)
     except BadInput:
-        job.say("the subject alone shows too little; cameras are looked for by all of the picture")
+        job.say("the subject alone has too few features; cameras are estimated from the full images")
         return None, True
     if turn([photo for photo in alone.photos if photo.mask is not None]) < LEAST_TURN:
-        job.say("the cameras all look the same way; the background may be far away, and all of the picture is used")
+        job.say("all cameras look the same way, so the background may be far away; the full images are used")
         return None, False
     if len(alone.photos) < ENOUGH * len(paths):
-        job.say("the subject alone shows too little for some photographs; cameras are looked for by all of the picture, too")
+        job.say("the subject alone has too few features in some photographs; cameras are also estimated from the full images")
         with contextlib.suppress(BadInput):
             whole = find("cameras", {})
             if turn(whole.photos) >= LEAST_TURN and _explained(whole) > _explained(alone):
-                job.say("all of the picture explains more than the subject alone, and is used")
+                job.say("the full images explain more than the subject alone and are used")
                 return whole, False
     return replace(alone, provenance=structs.replace(alone.provenance, background="left out")), False
 
@@ -199,14 +199,14 @@ def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mappi
         return share_that_fits(found, kind, reader) * len(found.photos)
 
     what = "masks" if kind.masks else "alpha channels"
-    job.say(f"{what} are taken for silhouettes; features are looked for outside of them, too: the background moves with the object")
+    job.say(f"{what} are used as silhouettes; features outside them are used too, because the background moves with the object")
     whole: Capture | None = None
     with contextlib.suppress(BadInput):
         found = find("cameras", everywhere)
         whole = replace(found, photos=tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in found.photos))
         if fit(whole) >= MIN_AGREEING * len(whole.photos):
             return whole
-    job.say("the silhouettes do not fit to these cameras; they are looked for again by the object alone")
+    job.say("the silhouettes do not fit these cameras; cameras are estimated again from the object alone")
     try:
         alone = find("cameras_of_object", masks)
     except BadInput:

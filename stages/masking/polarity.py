@@ -22,8 +22,8 @@ from stages.io.reader import PhotoReader
 from stages.io.working_images import mask_levels
 from stages.masking.background import photo_without_camera
 
-INVERTED = "masks keep what is black: what is white in them is left out"
-INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white takes them the other way round"
+INVERTED = "masks keep what is black; what is white is left out"
+INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white reverses this"
 
 
 @dataclass(frozen=True)

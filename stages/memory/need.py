@@ -65,7 +65,7 @@ def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:
     refuse_more_than(job.memory, job.stage, need, remedy)
     now = available_now() if job.memory is not None else None
     if now is not None and need.total > now:
-        job.warn(f"{job.stage} needs {need.text()}; other programs leave {size_text(now)} at the moment. Close some, should it fail.")
+        job.warn(f"{job.stage} needs {need.text()}; only {size_text(now)} are free now. Close other programs if it fails.")
 
 
 def refuse_more_than(limit: Limit | None, what: str, need: Need, remedy: str) -> None:

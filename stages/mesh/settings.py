@@ -19,33 +19,34 @@ class MeshSettings:
 
     region: Literal["foreground", "all"] = setting(
         "foreground",
-        "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
+        "What is meshed: the subject and what it stands on, clipped at the edge (foreground), or the whole scene (all), with cracks where its grids meet.",
         advanced=True,
     )
     max_faces: Annotated[int, Meta(ge=100, le=10**8)] | Literal["20k", "100k", "500k"] = setting(
-        200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
+        200_000, "Maximum number of faces after decimation: 20k for the web, 100k for games, 500k for prints and renders, or a number."
     )
     density_threshold: Density | Auto = setting(
-        "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
+        "auto", "Density at the surface, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
     )
     min_component: Fraction = setting(
-        0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
+        0.0, "Connected components with less than this fraction of the largest one's area are dropped; components that no view shows always are.", advanced=True
     )
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
-        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, of normals follow, which keep edges.", advanced=True
+        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, follow for normals, which keep edges.", advanced=True
     )
     texture: Literal["auto", "photographs", "asset", "off"] = setting(
         "auto",
-        "Where the texture's colours are from: the training photographs, blended (photographs), or the asset (asset); auto: photographs where they show the"
-        " mesh; off: colours at vertices alone.",
+        "Source of the texture's colours: the training photographs, blended (photographs), or the asset (asset); auto: photographs where they show the mesh;"
+        " off: vertex colours only.",
     )
     texture_size: Annotated[int, Meta(ge=256, le=8192)] = setting(
-        2048, "Most texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.", advanced=True
+        2048,
+        "Maximum number of texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.",
+        advanced=True,
     )
     normal_map: bool = setting(
         False,
-        "A normal map beside the texture, of the surface before it was decimated; materials are lit then, so that lamps show its relief over the light of the"
-        " capture.",
+        "Also write a normal map, from the surface before decimation; materials are then lit, so that lights show its relief on top of the captured light.",
         advanced=True,
     )
 

@@ -81,7 +81,7 @@ def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, f
     refuse_what_does_not_fit(job, need(fewer), REMEDY)
     if fewer < threads:
         job.warn(
-            f"features are detected on {fewer} of {threads} threads: more do not fit into memory. Give more by --memory, or lower poses.feature_image_size."
+            f"features are detected on {fewer} of {threads} threads, because more do not fit into memory. Raise --memory, or lower poses.feature_image_size."
         )
     return fewer
 

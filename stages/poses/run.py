@@ -47,7 +47,7 @@ def run(job: Job) -> None:
     """Write scene.json, images/, masks/, points.safetensors, verdict.json, pictures and report.json. Raises BadInput."""
     settings: PosesSettings = job.settings
     if job.source is None:
-        raise BadInput("the poses stage needs a source: name a folder of photographs, a video, or a posed data set.")
+        raise BadInput("the poses stage needs a source: give a folder of photographs, a video, or a posed data set.")
     notes: list[str] = []
 
     def warn(text: str, **facts: Any) -> None:
@@ -67,7 +67,7 @@ def run(job: Job) -> None:
         capture, up=settings.up, box=resolved(settings.crop_box), margin=settings.box_margin, space=settings.space, reader=reader
     )
     if names := framed.silhouettes_cut:
-        warn(f"the silhouettes of {len(names)} photographs reach out of the box: {abbreviated(names)}. What is there is cut off; state poses.crop_box.")
+        warn(f"the silhouettes of {len(names)} photographs extend beyond the box: {abbreviated(names)}. What is outside is cut off. Set poses.crop_box.")
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = _views(capture, written, splits, framed)
@@ -141,8 +141,8 @@ def _formats(job: Job, settings: PosesSettings) -> list[str]:
     for path in job.sources.values():
         found = importers.candidates(path, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else [settings.format]
         if len(job.sources) > 1 and found[0] != "photographs":
-            remedy = "Give it alone, or --as photographs, to find all cameras anew."
-            raise BadInput(f"{path}: is read as {found[0]}; of several sources photographs and videos alone can be put together. {remedy}")
+            remedy = "Give it alone, or use --as photographs to find all cameras anew."
+            raise BadInput(f"{path}: is read as {found[0]}; several sources can only be photographs and videos. {remedy}")
     return found
 
 
@@ -160,7 +160,7 @@ def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) ->
         warn(sentence)
     names = set(without_silhouette(capture.photos, use.silhouettes))
     if names:
-        warn(f"{len(names)} of {len(capture.photos)} images have no silhouette, and the others do: {abbreviated(sorted(names))}. They are left out.")
+        warn(f"{len(names)} of {len(capture.photos)} images have no silhouette, unlike the others: {abbreviated(sorted(names))}. They are left out.")
     kept = [index for index, photo in enumerate(capture.photos) if photo.camera.name not in names]
     capture = without(capture, kept, [(name, "has no silhouette, and the others do") for name in sorted(names)])
     if not use.silhouettes:
@@ -210,7 +210,7 @@ def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[
             why = "Refused by --strict." if len(kept) >= MIN_IMAGES else f"{len(kept)} remain; at least {MIN_IMAGES} are needed."
             raise BadInput(f"{job.source}: {sentence} {why} Copy or convert them again, or take them out.")
         warn(f"{sentence} They are left out.")
-    for sentence in [*remarks[:3], *([f"... and {len(remarks) - 3} more remarks like these."] if len(remarks) > 3 else [])]:
+    for sentence in [*remarks[:3], *([f"... and {len(remarks) - 3} more like these."] if len(remarks) > 3 else [])]:
         warn(sentence)
     return without(capture, kept, failed), written
 
@@ -231,9 +231,9 @@ def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: 
         if splits.count("train") >= 2:
             unlisted = given.count(None)
             if unlisted:
-                warn(f"{unlisted} images are in none of the splits that the source states; they are used for training.")
+                warn(f"{unlisted} images are in none of the source's splits; they are used for training.")
             return splits
-        warn(f"The source states {splits.count('train')} images for training; at least 2 are needed, and its split is not used.")
+        warn(f"The source's split has {splits.count('train')} training images; at least 2 are needed. The split is not used.")
     order = sorted(range(len(photos)), key=lambda index: photos[index].camera.name)
     test = set(order[::every][: max(0, len(photos) - 2)])
     return ["test" if index in test else "train" for index in range(len(photos))]

@@ -27,26 +27,26 @@ LEAST_SIDE = 1e-9  # of a crop box, in the capture's units
 class PosesSettings:
     """How a source is read and framed."""
 
-    format: Format = setting("auto", "Format of the source; auto: found out from its files.")
+    format: Format = setting("auto", "Format of the source; auto: detected from its files.")
     max_image_size: Annotated[int, Meta(ge=32, le=16384)] = setting(
-        1024, "Longest side of the images that later stages read; larger ones are reduced.", unit="pixels"
+        1024, "Longest side of the images that later stages read; larger images are downscaled.", unit="pixels"
     )
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "Axis of the capture's frame that points up; auto: estimated.")
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "Up axis of the capture's frame; auto: estimated.")
     crop_box: tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] | Auto = setting(
-        "auto", "Crop box in the capture's frame: x y z of one corner, then of the opposite one; auto: estimated."
+        "auto", "Crop box in the capture's frame: x y z of one corner, then of the opposite corner; auto: estimated."
     )
     box_margin: Annotated[float, Meta(ge=0.0, le=2.0)] = setting(
         0.05, "Margin on each side of an estimated crop box, as a fraction of its longest side.", advanced=True
     )
     space: Literal["auto", "box", "contracted", "ndc"] = setting(
         "auto",
-        "Space of the field: the box alone, with a background without depth beyond it (box); all of an unbounded scene (contracted); or normalised device"
-        " coordinates, for forward-facing captures (ndc); auto: ndc for forward-facing LLFF folders, box for objects with alpha, else contracted.",
+        "Space of the field: a box, with a background without depth around it (box), an unbounded scene (contracted), or normalised device coordinates for"
+        " forward-facing captures (ndc); auto: ndc for forward-facing LLFF folders, box for objects with alpha, else contracted.",
     )
     masks: Literal["auto", "silhouette", "ignore"] = setting(
         "auto",
-        "What masks and alpha channels mean: outside of them is background, and the object alone is trained, on random colours (silhouette), or pixels outside"
-        " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
+        "What masks and alpha channels mean: pixels outside are background, and only the object is trained, on random colours (silhouette), or pixels"
+        " outside are not used (ignore); auto: silhouette for renders with alpha, and where masks keep one compact object in nearly all photographs.",
     )
     mask_from: Annotated[
         str,
@@ -56,56 +56,53 @@ class PosesSettings:
         ),
     ] = setting(
         "auto",
-        "What silhouettes are made from where photographs have no masks: the subject as a first quick training of the scene finds it (foreground), a background"
-        " that stands still while the object turns (static), a screen of one colour (green, white, #rrggbb), or nothing (off); auto: static where cameras found"
-        " by the object alone show that it turned.",
+        "How silhouettes are made where photographs have no masks: the subject is found by a short first training (foreground), the background stands still"
+        " while the object turns (static), the background has one colour (green, white, #rrggbb), or not at all (off); auto: static where cameras found from"
+        " the object alone show that it turned.",
         advanced=True,
     )
     mask_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
-        "off", "ONNX file of a network that tells a subject from its background (as rembg has them), by which silhouettes are made; off: none.", advanced=True
+        "off", "ONNX file of a network that segments the subject (as rembg uses them), to make silhouettes; off: none.", advanced=True
     )
     features_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
-        "off",
-        "ONNX file of a network that detects features (ALIKED), by which photographs are matched that have no camera else; off: none.",
-        advanced=True,
+        "off", "ONNX file of a network that detects features (ALIKED), for photographs that get no camera otherwise; off: none.", advanced=True
     )
     matcher_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
         "off", "ONNX file of a network that matches these features (LightGlue); off: none.", advanced=True
     )
     mask_polarity: Literal["auto", "white", "black"] = setting(
         "auto",
-        "What is kept of given masks: what is not black in them (white), or what is (black); auto: white, unless black shows one compact object in nearly all.",
+        "Which pixels masks keep: those that are not black (white), or those that are (black); auto: white, unless black shows one compact object in nearly"
+        " all masks.",
         advanced=True,
     )
     test_every: Annotated[int, Meta(ge=2, le=10**6)] = setting(
-        8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True
+        8, "Every n-th image in sorted order is a test view, unless the source has a split.", advanced=True
     )
-    llff_factor: PositiveInt | Auto = setting(
-        "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
-    )
+    llff_factor: PositiveInt | Auto = setting("auto", "Downscale factor n of the LLFF images (images_n); auto: the largest images available.", advanced=True)
     frames: Annotated[int, Meta(ge=3, le=10_000)] = setting(
-        150, "Most frames that are chosen of videos, of all of them together: the sharpest ones that differ.", advanced=True
+        150, "Maximum number of frames from all videos together; the sharpest ones that differ are chosen.", advanced=True
     )
-    strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
+    strict: bool = setting(False, "Refuse a source with missing, unreadable or unregistered images, instead of warning.")
     allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
     lens: Literal["auto", "perspective", "fisheye", "equirectangular"] = setting(
         "auto",
-        "What photographs and videos show: what a usual lens projects (perspective), a fisheye lens (fisheye), or 360 degrees (equirectangular), which are cut"
-        " into views of pinhole cameras; auto: fisheye where EXIF names such a lens, 360 degrees where a picture is twice as wide as high and XMP says so.",
+        "Lens of photographs and videos: an ordinary lens (perspective), a fisheye lens (fisheye), or 360 degrees (equirectangular), which is cut into"
+        " pinhole views; auto: fisheye where EXIF names such a lens, 360 degrees where an image is twice as wide as high and XMP says so.",
         advanced=True,
     )
     matching: Literal["auto", "exhaustive", "retrieval", "sequential"] = setting(
         "auto",
-        "Which photographs are matched: all pairs (exhaustive), each with those that look most like it (retrieval), or with those that follow (sequential);"
-        " auto: exhaustive for up to 60, else retrieval.",
+        "Which photographs are matched: all pairs (exhaustive), each with the most similar ones (retrieval), or each with the ones that follow (sequential);"
+        " auto: exhaustive for up to 60 photographs, else retrieval.",
     )
     max_features: Annotated[int, Meta(ge=256, le=65536)] | Auto = setting(
-        "auto", "Most features detected in a photograph; auto: 4096, of more than 60 photographs 2048.", advanced=True
+        "auto", "Maximum number of features per photograph; auto: 4096, or 2048 for more than 60 photographs.", advanced=True
     )
     feature_image_size: Annotated[int, Meta(ge=320, le=8192)] = setting(
-        1600, "Longest side of the photographs in which features are detected.", unit="pixels", advanced=True
+        1600, "Longest side of the images in which features are detected.", unit="pixels", advanced=True
     )
-    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = setting(0, "Seed of every random choice in finding cameras.", advanced=True)
+    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = setting(0, "Seed of all random choices in finding cameras.", advanced=True)
 
 
 def files(source: Path, settings: PosesSettings) -> list[Path]:

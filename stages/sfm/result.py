@@ -158,7 +158,7 @@ def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: fl
     if agreement < 0.8:
         warnings.append(
             f"Only {agreement:.0%} of the verified matches agree with the cameras found: repeated structure may have folded the scene. "
-            "Look at the cameras before training."
+            "Check the cameras before training."
         )
     lenses: dict[tuple[float | None, str, int, int, int], Camera] = {}  # one of each: with intrinsics of their own they have much the same focal length
     for camera, prior in zip(cameras, priors, strict=True):

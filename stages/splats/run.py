@@ -82,7 +82,7 @@ def run(job: Job) -> None:
     outputs, settings = SplatsOutputs(job.out), job.settings
     if settings.make == "off":
         write_json(outputs.report, {"gaussians": 0, "made": False})
-        job.say("none are made (splats.make=off)", gaussians=0)
+        job.say("skipped (splats.make=off)", gaussians=0)
         return
     try:
         _make(job, outputs, settings)
@@ -90,7 +90,7 @@ def run(job: Job) -> None:
         if settings.make == "on":
             raise
         write_json(outputs.report, {"gaussians": 0, "made": False, "reason": str(error)})
-        job.warn(f"no Gaussians are made, and the run goes on: {error}")
+        job.warn(f"no Gaussians are made; the run continues: {error}")
 
 
 def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:

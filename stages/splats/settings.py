@@ -20,27 +20,27 @@ class SplatsSettings:
 
     make: Literal["auto", "on", "off"] = setting(
         "auto",
-        "Whether the run makes 3D Gaussians of its asset; auto: where there is memory for it and something shows; 'enerf export RUN --splats' makes them in any"
-        " case.",
+        "Whether the run makes 3D Gaussians from its asset; auto: if there is enough memory and the asset shows something; 'enerf export RUN --splats'"
+        " always makes them.",
         advanced=True,
     )
     region: Literal["foreground", "all"] = setting(
-        "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject with what supports it (foreground).", advanced=True
+        "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject and what it stands on (foreground).", advanced=True
     )
-    count: Annotated[int, Meta(ge=1, le=MOST)] = setting(200_000, "Most Gaussians; no more are made than a picture has pixels.", advanced=True)
+    count: Annotated[int, Meta(ge=1, le=MOST)] = setting(200_000, "Maximum number of Gaussians; no more are made than an image has pixels.", advanced=True)
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
     iterations: Count | Auto = setting(
         "auto",
-        "Steps in which they are fitted to pictures, each of a picture or of rows of a large one; 0: none; auto: four passes over all pixels, at least 300 and"
-        " at most 900.",
+        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: four passes over all pixels, at least 300 and at most 900 steps.",
         advanced=True,
     )
     pictures: Literal["photographs", "asset"] = setting(
         "photographs",
-        "What they are fitted to: the training photographs, or the asset's own renders, as in any case where region is foreground.",
+        "Images that they are trained on: the training photographs (photographs), or renders of the asset (asset), which are always used if region is"
+        " foreground.",
         advanced=True,
     )
-    seed: Seed = setting(0, "Seed of the order of the pictures.", advanced=True)
+    seed: Seed = setting(0, "Seed of the order of the images.", advanced=True)
 
 
 STAGE = Stage(name="splats", version=5, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))

@@ -65,10 +65,10 @@ class Checkpoints:
             try:
                 seconds = _restore(t, path, last)
             except (CorruptArtifact, ValueError, OSError) as error:
-                self.job.warn(f"{path.name} can't be used ({printable(error, 300)}); going on from the one before it")
+                self.job.warn(f"{path.name} can't be used ({printable(error, 300)}); resuming from the previous one")
                 remove(path)
                 continue
-            self.job.say(f"training goes on from step {t.step}")
+            self.job.say(f"resuming training from step {t.step}")
             return seconds
         return 0.0
 

@@ -83,12 +83,12 @@ def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
     first, last = np.array([(view.near, view.far) for view in s.views], np.float64).T
     scale = float(s.world_from_capture.scale)
     stated, own = (f"{a / scale:.3g} to {b / scale:.3g}" for a, b in ((near, far), (first.min(), last.max())))
-    ranges = f"train.near_plane and train.far_plane are {stated} in the capture's units, and the scene lies {own} before the cameras"
+    ranges = f"train.near_plane and train.far_plane are {stated} in the capture's units, and the scene is {own} from the cameras"
     inside = np.minimum(last, far) - np.maximum(first, near)
     if (inside <= 0).all():
-        raise UsageError(f"{ranges}: rays would miss all of it. Leave both auto, or state planes around it.")
+        raise UsageError(f"{ranges}: rays would miss all of it. Leave both auto, or set planes that enclose it.")
     if np.median(inside / (last - first)) < 1 - CUT_SHARE:
-        warn(f"{ranges}: rays miss a part of it. Leave both auto, or state planes around it.")
+        warn(f"{ranges}: rays miss a part of it. Leave both auto, or set planes that enclose it.")
 
 
 def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | None:

@@ -73,7 +73,7 @@ def begin_exposure(
     if choice == "auto" and not differs(fit):
         return None
     stops = fit.gains.mean(axis=1) / np.log(2)
-    say(f"exposure is learned: the photographs lie {stops.min():+.2f} to {stops.max():+.2f} stops from their mean")
+    say(f"learning exposure: photographs differ from their mean by {stops.min():+.2f} to {stops.max():+.2f} stops")
     return exposure_of(cameras, fit.gains, fit.vignetting, device)
 
 

@@ -116,8 +116,8 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
         return None
     pixels = count_pixels(tuple(views))
     job.warn(
-        f"the training pixels, {size_text(pixels * channels)}, are kept in a file, for they do not fit into memory with the rest: reading them takes longer."
-        " Give more by --memory, or lower poses.max_image_size."
+        f"the training pixels, {size_text(pixels * channels)}, do not fit into memory and are kept in a file, which is slower to read."
+        " Raise --memory, or lower poses.max_image_size."
     )
     return PixelFile(pixels, channels, job.work)
 

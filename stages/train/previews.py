@@ -69,7 +69,7 @@ class Previews:
             except Exception as error:  # whatever a decoder raises
                 if isinstance(error, OSError) and is_denied(error):
                     raise  # nothing is wrong with the file
-                warn(f"{path.name} of an earlier attempt can't be used ({printable(error, 200)}); it is left out")
+                warn(f"{path.name} of an earlier attempt can't be used ({printable(error, 200)}) and is left out")
                 continue
             folder.mkdir(exist_ok=True)
             shutil.copyfile(path, folder / path.name)

@@ -57,8 +57,8 @@ def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> tuple[P
     for prior in found:
         if prior.contradicted > MAX_CONTRADICTED:
             job.warn(
-                f"the prior {prior.name} is not used: it would keep {100 * prior.masked:.0f} % of the scene empty, in which {100 * prior.contradicted:.0f} % "
-                "of the reliable sparse points lie. Some cameras may be wrong: look at their picture in the report."
+                f"the prior {prior.name} is not used: it would keep {100 * prior.masked:.0f} % of the scene empty, but {100 * prior.contradicted:.0f} % "
+                "of the reliable sparse points lie there. Some cameras may be wrong. Check their picture in the report."
             )
     return found
 

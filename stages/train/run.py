@@ -120,7 +120,7 @@ def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> S
     """Rays to sparse points. A message says where there are points and none can be used."""
     found = sparse_depth_of(folder, s, settings.seed)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
-        job.say("no sparse point lies before enough of the training cameras that observe it: train.sparse_depth_loss_weight has no effect")
+        job.say("no sparse point is in front of enough of the training cameras that observe it; train.sparse_depth_loss_weight has no effect")
     return found
 
 

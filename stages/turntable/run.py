@@ -40,7 +40,7 @@ def cameras_of(tree: NerfTree, s: TurntableSettings, warn: Warn = lambda text: N
         tree, frames=s.frames, width=s.width, height=s.height, elevation=resolved(s.elevation), radius=resolved(s.radius), fov=resolved(s.fov),
         sway=resolved(s.sway),
         path=s.path, surroundings=s.region == "all" and tree.region is not None,
-        unused=lambda name, path: warn(f"turntable.{name}={getattr(s, name):g} has no effect: the camera's path is {path} (turntable.path={s.path})"),
+        unused=lambda name, path: warn(f"turntable.{name}={getattr(s, name):g} has no effect: the camera path is {path} (turntable.path={s.path})"),
     )  # fmt: skip
 
 

@@ -197,7 +197,7 @@ def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras
             sentence = f"The asset shows hardly more than one colour: {figures['psnr']:.1f} dB on {figures['views']}, a picture of the mean colour has"
             sentence += f" {figures['mean_colour']:.1f} dB."
         else:
-            sentence = f"The asset's pictures are {'strongly ' if grade == 'poor' else ''}blurred: {figures['psnr']:.1f} dB on {figures['views']},"
+            sentence = f"The asset's renders are {'strongly ' if grade == 'poor' else ''}blurred: {figures['psnr']:.1f} dB on {figures['views']},"
             sentence += f" {blur_in_words(blur)}, where captures that went well have {100 * USABLE_BLUR:.2f} % at most."
         found.append(ResultProblem("pictures", grade, sentence, *_cause(metrics, figures, cameras, strip)))
     off = figures["psnr_colour_fitted"] - figures["psnr"]
@@ -273,7 +273,7 @@ def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     if holes is None or holes <= HOLES or (excess is not None and excess <= 0):
         return []
     sentence = f"The asset has holes: {100 * holes:.1f} % of the pixels show through where the network shows something solid."
-    remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or give them more room (bake.max_mib)."
+    remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or allow a larger asset (bake.max_mib)."
     usual = ("Voxels that few rays see were left out.", remedy)
     return [ResultProblem("holes", "poor" if holes > MANY_HOLES else "usable", sentence, *(_short(metrics) or usual), strip)]
 

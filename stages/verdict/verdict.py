@@ -223,7 +223,7 @@ def _of_moving_parts(capture: Capture) -> list[Problem]:
     if large:
         sentence += " So many matches are of it that the cameras may be wrong."
     remedy = (
-        "Leave it out: masks beside the photographs (masks/, black over it), or --mask-model where the subject itself stands still."
+        "Leave it out: masks next to the photographs (masks/, black over it), or --mask-model where the subject itself stands still."
         " Or photograph again while nothing moves."
     )
     grade = "poor" if large else "usable" if len(names) > SHARE * len(capture.photos) else "good"

@@ -111,9 +111,9 @@ def _looked(name: str, path: Path, place: int, reader: Reader) -> Looked:
             found = look(path, reader)
         note(file, asdict(found))
     if found.damaged:
-        reader.warn(f"{name}: damaged; {found.damaged} of its frames or packets are left out.")
+        reader.warn(f"{name}: damaged: {found.damaged} frames or packets are skipped.")
     if found.hdr:
-        reader.warn(f"{name}: high dynamic range ({found.hdr}); its colours are taken as those of a usual screen. Film with HDR off for true ones.")
+        reader.warn(f"{name}: high dynamic range ({found.hdr}); its colours are read as SDR and may be off. Film with HDR off.")
     return found
 
 

@@ -25,15 +25,15 @@ LAYOUTS = ("compact", "packed", "small", "sparse", "full", "full32")
 @click.command()
 @click.argument("first", metavar="A", type=folder_type)
 @click.argument("second", metavar="B", type=folder_type)
-@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, on the orbit of A.")
-@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels along a side of the renders.")
+@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, on an orbit of A.")
+@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Side of the renders in pixels.")
 @json_option
 @quiet_option
 @common_options
 def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet: bool) -> int:
-    """Show which metadata and tensors of the assets (or runs) A and B differ, and the PSNR between their renders.
+    """Compare the assets (or runs) A and B: metadata and tensors that differ, and the PSNR between their renders.
 
-    Exit code 0 if they are equal, 6 if they differ, 4 if one is damaged.
+    The exit code is 0 if they are equal, 6 if they differ, 4 if one is damaged.
     """
     found = compare(first, second, views, size)
     code = 0 if found["equal"] else DIFFERENT
@@ -47,9 +47,9 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 @click.command()
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.argument("out", metavar="OUT", type=folder_type)
-@click.option("--layout", type=click.Choice(LAYOUTS), help="Layout of the voxels in OUT; by default that of ASSET.")
+@click.option("--layout", type=click.Choice(LAYOUTS), help="Voxel layout of OUT; by default that of ASSET.")
 @click.option("--sh-degree", "degree", type=click.IntRange(0, 4), help="Keep the spherical harmonics up to this degree.")
-@click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side, of the innermost cascade; fewer than there are.")
+@click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side, or of the innermost cascade; fewer than ASSET has.")
 @force_option
 @json_option
 @quiet_option
@@ -57,9 +57,9 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Write the asset of RUN, or ASSET, to the file OUT.
 
-    compact: 4 bytes a voxel and one for each harmonic above the first; packed: the same, entropy-coded, to send or keep; small: 6 bytes; sparse:
-    16-bit floats; full: all voxels of each brick, 16-bit floats, or 32-bit ones as full32. OUT appears whole or not at all; an existing file is
-    replaced with --force only, a file of a run never.
+    Layouts: compact (4 bytes per voxel, and one per harmonic above the first), packed (the same, entropy-coded, to send or keep), small (6 bytes per
+    voxel), sparse (16-bit floats), full (all voxels of each brick, 16-bit floats), full32 (the same, 32-bit floats). OUT is written completely or
+    not at all. An existing file is replaced only with --force, a file of a run never.
     """
     if out.suffix.lower() != ".nerftree":
         raise UsageError(f"{out}: the extension {out.suffix!r} is not that of an asset; expected .nerftree. For meshes and points: enerf export")
@@ -76,19 +76,19 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
 
 @click.command()
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
-@click.option("--no-browser", is_flag=True, help="Only make the page, and say where it is.")
-@click.option("--serve", "port", metavar="PORT", type=click.IntRange(0, 65535), help="Serve the page on this port until Ctrl-C; 0: one that is free.")
-@click.option("--address", metavar="IP", help="With --serve: the interface to listen on, 127.0.0.1 by default; on others, whoever reaches it may look.")
-@click.option("--force", is_flag=True, help="Make the page again even if there is one of the present asset.")
+@click.option("--no-browser", is_flag=True, help="Only write the page and print its path.")
+@click.option("--serve", "port", metavar="PORT", type=click.IntRange(0, 65535), help="Serve the page on this port until Ctrl-C; 0: any free port.")
+@click.option("--address", metavar="IP", help="With --serve: address to listen on, 127.0.0.1 by default. Everyone who can reach it can view the page.")
+@click.option("--force", is_flag=True, help="Rewrite the page even if it is up to date.")
 @json_option
 @quiet_option
 @common_options
 def view(what: Path, no_browser: bool, port: int | None, address: str | None, force: bool, as_json: bool, quiet: bool) -> None:
-    """Open the viewer page of RUN or ASSET, which needs no network: RUN/viewer.html, made if it is missing, older than the asset or written by another; for
-    an asset file a new one in a temporary folder.
+    """Open the viewer page of RUN or ASSET, which works offline. For a run it is RUN/viewer.html, rewritten if it is missing, out of date or of another
+    version. For an asset file it is a new page in a temporary folder.
 
-    With --serve, the stages, curves and previews of a RUN are shown while it trains, and the viewer once there is an asset. From another machine:
-    'ssh -L 8000:localhost:PORT HOST', then http://localhost:8000/. The server reads, and answers for these pages alone.
+    With --serve, the page shows the stages, curves and previews of a RUN while it trains, and the viewer once there is an asset. From another machine:
+    'ssh -L 8000:localhost:PORT HOST', then http://localhost:8000/. The server only reads files, and serves only these pages.
     """
     loopback = check_address(address, port)
     if port is None:

@@ -46,24 +46,24 @@ Crop = tuple[float, float, float, float, float, float] | None
 @click.argument("what", metavar="RUN|ASSET", required=False, type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
-@click.option("--list", "as_list", is_flag=True, help="All formats: what they keep and lose, what they need, who opens them.")
-@click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
-@click.option("--splats", "as_splats", is_flag=True, help="3D Gaussians instead of a mesh.")
+@click.option("--list", "as_list", is_flag=True, help="List all formats: what they keep and lose, what they need, which programs open them.")
+@click.option("--points", "as_points", is_flag=True, help="Write points instead of a mesh.")
+@click.option("--splats", "as_splats", is_flag=True, help="Write 3D Gaussians instead of a mesh.")
 @click.option(
-    "--region", type=click.Choice(REGIONS), help="The subject (foreground) or the whole scene (all); by default that of the stage: foreground, of splats all."
+    "--region", type=click.Choice(REGIONS), help="The subject (foreground) or the whole scene (all); by default foreground, and all for splats."
 )
 @crop_option
-@click.option("--faces", metavar="20k|100k|500k|N", help="Most faces of the mesh, in place of mesh.max_faces.")
+@click.option("--faces", metavar="20k|100k|500k|N", help="Maximum number of faces, instead of mesh.max_faces.")
 @click.option(
-    "--texture", type=click.Choice(TEXTURES), help="From the training photographs or the asset, in place of mesh.texture; off: colours of vertices alone."
+    "--texture", type=click.Choice(TEXTURES), help="Source of the texture, instead of mesh.texture; off: vertex colours only."
 )
-@click.option("--texture-size", metavar="N", help="Most texels along a side, in place of mesh.texture_size.")
+@click.option("--texture-size", metavar="N", help="Maximum number of texels along a side, instead of mesh.texture_size.")
 @click.option(
     "--normal-map/--no-normal-map",
     default=None,
-    help="The relief that decimation took away, beside the texture, in place of mesh.normal_map; materials are lit then.",
+    help="A normal map with the detail lost in decimation, instead of mesh.normal_map; materials are then lit.",
 )
-@click.option("--jpeg", is_flag=True, help="Textures as JPEG instead of PNG: smaller files.")
+@click.option("--jpeg", is_flag=True, help="Write textures as JPEG instead of PNG, for smaller files.")
 @force_option
 @memory_option
 @set_option
@@ -74,12 +74,11 @@ def export(
     what: Path | None, first: Path | None, more: tuple[Path, ...], as_list: bool, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool,
     **given: Any,
 ) -> None:
-    """Write the surface of RUN or ASSET as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl, with --points as .ply, .xyz, .las or .laz; with
-    --splats 3D Gaussians as .ply, .spz or .glb; its voxels as a volume (.vdb); all of it as a page for browsers (.html); or the cameras of RUN as .json
-    (nerfstudio).
+    """Export RUN or ASSET: a mesh as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl; with --points a point cloud as .ply, .xyz, .las or .laz; with
+    --splats 3D Gaussians as .ply, .spz or .glb; the voxels as a volume (.vdb); a viewer page (.html); or the cameras of RUN as .json (nerfstudio).
 
-    Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. What the run's stages mesh and splats
-    have made with the same settings is taken from there. Settings of the stages mesh, points and splats apply: '--set mesh.max_faces=...'.
+    Each file is written completely or not at all. An existing file is replaced only with --force, a file of a run never. Results of the run's stages mesh
+    and splats are reused if their settings are the same. Settings of the stages mesh, points and splats apply: '--set mesh.max_faces=...'.
     """
     if as_list:
         rows = exporting.formats()
@@ -133,15 +132,15 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
     "way",
     type=folder_type,
     metavar="orbit|sway|captured|JSON",
-    help="A circle, to and fro, past the captured cameras, or a camera path as nerfstudio exports it, in the frame of the capture.",
+    help="A circle, to and fro, past the captured cameras, or a camera path exported by nerfstudio, in the capture's frame.",
 )
-@click.option("--region", type=click.Choice(REGIONS), help="The whole scene (all, the default) or the subject alone (foreground).")
+@click.option("--region", type=click.Choice(REGIONS), help="The whole scene (all, the default) or only the subject (foreground).")
 @crop_option
-@click.option("--frames", type=click.IntRange(1, 9999), help="Frames of the turntable.")
-@click.option("--width", type=click.IntRange(16, 8192), help="Pixels; with --path in place of the file's.")
-@click.option("--height", type=click.IntRange(16, 8192), help="Pixels.")
+@click.option("--frames", type=click.IntRange(1, 9999), help="Number of frames of the turntable.")
+@click.option("--width", type=click.IntRange(16, 8192), help="Width in pixels; with a camera path, instead of the file's.")
+@click.option("--height", type=click.IntRange(16, 8192), help="Height in pixels; with a camera path, instead of the file's.")
 @click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb; by default the scene's environment, or white.")
-@click.option("--exr", type=click.Choice(EXR), help="Frames written as EXR too, with depth, normals and positions; in place of turntable.exr.")
+@click.option("--exr", type=click.Choice(EXR), help="Frames also written as EXR, with depth, normals and positions, instead of turntable.exr.")
 @click.option("--video", metavar="FILE", type=folder_type, help="Also write the frames as an MP4 (H.264).")
 @force_option
 @memory_option
@@ -152,11 +151,10 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 def render(
     what: Path, out: Path, way: Path | None, crop: Crop, video: Path | None, force: bool, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any
 ) -> None:
-    """Render the asset of RUN, or ASSET, on a turntable or along a camera path, into DIR.
+    """Render the asset of RUN, or ASSET, to DIR, on a turntable or along a camera path.
 
-    With all of a scene its surroundings are the background, unless one is given.
-    Settings of the stage turntable apply: '--set turntable.elevation=30'. Existing frames are replaced with --force only;
-    DIR cannot lie in a run.
+    With the whole scene, its surroundings are the background, unless one is given. Settings of the stage turntable apply:
+    '--set turntable.elevation=30'. Existing frames are replaced only with --force. DIR cannot be in a run.
     """
     if video is not None and video.suffix.lower() != ".mp4":
         raise UsageError(f"--video {video}: the extension {video.suffix!r} is not known; expected .mp4.")
@@ -209,8 +207,8 @@ def _restricted_with_cameras(
 @json_option
 @common_options
 def inspect(what: Path, as_json: bool) -> None:
-    """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, warnings; or a file that was
-    exported, a mesh, points or 3D Gaussians (.ply, .spz, .glb, of other programs too)."""
+    """Describe an asset, a run, a data set or a folder of photographs: number of images, resolution, camera model, bounds, warnings; or a mesh, points or
+    3D Gaussians (.ply, .spz, .glb), also from other programs."""
     found = describe(what)
     if as_json:
         write_json(found, indent=1)

@@ -22,11 +22,11 @@ INTERRUPTED = 128 + signal.SIGINT  # exit code
 COMMANDS = {  # name -> its module, and what `enerf --help` says of it
     "run": ("workflows.cli.run", "Run all stages on photographs or a data set, or resume a run."),
     "stage": ("workflows.cli.run", "Run one stage on the artifacts of a run."),
-    "fleet": ("workflows.fleet.command", "Run many scenes, here or on many machines; one bad scene stops no other."),
-    "check": ("workflows.inspection.command", "Say whether photographs will do, before anything is run."),
-    "status": ("workflows.cli.status", "Show for each stage whether it is up to date, and why not."),
+    "fleet": ("workflows.fleet.command", "Run many scenes, here or on many machines; a failed scene stops no other."),
+    "check": ("workflows.inspection.command", "Check photographs before a run."),
+    "status": ("workflows.cli.status", "Show which stages are up to date, and why not."),
     "verify": ("workflows.cli.verify", "Check every file against its recorded hash."),
-    "report": ("workflows.report.command", "Write a page about a run: renders, figures, settings."),
+    "report": ("workflows.report.command", "Write a page about a run: renders, metrics, settings."),
     "export": ("workflows.cli.files", "Write meshes, points, splats, volumes, a viewer or cameras."),
     "render": ("workflows.cli.files", "Render a turntable, or the cameras of a JSON path."),
     "inspect": ("workflows.cli.files", "Describe an asset, a run, a data set, a mesh or points."),
@@ -34,7 +34,7 @@ COMMANDS = {  # name -> its module, and what `enerf --help` says of it
     "convert": ("workflows.cli.assets", "Write an asset in another layout, resolution or degree."),
     "view": ("workflows.cli.assets", "Show a run or an asset in a browser."),
     "presets": ("workflows.cli.presets", "List presets and settings with their defaults and meaning."),
-    "paper": ("workflows.paper.command", "Reproduce a table of the paper, with its figures beside ours."),
+    "paper": ("workflows.paper.command", "Reproduce a table of the paper, next to our results."),
 }
 
 
@@ -59,11 +59,11 @@ class _Commands(click.Group):
     cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     epilog="Exit codes: 0 done; 2 usage or bad input; 3 a stage failed, or output could not be written; 4 corrupt artifact; 5 run locked; "
-    "6 assets differ, or a result that --fail-on names; 130, 143 interrupted.",
+    "6 assets differ, or --fail-on applies; 130, 143 interrupted.",
 )
 @click.version_option(package_name="efficientnerf", prog_name="enerf")
 def enerf() -> None:
-    """Photographs or posed data sets in, a baked 3D asset out.
+    """Turn photographs or posed data sets into a baked 3D asset.
 
     \b
     enerf run photos/ --out runs/mine      everything, from photographs to asset, turntable, mesh and points

@@ -15,16 +15,16 @@ from workflows.workflow import Workflow
 C = TypeVar("C", bound=Callable[..., Any])
 
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON on standard output instead of text.")
-quiet_option = click.option("--quiet", "-q", is_flag=True, help="Nothing but warnings and errors.")
-force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
-set_option = click.option("--set", "sets", multiple=True, metavar="STAGE.NAME=VALUE", help="A setting of a stage; may be repeated. 'enerf presets' lists them.")
-device_option = click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Device to compute on; auto: CUDA where there is one.")
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="Show only warnings and errors.")
+force_option = click.option("--force", is_flag=True, help="Replace existing files.")
+set_option = click.option("--set", "sets", multiple=True, metavar="STAGE.NAME=VALUE", help="Change a setting; may be repeated. 'enerf presets' lists them.")
+device_option = click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Device to compute on; auto: CUDA if available.")
 memory_option = click.option(
-    "--memory", metavar="SIZE", help="Memory that may be taken, as 512m, 8g or 1.5GiB; auto: what the machine or its control group has. Changes no result."
+    "--memory", metavar="SIZE", help="Memory limit, such as 512m, 8g or 1.5GiB; auto: that of the machine or its control group. Does not change results."
 )
 
 crop_option = click.option(
-    "--crop", nargs=6, type=float, metavar="X Y Z X Y Z", help="Only what lies in this box, two opposite corners in the capture's frame; in place of a region."
+    "--crop", nargs=6, type=float, metavar="X Y Z X Y Z", help="Crop to this box, two opposite corners in the capture's frame, instead of a region."
 )
 
 
@@ -54,4 +54,4 @@ def workflow() -> Workflow:
 
 def common_options(command: C) -> C:
     """--debug, which main() finds by itself, so that it holds for errors of the command line too."""
-    return click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error, and what libraries said.")(command)
+    return click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error, and the output of libraries.")(command)

@@ -15,11 +15,11 @@ from workflows.cli.resolve import Settings, meaning, nearest, preset_names, read
 
 @click.command()
 @click.argument("stages", nargs=-1, metavar="[STAGE]...")
-@click.option("--preset", metavar="NAME", help="Show the values of this preset in place of the defaults.")
+@click.option("--preset", metavar="NAME", help="Show the values of this preset instead of the defaults.")
 @json_option
 @common_options
 def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
-    """List the presets and the main settings with their defaults and meaning; with STAGE... all settings of these stages."""
+    """List the presets and the main settings with their defaults and meaning, or all settings of the given stages."""
     folder = workflow().presets
     types = {stage.name: stage.settings for stage in workflow().stages}
     for name in stages:

@@ -30,32 +30,32 @@ GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 
 @click.command()
 @click.argument("sources", nargs=-1, type=folder_type, metavar="[SOURCE]...")
-@click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="The folder of the run.")
-@click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE; by default it is detected. See poses.format in 'enerf presets poses'.")
+@click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="Folder of the run.")
+@click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE, detected by default. See poses.format in 'enerf presets poses'.")
 @click.option("--preset", metavar="NAME",
-              help="Preset to start from: tiny, preview (default without CUDA), standard (default with), high; nerf, paper, paper-n1 to -n4.")  # fmt: skip
+              help="Preset to start from: tiny, preview (default on the CPU), standard (default on CUDA), high; nerf, paper, paper-n1 to -n4.")  # fmt: skip
 @set_option
-@click.option("--config", type=folder_type, metavar="FILE", help="A TOML file with tables of settings, one for each stage.")
+@click.option("--config", type=folder_type, metavar="FILE", help="TOML file with a table of settings per stage.")
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
-@click.option("--from", "start", metavar="STAGE", help="Run this stage and those after it again, even if they are up to date.")
+@click.option("--from", "start", metavar="STAGE", help="Rerun this stage and the later ones, even if they are up to date.")
 @device_option
 @memory_option
-@click.option("--seed", type=int, help="Seed of every stage with random choices.")
-@click.option("--budget", metavar="TIME", help="Time for training the field and the asset, as 90s, 10m or 1h; sets train.time_budget and bake.time_budget.")
-@click.option("--target-mib", type=float, metavar="N", help="Largest size of the asset in MiB; sets bake.max_mib.")
-@click.option("--frames", type=int, metavar="N", help="Most frames that are chosen of videos, 150 by default; sets poses.frames.")
+@click.option("--seed", type=int, help="Random seed of all stages.")
+@click.option("--budget", metavar="TIME", help="Time for training and baking, such as 90s, 10m or 1h; sets train.time_budget and bake.time_budget.")
+@click.option("--target-mib", type=float, metavar="N", help="Maximum size of the asset in MiB; sets bake.max_mib.")
+@click.option("--frames", type=int, metavar="N", help="Maximum number of frames from videos, 150 by default; sets poses.frames.")
 @click.option("--mask", "mask_from", metavar="HOW",
-              help="Make silhouettes: foreground (the subject, found by a first quick training), static (the object turns before it) or a screen's colour:"
+              help="Make silhouettes: foreground (the subject, found by a short first training), static (the object turns, not the background) or a chroma key:"
               " green, white or #rrggbb; sets poses.mask_from.")  # fmt: skip
-@click.option("--mask-model", metavar="FILE", help="Make silhouettes by this network, an ONNX file as rembg has them; sets poses.mask_model.")
+@click.option("--mask-model", metavar="FILE", help="Make silhouettes with this network, an ONNX file as rembg uses them; sets poses.mask_model.")
 @click.option("--features-model", nargs=2, metavar="FILE FILE",
-              help="Match photographs that have no camera else by these networks, ONNX files of ALIKED and of LightGlue; sets poses.features_model and"
+              help="Match photographs that get no camera otherwise with these networks, ONNX files of ALIKED and LightGlue; sets poses.features_model and"
               " poses.matcher_model.")  # fmt: skip
-@click.option("--lens", metavar="LENS", help="fisheye, or equirectangular (360 degrees); sets poses.lens. By default photographs that say so are taken so.")
-@click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
+@click.option("--lens", metavar="LENS", help="fisheye, or equirectangular (360 degrees); sets poses.lens. Detected from metadata by default.")
+@click.option("--strict", is_flag=True, help="Refuse a source with missing, unreadable or unregistered images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
-@click.option("--fail-on", type=click.Choice(["poor", "failed"]), help="Exit with code 6 where the result is graded so, or worse; all files are written.")
-@click.option("--dry-run", is_flag=True, help="Show what would be done and why; do nothing.")
+@click.option("--fail-on", type=click.Choice(["poor", "failed"]), help="Exit with code 6 if the result has this grade or worse; all files are still written.")
+@click.option("--dry-run", is_flag=True, help="Show what would be done and why, and do nothing.")
 @json_option
 @quiet_option
 @common_options
@@ -66,11 +66,11 @@ def run(
     """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or resume RUN.
 
     SOURCE is a folder of photographs, a video, or the folder of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Several folders and
-    videos of one scene may be given at once. Without any, RUN is resumed with the settings that it recorded; options change them. Stages that are
-    up to date are skipped.
+    videos of one scene can be given. Without a SOURCE, RUN is resumed with its recorded settings; options change them. Stages that are up to date are
+    skipped.
 
-    The result is graded good, usable, poor or failed, in the first line and in RUN/evaluate/verdict.json with what to do; the exit code is 0 all the same,
-    unless --fail-on says otherwise.
+    The result is graded good, usable, poor or failed. The first line and RUN/evaluate/verdict.json show the grade and what to do. The exit code is 0 for
+    every grade, unless --fail-on is given.
     """
     options |= {"format": options.pop("format_name"), "source": sources[0] if sources else None, "also": sources[1:]}
     plan = plan_run(run_folder, workflow(), Options(**options))
@@ -84,12 +84,12 @@ def run(
 @click.option("--force", is_flag=True, help="Run it even if it is up to date.")
 @device_option
 @memory_option
-@click.option("--dry-run", is_flag=True, help="Show whether it would run and why; do nothing.")
+@click.option("--dry-run", is_flag=True, help="Show whether it would run and why, and do nothing.")
 @json_option
 @quiet_option
 @common_options
 def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Run the stage NAME of RUN on the artifacts of the stages before it, which are not run again; stale ones are named."""
+    """Run the stage NAME of RUN on the artifacts of earlier stages. Those are not rerun; stale ones are listed."""
     names = [each.name for each in workflow().stages]
     if name not in names:
         raise UsageError(f"{name}: no such stage.{nearest(name, names)} Stages: {', '.join(names)}.")

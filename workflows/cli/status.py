@@ -20,9 +20,9 @@ from workflows.inspection.status import run_status
 @json_option
 @common_options
 def status(run_folder: Path, as_json: bool) -> None:
-    """Show for each stage of RUN whether it is fresh, stale, missing, partial or corrupt, with the reason, its seconds and its size.
+    """Show for each stage of RUN whether it is fresh, stale, missing, partial or corrupt, and why; with its time and size.
 
-    A file of unchanged size and modification time counts as unchanged; 'enerf verify' hashes it.
+    Files with the same size and modification time count as unchanged; 'enerf verify' hashes them.
     """
     run = open_run(run_folder)
     found = run_status(run, survey(workflow().stages, run))

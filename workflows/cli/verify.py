@@ -22,8 +22,8 @@ from workflows.report.signature import altered_pages
 @quiet_option
 @common_options
 def verify(what: Path, as_json: bool, quiet: bool) -> None:
-    """Hash every file of RUN, its pages too, and compare it with the recorded hashes; or read ASSET, which carries its own hashes, and check every rule of its
-    format. Exit code 4 if anything was altered.
+    """Compare the hash of every file of RUN, its pages included, with the recorded one; or check the hashes in ASSET and every rule of its format. The exit
+    code is 4 if anything was altered.
     """
     if what.is_file():
         _verify_asset(what, as_json, quiet)

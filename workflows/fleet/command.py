@@ -42,15 +42,15 @@ class _Fleet(click.Group):
 
 @click.group(cls=_Fleet)
 def fleet() -> None:
-    """Many scenes by one command. Each is a run under FLEET, as 'enerf run' makes it.
+    """Run many scenes with one command. Each becomes a run under FLEET, as 'enerf run' makes it.
 
     \b
-    enerf fleet shoots/ --out fleet            a run for each folder in shoots/
-    enerf fleet scenes.toml --out fleet        scenes with settings of their own
+    enerf fleet shoots/ --out fleet            one run per folder in shoots/
+    enerf fleet scenes.toml --out fleet        scenes with their own settings
     enerf fleet status fleet
 
-    The same command again does what is missing or stale. 'enerf fleet run --help' lists the options. A folder that has the name of a command is
-    given as ./status.
+    Repeat the command to run what is missing or stale. 'enerf fleet run --help' lists the options. Write a folder with the name of a command as
+    ./status.
     """
 
 
@@ -58,10 +58,10 @@ def _placement_options(command: Any) -> Any:
     """Those that say where stages run."""
     for option in reversed((
         click.option("--jobs", type=click.IntRange(1, 1024), default=1, metavar="N",
-                     help="Stages at a time on each worker, beside one for each CUDA device; they share its cores and memory. By default 1."),
-        click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler whose workers are used, as tcp://host:8786."),
-        click.option("--cluster", type=click.Choice(CLUSTERS), help="Start a Dask cluster: local worker processes, by ssh, or jobs of a batch queue."),
-        click.option("--cluster-options", type=folder_type, metavar="FILE", help="A TOML file with the options of the cluster."),
+                     help="Number of concurrent CPU stages per worker, which share its cores and memory; each CUDA device runs one more. By default 1."),
+        click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler, such as tcp://host:8786."),
+        click.option("--cluster", type=click.Choice(CLUSTERS), help="Start a Dask cluster: local processes, over ssh, or jobs of a batch queue."),
+        click.option("--cluster-options", type=folder_type, metavar="FILE", help="TOML file with options of the cluster."),
         device_option,
         memory_option,
     )):  # fmt: skip
@@ -69,14 +69,14 @@ def _placement_options(command: Any) -> Any:
     return command
 
 
-@fleet.command(short_help="Run the scenes of a manifest, or go on with them.")
+@fleet.command(short_help="Run the scenes of a manifest, or resume them.")
 @click.argument("scenes", nargs=-1, required=True, metavar="SCENES...")
-@click.option("--out", "folder", required=True, type=folder_type, metavar="FLEET", help="The folder of the fleet.")
-@click.option("--preset", metavar="NAME", help="Preset to start from, for all scenes.")
+@click.option("--out", "folder", required=True, type=folder_type, metavar="FLEET", help="Folder of the fleet.")
+@click.option("--preset", metavar="NAME", help="Preset for all scenes.")
 @set_option
 @click.option("--root", "roots", multiple=True, type=folder_type, metavar="FOLDER",
-              help="A folder beside the manifest's own that its sources may lie in; may be repeated.")  # fmt: skip
-@click.option("--seed", type=int, help="Seed of every stage with random choices.")
+              help="Allow sources in this folder, besides that of the manifest; may be repeated.")  # fmt: skip
+@click.option("--seed", type=int, help="Random seed of all stages.")
 @click.option("--sweep", "sweeps", multiple=True, metavar="STAGE.NAME=A,B,...", help="Run each scene with each of these values; may be repeated.")
 @_placement_options
 @json_option
@@ -86,10 +86,10 @@ def run(
     scenes: tuple[str, ...], folder: Path, preset: str | None, sets: tuple[str, ...], seed: int | None, sweeps: tuple[str, ...], roots: tuple[Path, ...],
     as_json: bool, quiet: bool, **options: Any,
 ) -> int:  # fmt: skip
-    """Run SCENES under FLEET: a manifest (.toml, .csv), a folder of scenes, a pattern as 'shoots/*/', or several folders and videos.
+    """Run SCENES under FLEET: a manifest (.toml, .csv), a folder of scenes, a pattern such as 'shoots/*/', or several folders and videos.
 
-    A scene that fails is tried again where that may help, and else set aside with the reason; the others go on. Exit code 0 where all scenes are
-    done, 3 where some are not.
+    A scene that fails is retried if that may help, otherwise quarantined with the reason; the others continue. The exit code is 0 if all scenes are
+    done, otherwise 3.
     """
     check_fleet_folder(folder)
     if preset is not None:
@@ -100,12 +100,12 @@ def run(
     return _run(folder, chosen, as_json=as_json, quiet=quiet, retry=None, **options)
 
 
-@fleet.command(short_help="Show what became of each scene.")
+@fleet.command(short_help="Show the state of each scene.")
 @click.argument("folder", metavar="FLEET", type=folder_type)
 @json_option
 @common_options
 def status(folder: Path, as_json: bool) -> None:
-    """Show the state of each scene of FLEET, and who runs it."""
+    """Show the state of each scene of FLEET, and which process runs it."""
     found, holder = read_fleet(folder), holder_of(folder)
     if as_json:
         write_json({**msgspec.to_builtins(found), "written_by": None if holder is None else holder.text()}, indent=1)
@@ -117,7 +117,7 @@ def status(folder: Path, as_json: bool) -> None:
         listing("The process that ran it has ended. Give the fleet's command again to go on.")
 
 
-@fleet.command(short_help="Try failed and quarantined scenes again.")
+@fleet.command(short_help="Retry failed and quarantined scenes.")
 @click.argument("folder", metavar="FLEET", type=folder_type)
 @click.argument("names", nargs=-1, metavar="[SCENE]...")
 @_placement_options
@@ -125,7 +125,7 @@ def status(folder: Path, as_json: bool) -> None:
 @quiet_option
 @common_options
 def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> int:
-    """Try the failed and quarantined scenes of FLEET again, or those that are named: by the process that runs it, or here."""
+    """Retry the failed and quarantined scenes of FLEET, or only the given ones. The process that runs FLEET does it; if there is none, this one."""
     chosen = scenes_to_retry(read_fleet(folder).scenes, names)
     if is_running(folder):
         outcome = requests.outcome(requests.ask(folder, "retry", chosen), lambda: is_running(folder))
@@ -136,12 +136,12 @@ def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **op
     return _run(folder, None, as_json=as_json, quiet=quiet, retry=chosen, **options)
 
 
-@fleet.command(short_help="Stop a fleet that runs, or some of its scenes.")
+@fleet.command(short_help="Stop a running fleet, or some of its scenes.")
 @click.argument("folder", metavar="FLEET", type=folder_type)
 @click.argument("names", nargs=-1, metavar="[SCENE]...")
 @common_options
 def cancel(folder: Path, names: tuple[str, ...]) -> None:
-    """Let the process that runs FLEET, here or elsewhere, stop at the next safe point; or only the scenes that are named. What is done is kept."""
+    """Stop FLEET, or only the given scenes, at the next safe point, on whichever machine it runs. Finished work is kept."""
     known = {scene.name for scene in read_fleet(folder).scenes}
     unknown = [name for name in names if name not in known]
     if unknown:

@@ -84,10 +84,10 @@ def in_words(found: dict[str, Any]) -> list[str]:
 
 
 def _of_the_run(about: dict[str, Any]) -> str:
-    room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are: a lower --target-mib takes less"
+    room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} available; lower --target-mib"
     memory = f"up to about {size(about['run_bytes'])} of memory{room}"
     if about["run_seconds"] is None:
-        return f"Then training, for as long as --budget says, or 'enerf presets' has it; {memory}."
+        return f"Then training, for the time set by --budget or the preset; {memory}."
     longest = sorted(about["stage_seconds"].items(), key=lambda stage: -stage[1])[:3]
     stages = ", ".join(f"{name} {duration(took)}" for name, took in longest)
     return f"All stages of the preset {CPU_PRESET}: about {duration(about['run_seconds'])} ({stages}), and {memory}."

@@ -13,17 +13,17 @@ from workflows.inspection.check import check_source, in_words
 
 @click.command()
 @click.argument("source", metavar="SOURCE", type=folder_type)
-@click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE; by default it is detected. See poses.format in 'enerf presets poses'.")
+@click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE, detected by default. See poses.format in 'enerf presets poses'.")
 @set_option
 @memory_option
 @json_option
 @quiet_option
 @common_options
 def check(source: Path, format_name: str | None, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool) -> int:
-    """Look at the photographs of the folder SOURCE, or at the frames that are chosen of a video: sharpness, exposure, focal lengths, sizes, overlap on
-    small pictures; and say what is likely to go wrong, what to do, and what finding their cameras and a whole run will take here on the CPU.
+    """Check the photographs in the folder SOURCE, or frames of a video, before a run: sharpness, exposure, focal lengths, sizes, and overlap on small images.
+    Report likely problems and what to do, and estimate the time and memory of camera poses and of a full run on this CPU.
 
-    The grade is good, usable, poor or failed. Exit code 0, and 2 where no cameras can be found of them.
+    The grade is good, usable, poor or failed. The exit code is 0, or 2 if no cameras can be found.
     """
     settings = ("poses.format=" + format_name,) if format_name else ()
     found = check_source(source, (*sets, *settings), memory_limit(memory), workflow())

@@ -16,17 +16,17 @@ from workflows.paper.document import Request, make
 
 @click.command()
 @click.argument("table", metavar="TABLE")
-@click.option("--data", type=folder_type, metavar="DIR", help="A data set, or a folder of data sets (table 7 needs none).")
+@click.option("--data", type=folder_type, metavar="DIR", help="Data set, or folder of data sets (table 7 needs none).")
 @click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder of the table and its runs, which are resumed.")
 @click.option("--scale", type=click.FloatRange(1e-5, 1.0), default=1.0, show_default=True,
-              help="Scale of iterations, resolution, networks and grids; stated in the table.")  # fmt: skip
+              help="Scale of iterations, resolution, networks and grids; the table reports it.")  # fmt: skip
 @device_option
 @json_option
 @quiet_option
 @common_options
 def paper(table: str, data: Path | None, out: Path, scale: float, device: str | None, as_json: bool, quiet: bool) -> None:
     """Reproduce TABLE of the paper: 1 shares of samples, 2 quality and speed, 3 N1 to N4, 4 sizes of the networks, 5 modules one by one, 6 sampling
-    strategies, 7 NerfTree against other structures. Writes DIR/table_N.md, .json and, where something is trained, .png.
+    strategies, 7 NerfTree against other structures. Writes DIR/table_N.md, .json and, if something is trained, .png.
     """
     check_folder(out)
     with display(as_json=as_json, quiet=quiet) as show:

@@ -120,7 +120,7 @@ def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | N
         job.warn(unusable(path, error))
         remove(path)
         return None
-    job.say(f"the refinement goes on from step {state.step}")
+    job.say(f"resuming the refinement from step {state.step}")
     return Point(state, schedule, about.phase, about.pruned, about.seconds, about.began, about.allotted)
 
 

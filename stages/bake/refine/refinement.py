@@ -212,7 +212,7 @@ def refined(
 def _unrefined(taken: int, usual: int) -> str:
     """The warning about a time budget that was too short, and what to do."""
     done = f"bake.time_budget left time for {taken} step{'' if taken == 1 else 's'} of the refinement, where {usual:,} are usual"
-    return f"{done}: the asset is hardly better than it was baked. Give more time (--budget) or fewer voxels (bake.max_mib), or run it while nothing else does."
+    return f"{done}: refinement hardly improved the asset. Give more time (--budget) or fewer voxels (bake.max_mib), or run it while the machine is idle."
 
 
 def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, thickness: float, *, timed: bool) -> Point:
@@ -261,8 +261,8 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
     if job.device == "cpu" or needed <= (free := free_on_device(job.device)):
         return targets.to(job.device)
     job.warn(
-        f"refining {voxels:,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} are free there:"
-        " they are refined on the CPU, which takes longer (lower bake.max_mib or bake.resolution for the device)"
+        f"refining {voxels:,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} GiB are free."
+        " They are refined on the CPU, which takes longer. Lower bake.max_mib or bake.resolution to use the device."
     )
     return targets
 

@@ -78,7 +78,7 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
         raise BadInput(f"{place}: {len(photos)} usable images; at least {MIN_IMAGES} are needed.")
     points = _sparse(model.points, ids) if model.points is not None and len(model.points.xyz) else None
     if points is None:
-        warnings.append(f"{where}: no points3D; the bounds are guessed from the cameras alone.")
+        warnings.append(f"{where}: no points3D; the bounds are estimated from the cameras alone.")
     return Capture(
         kind="colmap",
         photos=photos,

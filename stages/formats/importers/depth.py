@@ -84,7 +84,7 @@ def with_depth(capture: Capture, depth_of: Callable[[Photo], DepthFile | None]) 
     if unreadable:
         warnings.append(f"{len(unreadable)} of {len(known)} depth maps are not used, e.g. {unreadable[0]}.")
     if points is None and maps:
-        warnings.append("The depth maps confirm each other nowhere, and are not used: the poses and the depth may be in different units.")
+        warnings.append("The depth maps disagree everywhere and are not used: poses and depth may be in different units.")
     facts = capture.facts | {"depth_maps": len(maps), "depth_points": 0 if points is None else len(points.xyz)}
     return replace(capture, points=points, warnings=tuple(warnings), facts=facts)
 

@@ -120,7 +120,7 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
         warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
     document = _documents(source)[0][1]
     if len({file.name for file in json_files(folder)} & set(SPLIT_FILES)) and (folder / "transforms.json").is_file():
-        warnings.append(f"transforms.json is not read: {where} state the same with their splits.")
+        warnings.append(f"transforms.json is not read: {where} have the same frames, with splits.")
     points, point_warnings = _points(source, document)
     capture = Capture(
         kind=kind,
@@ -219,9 +219,9 @@ def _photos(source: Source, listing: Listing[_Frame]) -> tuple[list[Photo], list
         lost_masks += mask is None and "mask_path" in frame.entry
         photos.append(Photo(camera, source.real(image), None if mask is None else source.real(mask), ignore, frame.split))
     if rolling:
-        warnings.append(f"{rolling} frames state a rolling shutter (transform_matrix_start, _end); the pose in the middle is used.")
+        warnings.append(f"{rolling} frames have a rolling shutter (transform_matrix_start, _end); the middle pose is used.")
     if lost_masks:
-        warnings.append(f"{lost_masks} masks that are listed (mask_path) are missing; those images are used whole.")
+        warnings.append(f"{lost_masks} listed masks (mask_path) are missing; those images are used without one.")
     centred = [photo for photo in photos if 0 < photo.camera.intrinsics["cx"] < photo.camera.width and 0 < photo.camera.intrinsics["cy"] < photo.camera.height]
     if len(centred) < len(photos):
         warnings.append(f"{len(photos) - len(centred)} cameras have their principal point outside the image: cx, cy may belong to another size.")

@@ -90,7 +90,7 @@ def try_all(job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: S
                 continue
             trial = Trial(name, choices, result)
             note(path, asdict(trial))
-        job.say(f"second chance, {name}: {trial.result.psnr:.2f} dB after {SMALL.iterations} small steps", trial=asdict(trial))
+        job.say(f"second chance, {name}: {trial.result.psnr:.2f} dB after a short training of {SMALL.iterations} steps", trial=asdict(trial))
         trials.append(trial)
     return trials
 

@@ -26,7 +26,7 @@ from stages.train.checks.second_chances import best_of, finished, try_all
 from stages.train.choices import TrainingChoices, write
 
 DECIDED = "second_chances.json"
-REMEDY = "Look at the cameras and the photographs in the report, and try poses.masks=ignore where there are masks."
+REMEDY = "Check the cameras and photographs in the report. If there are masks, try poses.masks=ignore."
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Watch:
         if result is None or result.learning or self.decision is not None:
             return False
         if self.job.settings.on_failure == "stop":
-            raise StageFailed(f"train: {_in_words(result)}. {REMEDY} train.on_failure=continue goes on all the same.")
+            raise StageFailed(f"train: {_in_words(result)}. {REMEDY} Set train.on_failure=continue to train anyway.")
         if self.job.settings.on_failure == "continue":
             return False
         if step:
@@ -112,10 +112,10 @@ class Watch:
         best = best_of(trials)
         self.decision = _Decision(None, TrainingChoices(), seconds) if best is None else _Decision(best.name, best.choices, seconds)
         if best is None:
-            self.job.warn(f"none of {len(trials) - 1} second chances is clearly better than what is stated; training goes on. {REMEDY}")
+            self.job.warn(f"none of {len(trials) - 1} second chances is clearly better than the given settings; training continues. {REMEDY}")
         else:
             self._clear()
-            self.job.warn(f"training begins again with {best.name}: {best.result.psnr:.2f} dB in its short training, {trials[0].result.psnr:.2f} as stated")
+            self.job.warn(f"training restarts with {best.name}: {best.result.psnr:.2f} dB in its short training, {trials[0].result.psnr:.2f} dB without")
         note(self.job.work / DECIDED, asdict(self.decision))
         return best is not None
 

@@ -49,7 +49,7 @@ def train_and_check(job: Job, t: Trainer, pixels: Pixels, s: Scene, sparse_depth
 
 
 def _say(job: Job, c: ViewChecks, before: np.ndarray, views: tuple[View, ...]) -> None:
-    for which, what in ((c.left_out & ~before, "left out of training for now: their cameras seem wrong"), (before & ~c.left_out, "trained on again")):
+    for which, what in ((c.left_out & ~before, "left out of training for now because their cameras seem wrong"), (before & ~c.left_out, "trained on again")):
         if which.any():
             names = ", ".join(printable(view.name, 60) for view, one in zip(views, which, strict=True) if one)
             job.say(f"{int(which.sum())} of {len(views)} views are {what}: {names}")

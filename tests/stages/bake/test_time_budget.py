@@ -122,7 +122,7 @@ def test_an_interrupted_bake_keeps_to_its_plan(inputs: dict[str, Path], tmp_path
     events: list[dict[str, Any]] = []
     made = job(tmp_path, QUICK, stop=stop, events=events, **inputs)
     bake.run(made)
-    assert [event["text"] for event in events if "goes on" in event.get("text", "")] == [f"the refinement goes on from step {at}"]
+    assert [event["text"] for event in events if "resuming" in event.get("text", "")] == [f"resuming the refinement from step {at}"]
     assert 0.9 * SECONDS <= now[0] <= SECONDS
     steps = [line["step"] for line in read_lines(made.out / BakeOutputs.log)]
     assert steps == sorted(set(steps))

@@ -94,7 +94,7 @@ def test_val_stands_in_for_test_and_train_for_both_with_a_warning(tmp_path: Path
     job = job_in(tmp_path, make_scene(tmp_path / "poses", splits), report=events.append)
     measure(TREE, lambda: BallField(TREE, background=WHITE), job)
     assert figures_of(job)["split"] == expected
-    assert any("training saw" in event["text"] for event in events if event["event"] == "warning") == warned
+    assert any("training views" in event["text"] for event in events if event["event"] == "warning") == warned
 
 
 def test_on_photographs_the_asset_lies_over_the_networks_background(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_depth_that_no_other_image_confirms_is_left_out_with_a_word(tmp_path: Pa
     capture = read(folder)
     assert capture.points is None
     assert capture.facts["depth_points"] == 0
-    assert any("confirm each other nowhere" in warning for warning in capture.warnings)
+    assert any("disagree everywhere" in warning for warning in capture.warnings)
     assert any("2 of 6 depth maps are not used" in warning for warning in capture.warnings)
 
 

@@ -155,7 +155,7 @@ def test_photographs_without_a_silhouette_are_left_out(tmp_path: Path) -> None:
     captures.write_picture(source / "masks/img_4.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     made, _, warned = run(source, tmp_path / "a", masks="silhouette")
     assert [view.name for view in made.views] == [f"images/img_{index}.png" for index in (0, 1, 3, 5)]
-    assert any("1 of 6 images have no silhouette, and the others do: images/img_2.png" in text for text in warned)
+    assert any("1 of 6 images have no silhouette, unlike the others: images/img_2.png" in text for text in warned)
     assert any("images/img_4.png has an empty silhouette" in text for text in warned)
     assert {len(track) for track in scene.read_points(tmp_path / "a/poses").tracks} == {4}
     for index in (0, 1, 3):
@@ -295,7 +295,7 @@ def test_which_level_is_kept_can_be_stated(tmp_path: Path) -> None:
     assert not any("keep what is black" in text for text in said)
     usual = with_masks("colmap", tmp_path / "usual", but_for_a_thing)
     made, said, _ = run(usual, tmp_path / "black", mask_polarity="black", masks="ignore")
-    assert "masks keep what is black: what is white in them is left out" in said
+    assert "masks keep what is black; what is white is left out" in said
     for index, view in enumerate(made.views):
         np.testing.assert_array_equal(scene.read_mask(tmp_path / "black/poses", view), but_for_a_thing(index, captures.cameras()[index]) == 0)
 

@@ -181,7 +181,7 @@ def test_a_photograph_whose_silhouette_does_not_fit_is_left_out(tmp_path: Path, 
 def test_silhouettes_of_no_compact_thing_are_refused(change: Any, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = captures.cameras(8)
     seen(monkeypatch, change(ball_pictures(made)))
-    with pytest.raises(BadInput, match=rf"--mask foreground: .*{why}.* Photograph it from all round.*masks/") as error:
+    with pytest.raises(BadInput, match=rf"--mask foreground: .*{why}.* Photograph it from all sides.*masks/") as error:
         poses.run(job_of(captures.nerfstudio(tmp_path / "source", made), tmp_path))
     assert error.value.exit_code == 2
     assert not (tmp_path / "poses/scene.json").exists()

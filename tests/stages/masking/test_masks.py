@@ -121,4 +121,4 @@ def test_masks_are_files_at_the_size_of_their_photographs(tmp_path: Path, how: s
         assert mask.shape == (H, W)
         assert overlap(mask, cover) > 0.85
     assert len(told) == 1
-    assert told[0] == f"--mask {how}: no such background in 1 of 8 photographs, as in 6.png: they get no mask"
+    assert told[0] == f"--mask {how}: no such background in 1 of 8 photographs, such as 6.png; they get no mask"

@@ -72,7 +72,7 @@ def test_masks_are_files_at_the_size_of_their_photographs_and_silhouettes(tmp_pa
     told: list[str] = []
     masks = made({name: tmp_path / name for name in ("a.png", "b.png")}, red(tmp_path / "net.onnx"), tmp_path / "masks", told)
     assert list(masks) == ["a.png"]
-    assert told == ["--mask-model net.onnx: no subject in 1 of 2 photographs, as in b.png: they get no mask"]
+    assert told == ["--mask-model net.onnx: no subject in 1 of 2 photographs, such as b.png; they get no mask"]
     mask = read_png(masks["a.png"])
     expected = (scene() == [220, 40, 60]).all(-1)
     assert mask.shape == expected.shape

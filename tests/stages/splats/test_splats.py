@@ -182,6 +182,6 @@ def test_a_run_goes_on_without_them_unless_they_are_asked_for(
                 splats.run(job)
         else:
             splats.run(job)
-    assert sum("the run goes on" in text and why in text for text in told) == 1
+    assert sum("the run continues" in text and why in text for text in told) == 1
     assert json.loads((tmp_path / "auto/out/report.json").read_text())["reason"] == f"splats: {why}."
     assert load_splats(SplatsOutputs(tmp_path / "auto/out"), load(inputs["bake"] / "asset.nerftree")) is None

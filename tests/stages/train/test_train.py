@@ -96,7 +96,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, un
         assert 1 <= len(checkpoints(job(tmp_path, None))) <= 2
     events: list[dict[str, Any]] = []
     assert run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop, events=events)) == undisturbed
-    assert any("training goes on from step" in event.get("text", "") for event in events)
+    assert any("resuming training from step" in event.get("text", "") for event in events)
     lines = [json.loads(line)["step"] for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
     assert lines == [5, 10, 13]
 

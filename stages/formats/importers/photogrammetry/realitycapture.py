@@ -53,7 +53,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
         raise BadInput(f"{source.root}: several tables of cameras ({names}); one is expected. Take the others out.")
     if not tables:
         return _from_sidecars(source, sidecars)
-    warnings = [f"{source.name_of(tables[0])} is read; the XMP files beside the photographs are not."] if sidecars else []
+    warnings = [f"{source.name_of(tables[0])} is read; the XMP files next to the photographs are not."] if sidecars else []
     return _from_table(source, tables[0], warnings)
 
 
