@@ -120,16 +120,16 @@ def memory(tree: Any, view: Any) -> dict[str, float]:
     """Bytes in memory while rendering: the tree, its packed form, the colours of the view, and the framebuffer."""
     from efficientnerf.asset.rendering import render
     from efficientnerf.backends.numba.tree.packed import packed_of
-    from efficientnerf.backends.numba.tree.rendering import scratch_bytes
 
     values = vars(tree) | vars(tree.harmonics) if hasattr(tree.harmonics, "__dict__") else vars(tree)
     own = sum(part.nbytes for part in values.values() if hasattr(part, "nbytes") and not isinstance(part, tuple))
     rendering = render(tree, view)
     framebuffer = sum(part.nbytes for part in vars(rendering).values())
-    total = own + packed_of(tree).nbytes + scratch_bytes(tree) + framebuffer
+    colours = 8 * (len(tree.density_values) + 2)
+    total = own + packed_of(tree).nbytes + colours + framebuffer
     each = round(total / max(1, len(tree.density_values)), 1)
     packed = packed_of(tree).nbytes
-    return {"tree": own, "packed": packed, "view_colours": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
+    return {"tree": own, "packed": packed, "view_colours": colours, "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
 
 
 def measure_task(task: dict[str, Any]) -> dict[str, Any]:

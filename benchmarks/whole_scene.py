@@ -64,7 +64,6 @@ def whole_scene(side: int = 320, count: int = 5, brick: int = 4) -> Any:
     from efficientnerf.asset.cascades import cascade_grids, check_cascades
     from efficientnerf.asset.palettes import PaletteHarmonics
     from efficientnerf.asset.tree import Cascade, NerfTree, tree_from_voxels
-    from efficientnerf.rendering.environment import directions_of
 
     grids = cascade_grids(np.array([[-HALF] * 3, [HALF] * 3]), 2 * HALF / side, brick, count)
     trees, inner = [], None
@@ -86,7 +85,7 @@ def whole_scene(side: int = 320, count: int = 5, brick: int = 4) -> Any:
         cascades.append(Cascade(tree.shape, tree.voxel, tree.bounds_min, np.where(tree.brick_index >= 0, tree.brick_index + bricks, -1).astype(np.int32)))
         rows.append(np.where(tree.voxel_index >= 0, tree.voxel_index + voxels, -1).astype(np.int32))
         bricks, voxels = bricks + len(tree.voxel_index), voxels + len(tree.density_values)
-    up = directions_of(64, 128)[..., 2:]
+    up = np.cos((np.arange(64) + 0.5) / 64 * np.pi)[:, None, None].repeat(128, axis=1)  # of the texels' directions, along z
     whole = NerfTree(
         shape=cascades[0].shape, brick=brick, voxel=cascades[0].voxel, bounds_min=cascades[0].bounds_min, brick_index=cascades[0].brick_index,
         voxel_index=np.concatenate(rows), density_values=np.concatenate([tree.density_values for tree in trees]),

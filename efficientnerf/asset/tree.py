@@ -166,14 +166,6 @@ class NerfTree:
         one voxel is `voxel` units of the frame, which densities are per; harmonics are looked up along the directions of the world."""
         return WORLD if self.ndc is None else self.ndc
 
-    def with_values(self, density: np.ndarray, sh: np.ndarray) -> NerfTree:
-        """The same voxels with other densities (N,) and coefficients (N, K, 3)."""
-        count = len(self.density_values)
-        if density.shape != (count,) or sh.ndim != 3 or sh.shape[::2] != (count, 3):
-            raise ValueError(f"values of shapes {density.shape} and {sh.shape} for {count} voxels; expected ({count},) and ({count}, K, 3)")
-        harmonics_count(round(sh.shape[1] ** 0.5) - 1)
-        return replace(self, density_values=np.ascontiguousarray(density, np.float32), harmonics=np.ascontiguousarray(sh, np.float32))
-
     def with_metadata(self, **entries: Any) -> NerfTree:
         return replace(self, metadata={**self.metadata, **entries})
 

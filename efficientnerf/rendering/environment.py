@@ -16,14 +16,6 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 
-def directions_of(height: int, width: int) -> np.ndarray:
-    """(H, W, 3) unit directions of the texels' centres."""
-    polar = (np.arange(height) + 0.5) / height * np.pi
-    azimuth = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
-    sine = np.sin(polar)[:, None]
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.broadcast_to(np.cos(polar)[:, None], (height, width))], axis=-1)
-
-
 def lookup(environment: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Colours (R, 3) of a map (H, W, 3) along unit directions (R, 3)."""
     height, width = environment.shape[:2]

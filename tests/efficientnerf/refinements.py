@@ -18,7 +18,7 @@ from efficientnerf.backends.layout import EARLY_STOP, Hyperparameters, Moments, 
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
-from efficientnerf.backends.numba.tree_training.steps import sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import values_of
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
@@ -64,6 +64,17 @@ def packet_gradients(
     by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)
     sum_gradients(records, by_density, by_sh)
     return loss, by_density, by_sh.reshape(tree.sh.shape)
+
+
+def sum_gradients(records: Records, grad_density: np.ndarray, grad_sh: np.ndarray) -> None:
+    """Add the gradients of the summed loss with respect to density (N,) and sh (N, 3 K)."""
+    terms = grad_sh.shape[1] // 3
+    for slab in range(records.begin.shape[1] - 1):
+        for begin, end in records.begin[:, slab : slab + 2]:
+            voxel, packet = records.numbers[begin:end].T
+            gradient = records.gradient[begin:end]
+            np.add.at(grad_density, voxel, gradient[:, 3])
+            np.add.at(grad_sh, voxel, (records.basis[packet, :terms, None] * gradient[:, None, :3]).reshape(-1, 3 * terms))
 
 
 def ball_tree(side: int = 20) -> NerfTree:

@@ -67,7 +67,7 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
     """Close before the wall, where a voxel's direction is not its samples', voxels are not painted."""
     tree = wall(0.4, voxels=144, degree=2)
     # Voxels that have nothing in common with their neighbours.
-    tree = tree.with_values(tree.density_values, np.random.default_rng(3).normal(0, 0.1, tree.sh.shape).astype(np.float32))
+    tree = replace(tree, harmonics=np.random.default_rng(3).normal(0, 0.1, tree.sh.shape).astype(np.float32))
     camera = camera_at(*PLACES[place])
     direction = rendering._view_direction(tree, camera.centre)
     away = np.linalg.norm(voxel_coordinates(tree) @ direction[:, :3].T + direction[:, 3], axis=1) / np.linalg.norm(direction[:, :3], 2)

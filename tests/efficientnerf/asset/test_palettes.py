@@ -42,7 +42,7 @@ def test_a_tree_of_codes_is_asked_like_one_of_floats() -> None:
     plain = random_tree(1, degree=2)
     coded = replace(plain, harmonics=random_palette(len(plain.density_values), (1,) * 8))
     assert (coded.degree, coded.harmonics_count) == (2, 9)
-    twin = plain.with_values(plain.density_values, coded.sh)
+    twin = replace(plain, harmonics=coded.sh)
     assert np.array_equal(coded.sh, twin.sh)
     origins, directions = rays_at(plain)
     for name in ("colour", "opacity", "depth", "normal"):

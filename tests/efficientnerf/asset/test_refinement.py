@@ -22,9 +22,8 @@ from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, v
 from efficientnerf.backends.numba.tree.contributions import max_contributions
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
-from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS, pixels
-from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random, sum_gradients
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
 

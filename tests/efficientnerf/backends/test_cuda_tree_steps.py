@@ -18,7 +18,7 @@ from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training import steps as host
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.refinements import GRIDS, empty_moments, records_of, rule_of
+from tests.efficientnerf.refinements import GRIDS, empty_moments, records_of, rule_of, sum_gradients
 
 device = pytest.importorskip("efficientnerf.backends.triton.tree_steps")
 refinement = pytest.importorskip("efficientnerf.asset.refinement.device")
@@ -66,7 +66,7 @@ def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str
     for number in (1, 2, 3):
         records = records_of(tree, o, number)
         by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
-        host.sum_gradients(records, by_density, by_sh)
+        sum_gradients(records, by_density, by_sh)
         met = np.zeros(len(o.density), bool)
         for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
             met[records.numbers[begin:end, 0]] = True

@@ -19,9 +19,9 @@ from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
-from efficientnerf.backends.numba.tree_training.steps import Values, step, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import Values, step, values_of
 from efficientnerf.backends.numba.vector.memory import pointer
-from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random
+from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random, sum_gradients
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
 # brick, degree, lookup

@@ -96,7 +96,7 @@ def test_fitting_brings_gaussians_nearer_to_pictures_held_back() -> None:
 def test_colours_are_those_of_the_asset_from_all_directions() -> None:
     rng, degree = np.random.default_rng(0), 2
     tree = ball(degree=degree)
-    tree = tree.with_values(tree.density_values, rng.normal(size=tree.sh.shape).astype(np.float32) * [[[0.5]]] * np.float32(1))
+    tree = replace(tree, harmonics=rng.normal(0, 0.5, tree.sh.shape).astype(np.float32))
     shown = merging.shown_voxels(tree, ring(4))
     begin = np.arange(len(shown.voxels) + 1)
     out = np.empty((len(shown.voxels), 9, 3), np.float32)

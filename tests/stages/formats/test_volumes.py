@@ -107,7 +107,7 @@ def test_density_and_colour_lie_where_the_asset_has_them() -> None:
     from efficientnerf.asset.queries import colour_at, density_at
 
     asset = tree()
-    asset = asset.with_values(asset.density_values, asset.sh[:, :1])
+    asset = replace(asset, harmonics=np.ascontiguousarray(asset.sh[:, :1]))
     density, colour = grids_of(asset, Y_DOWN, Path("a.vdb"))
     assert (density.name, colour.name) == ("density", "color")
     np.testing.assert_array_equal(density.coordinates, colour.coordinates)
@@ -164,8 +164,8 @@ def test_what_makes_no_volume_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError):
         VOLUME_EXPORTERS[".vdb"](forward_facing, tmp_path / "a.vdb", Z_UP)
     with pytest.raises(BadInput, match="density"):
-        VOLUME_EXPORTERS[".vdb"](tree().with_values(np.zeros(len(tree().density_values)), tree().sh), tmp_path / "a.vdb", Z_UP)
-    endless = tree().with_values(np.full(len(tree().density_values), 3e38), tree().sh)
+        VOLUME_EXPORTERS[".vdb"](replace(tree(), density_values=np.zeros_like(tree().density_values)), tmp_path / "a.vdb", Z_UP)
+    endless = replace(tree(), density_values=np.full_like(tree().density_values, 3e38))
     with pytest.raises(BadInput, match="not finite"):
         VOLUME_EXPORTERS[".vdb"](endless, tmp_path / "a.vdb", replace(Z_UP, world_from_capture=replace(Z_UP.world_from_capture, scale=10.0)))
     assert not list(tmp_path.iterdir())

@@ -48,7 +48,7 @@ def test_what_differs_is_said(enerf: Enerf, asset: Path, tmp_path: Path) -> None
     found = enerf("diff", asset, other, "--views", 2, "--json").object
     assert (found["equal"], found["psnr"], set(found["tensors"].values())) == (True, 100.0, {"same"})
     tree = load(asset)
-    save(tree.with_values(tree.density_values * 2, tree.sh).with_metadata(licence="MIT"), other)
+    save(replace(tree, density_values=tree.density_values * 2).with_metadata(licence="MIT"), other)
     result = enerf("diff", asset, other, "--size", 48)
     assert result.code == 6
     assert all(name in result.out for name in ("CC0-1.0", "MIT", "voxel.density"))

@@ -182,18 +182,3 @@ def step(values, moments, lens, degree, first, sums, h, errors):  # type: ignore
                 )  # fmt: skip
                 for lane in range(LANES):
                     errors[group * LANES + lane] += total[16 * ERROR + lane]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def gradients(values, lens, degree, first, sums, out):  # type: ignore[no-untyped-def]
-    """What `step` goes along, for tests: out like values."""
-    rows = values.shape[1]
-    total, basis, gradient = np.empty(16 * (SUMS + 1), np.float32), np.empty(16 * 16, np.float32), np.empty(16 * rows, np.float32)
-    for group in range(values.shape[0]):
-        _gather_sums(group, first, sums, total)
-        at = np.int64(group) * rows * LANES
-        _geometry_gradients(pointer(values), at, lens, pointer(total), pointer(gradient))
-        _colour_gradients(pointer(values), at, lens, degree, pointer(total), pointer(basis), pointer(gradient))
-        for row in range(rows):
-            for lane in range(LANES):
-                out[group, row, lane] = gradient[16 * row + lane]

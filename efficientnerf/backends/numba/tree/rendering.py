@@ -132,11 +132,6 @@ def _render(
         pass
 
 
-def scratch_bytes(tree: NerfTree) -> int:
-    """Memory of the view's colours while an image is rendered."""
-    return 8 * (len(tree.density_values) + 2)
-
-
 def render_rays(
     tree: NerfTree,
     origins: np.ndarray,

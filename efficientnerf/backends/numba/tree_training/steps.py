@@ -285,19 +285,6 @@ def _copy(workers, task, records, values):  # type: ignore[no-untyped-def]
         _copy_bins(task, records, values)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _sum_gradients(records, grad_density, grad_sh):  # type: ignore[no-untyped-def]
-    bins, terms = records.begin.shape[1] - 1, grad_sh.shape[1] // 3
-    for slab in range(bins):
-        for chunk in range(records.begin.shape[0]):
-            for at in range(records.begin[chunk, slab], records.begin[chunk, slab + 1]):
-                v, basis = records.numbers[at, 0], records.basis[records.numbers[at, 1]]
-                grad_density[v] += records.gradient[at, 3]
-                for k in range(terms):
-                    for channel in range(3):
-                        grad_sh[v, 3 * k + channel] += basis[k] * records.gradient[at, channel]
-
-
 def step(records: Records, values: Values, moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS) -> None:
     """A step for the voxels that the records name; the others stay. float32.
 
@@ -311,8 +298,3 @@ def step(records: Records, values: Values, moments: Moments, hyperparameters: Hy
     _step(workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum))
     # Not before all bins are done: total variation is that of the densities before the step.
     _copy(workers, np.zeros(1, np.int64), records, values)
-
-
-def sum_gradients(records: Records, grad_density: np.ndarray, grad_sh: np.ndarray) -> None:
-    """Add the gradients of the summed loss with respect to density (N,) and sh (N, 3 K)."""
-    _sum_gradients(records, grad_density, grad_sh)
