@@ -271,9 +271,9 @@ def remove_abandoned(folder: Path, seconds: float) -> None:
                 os.unlink(entry.path)
 
 
-def write_json(path: Path, value: Any, *, sort_keys: bool = False, default: Callable[[Any], Any] | None = None, durable: bool = True) -> None:
+def write_json(path: Path, value: Any, *, default: Callable[[Any], Any] | None = None) -> None:
     """An indented JSON file, written atomically; see `json.dumps`. Raises ValueError for NaN and infinity."""
-    write_atomically(path, pretty_json(value, sort_keys=sort_keys, default=default), durable=durable)
+    write_atomically(path, pretty_json(value, sort_keys=False, default=default))
 
 
 def rename(source: Path, target: Path) -> None:

@@ -8,11 +8,10 @@ from __future__ import annotations
 _SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
-def printable(text: object, limit: int | None = None, *, keep: str = "") -> str:
+def printable(text: object, limit: int | None = None) -> str:
     """`text` with every character that is no letter, mark, number, punctuation, symbol or plain space as an escape: \\n, \\x1b, \\u202e, \\udcff.
 
     limit  most characters returned, of which the last is an ellipsis where something was cut; None: all
-    keep   characters that stay as they are, such as line ends of our own
 
     The result encodes in UTF-8: bytes of a file name that no encoding explains (surrogateescape) come out as \\udc80 to \\udcff.
     """
@@ -20,7 +19,7 @@ def printable(text: object, limit: int | None = None, *, keep: str = "") -> str:
     if limit is not None:
         shown = shown[: limit + 1]  # an escape is never shorter than what it stands for
     if not shown.isprintable():
-        shown = "".join(character if character.isprintable() or character in keep else _escaped(character) for character in shown)
+        shown = "".join(character if character.isprintable() else _escaped(character) for character in shown)
     if limit is not None and len(shown) > limit:
         shown = shown[: max(limit - 1, 0)] + "…"
     return shown

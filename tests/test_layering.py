@@ -60,7 +60,7 @@ LATE = {
     "stages/io/network_file.py": 1,
     "stages/io/photo.py": 1,
     "stages/io/pictures.py": 1,
-    "stages/poses/memory.py": 2,
+    "stages/poses/memory.py": 1,
     "stages/poses/run.py": 1,
     "stages/sfm/colmap.py": 5,
     "workflows/cli/device.py": 1,

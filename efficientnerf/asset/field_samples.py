@@ -56,10 +56,6 @@ class FieldSamples:
     thickness: np.ndarray
     colour: np.ndarray
 
-    def ray(self) -> np.ndarray:
-        """(M,) the ray of each sample."""
-        return np.repeat(np.arange(len(self.pixel)), np.diff(self.first))
-
     def points(self, samples: np.ndarray, ray: np.ndarray) -> np.ndarray:
         """World points (n, 3) in the middle of some samples, of which the rays are given."""
         along = self.start[samples] + self.extent[samples] / 2

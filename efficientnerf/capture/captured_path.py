@@ -125,10 +125,10 @@ def _nearest_neighbours(distance: np.ndarray) -> np.ndarray:
     return np.array(order)
 
 
-def _shorter(order: np.ndarray, distance: np.ndarray, rounds: int = 20) -> np.ndarray:
+def _shorter(order: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """The walk with pieces turned round where that makes it shorter (2-opt)."""
     order, count = order.copy(), len(order)
-    for _ in range(rounds):
+    for _ in range(20):
         changed = False
         for i in range(count - 2):
             j = np.arange(i + 1, count - 1)  # turn i + 1 .. j round

@@ -90,7 +90,6 @@ class FieldRenderer:
     model: Model
     near: float
     far: float
-    rays_per_block: int = RAYS_PER_BLOCK
 
     @torch.no_grad()
     def render(
@@ -112,7 +111,7 @@ class FieldRenderer:
         count = camera.width * camera.height
         parts, counts = [], SampleCounts()
         # Without pruning a ray has all samples.
-        block = self.rays_per_block if m.prunes else min(self.rays_per_block, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
+        block = RAYS_PER_BLOCK if m.prunes else min(RAYS_PER_BLOCK, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
         for begin in range(0, count, block):
             index = np.arange(begin, min(count, begin + block))
             pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)

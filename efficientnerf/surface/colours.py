@@ -17,7 +17,7 @@ CHUNK = 1 << 16  # points whose colours are looked up at a time
 
 
 def surface_colours(
-    volume: Volume, positions: np.ndarray, normals: np.ndarray, progress: Progress = silent, view_directions: ViewDirections | None = None, chunk: int = CHUNK
+    volume: Volume, positions: np.ndarray, normals: np.ndarray, progress: Progress = silent, view_directions: ViewDirections | None = None
 ) -> np.ndarray:
     """(N, 3) float32 sRGB of surface points, as seen from outside.
 
@@ -28,8 +28,8 @@ def surface_colours(
     """
     colours = np.empty((len(positions), 3), np.float32)
     steps = np.linspace(-1.0, 2.0, 7) * float(volume.voxel)  # (S,)
-    for start in range(0, len(positions), chunk):
-        part = slice(start, start + chunk)
+    for start in range(0, len(positions), CHUNK):
+        part = slice(start, start + CHUNK)
         progress(start, len(positions), "colours")
         point, normal = positions[part], normals[part]
         samples = point[:, None] - steps[:, None] * normal[:, None]  # (N, S, 3)

@@ -48,12 +48,12 @@ def pool_of(volume: Volume) -> int:
     return pool
 
 
-def automatic_threshold(volume: Volume, lines: int = 24) -> float:
+def automatic_threshold(volume: Volume) -> float:
     """The default density of the surface: that which light from outside meets.
 
         tau = min( ln 2 / s,  lower quartile over rays of max_{j <= h} sigma_j ),   h: the voxel where the ray's transmittance falls to 1/2
 
-    Rays run along the axes, both ways, through up to `lines` x `lines` columns of bricks per axis; those that stay half transparent are
+    Rays run along the axes, both ways, through up to 24 x 24 columns of bricks per axis; those that stay half transparent are
     left out. A surface at tau lies at or in front of the depth at which a ray has lost half its light if tau <= the highest density up to
     there; the lower quartile makes that true for three rays in four, so that soft, half-trained densities give a closed surface where a
     fixed level would leave holes or nothing. Where densities are hard, one voxel that swallows half the light is enough (the first term):
@@ -65,8 +65,8 @@ def automatic_threshold(volume: Volume, lines: int = 24) -> float:
     found, highest = [], 0.0
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
-        for i in _evenly_spaced(grid[first] // brick, lines):
-            for j in _evenly_spaced(grid[second] // brick, lines):
+        for i in _evenly_spaced(grid[first] // brick, 24):
+            for j in _evenly_spaced(grid[second] // brick, 24):
                 low, high = np.zeros(3, np.int64), grid.copy()
                 low[first], low[second] = i * brick, j * brick
                 high[first], high[second] = low[first] + brick, low[second] + brick

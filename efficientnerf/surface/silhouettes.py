@@ -33,7 +33,7 @@ CURVED = (0.97, 0.85)  # length of the mean normal around a vertex: down to the 
 
 
 def fitted_to_silhouettes(
-    vertices: np.ndarray, faces: np.ndarray, views: Sequence[AssetView], tick: Callable[[], None] = lambda: None, rounds: int = ROUNDS
+    vertices: np.ndarray, faces: np.ndarray, views: Sequence[AssetView], tick: Callable[[], None] = lambda: None
 ) -> np.ndarray:
     """(V, 3) the vertices (V, 3) of the world of faces (F, 3), moved to the silhouettes that views by pinhole cameras have of their asset. `tick` is called
     before each view; an exception from it stops the work."""
@@ -47,7 +47,7 @@ def fitted_to_silhouettes(
             values = 0.5 * values + 0.5 * (neighbours @ values) / degree
         return values
 
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         normals = vertex_normals(vertices, faces)
         sums = np.zeros((len(vertices), 2))  # of moves, and of views
         for camera, edge in edges:

@@ -103,7 +103,7 @@ class _Child:
         with contextlib.suppress(OSError):
             assert self.process.stdin is not None
             self.process.stdin.close()
-        if not self._ended(GRACE):
+        if not self._ended():
             self.kill()
         self._reap()
 
@@ -114,7 +114,7 @@ class _Child:
                 os.killpg(self.process.pid, signal.SIGKILL)
 
     def _died(self) -> Event:
-        if not self._ended(GRACE):
+        if not self._ended():
             self.kill()
         self._reap()
         code = self.process.returncode
@@ -122,9 +122,9 @@ class _Child:
         how = f"was ended by {signal.Signals(number).name}" if number is not None else f"ended with exit code {code} and no answer"
         return {"event": "result", "ok": False, "kind": "died", "signal": number, "text": f"its process {how}.", "lines": self._last_lines()}
 
-    def _ended(self, seconds: float) -> bool:
-        """Whether it has ended, or does within this time; it is not reaped yet, so that its group's number is still its own."""
-        deadline = time.monotonic() + seconds
+    def _ended(self) -> bool:
+        """Whether it has ended, or does within GRACE seconds; it is not reaped yet, so that its group's number is still its own."""
+        deadline = time.monotonic() + GRACE
         while not self._has_ended():
             if time.monotonic() > deadline:
                 return False

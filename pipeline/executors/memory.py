@@ -64,13 +64,12 @@ def size_text(count: float) -> str:
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{max(1, round(count / 2**20))} MiB"
 
 
-def usable_memory(root: Path = Path("/"), cores: int | None = None) -> Limit | None:
+def usable_memory(root: Path = Path("/")) -> Limit | None:
     """The smallest limit on this process, less what is kept back; None where the system states none.
 
-    root   where /proc and /sys lie, for tests
-    cores  threads that may run at a time; None: those of this process
+    root  where /proc and /sys lie, for tests
     """
-    cores = cores or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limits = [Limit(int((1 - KEPT_BACK) * limit.bytes), limit.whose) for limit in (*_machine(root), *_cgroups(root))]
     limits += _rlimits(cores)
     return min(limits, key=lambda limit: limit.bytes, default=None)

@@ -92,7 +92,7 @@ class _Bake:
     def capacity(self, cells: int) -> int:
         """Voxels that the asset holds besides so many coarse cells."""
         size = int(self.mib * 2**20)
-        return serialisation.most_voxels(size, self.layout, self.degree, (cells, 1, 1), self.brick_size, environment=self.environment_size)
+        return serialisation.most_voxels(size, self.layout, self.degree, cells, self.brick_size, environment=self.environment_size)
 
     @property
     def most_voxels(self) -> int:

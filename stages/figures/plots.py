@@ -83,19 +83,17 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
     return (np.clip(np.nan_to_num(image.astype(np.float32)), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def error_map(image: np.ndarray, truth: np.ndarray, *, full: float = 0.25) -> np.ndarray:
-    """Mean absolute difference over the channels as colours: black for none, light yellow for `full` and more.
+def error_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Mean absolute difference over the channels as colours: black for none, light yellow for 0.25 and more.
 
     image, truth  (H, W, 3) floating point 0 to 1
     returns       (H, W, 3) uint8
     """
     error = np.abs(image - truth).mean(axis=2)
-    return np.asarray(to_uint8(matplotlib().colormaps["inferno"](np.clip(error / full, 0.0, 1.0))[:, :, :3]))
+    return np.asarray(to_uint8(matplotlib().colormaps["inferno"](np.clip(error / 0.25, 0.0, 1.0))[:, :, :3]))
 
 
-def curve(
-    path: Path, series: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, x_label: str, y_label: str, title: str = "", log_y: bool = False
-) -> None:
+def curve(path: Path, series: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, x_label: str, y_label: str, title: str = "") -> None:
     """Write a PNG of curves over one axis.
 
     series  name -> (x, y) of equal length; values that are not finite are left out
@@ -104,10 +102,8 @@ def curve(
     axes = figure.add_subplot()
     for name, (x, y) in series.items():
         xs, ys = np.asarray(x, float), np.asarray(y, float)
-        finite = np.isfinite(xs) & np.isfinite(ys) & ((ys > 0) | (not log_y))
+        finite = np.isfinite(xs) & np.isfinite(ys)
         axes.plot(xs[finite], ys[finite], label=name, linewidth=1.2, marker="." if finite.sum() < 20 else None)
-    if log_y:
-        axes.set_yscale("log")
     axes.set(xlabel=x_label, ylabel=y_label, title=title)
     axes.grid(alpha=0.3)
     if series:
@@ -116,11 +112,11 @@ def curve(
     canvas.print_png(path, metadata={"Software": None})
 
 
-def with_palette(path: Path, colours: int = 128) -> None:
+def with_palette(path: Path) -> None:
     """Write a plot's PNG again with a palette: half the bytes or fewer, for a document; thin lines keep their colours to within a few of 255 levels."""
     plain = Image.fromarray(np.ascontiguousarray(read_png(path)[..., :3]))
     with atomic(path) as temporary:
-        plain.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
+        plain.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
 
 
 def _fitted(text: str, width: int, draw: object, font: object) -> str:

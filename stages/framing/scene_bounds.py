@@ -117,13 +117,13 @@ def _bounds_of_path(xyz: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, n
     return both.min(0), both.max(0)
 
 
-def outliers(xyz: np.ndarray, *, neighbours: int = 5, factor: float = 4.0) -> np.ndarray:
-    """(N,) bool: points whose distance to their neighbours is more than `factor` times the median."""
-    count = min(neighbours, len(xyz) - 1)
+def outliers(xyz: np.ndarray) -> np.ndarray:
+    """(N,) bool: points whose distance to their fifth neighbour is more than four times the median."""
+    count = min(5, len(xyz) - 1)
     if count < 1:
         return np.zeros(len(xyz), bool)
     distance = cKDTree(xyz).query(xyz, k=count + 1)[0][:, -1]
-    return np.asarray(distance > factor * np.median(distance))
+    return np.asarray(distance > 4.0 * np.median(distance))
 
 
 def in_view(xyz: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -13,15 +13,12 @@ LARGEST = 256 << 20  # bytes; scene.json of a hundred thousand views fits
 LARGEST_NUMBER = 1e12  # of lengths and parameters: UTM coordinates in millimetres fit, and no product of a few overflows
 
 
-def read_json(path: Path, remedy: str, *, missing: str | None = None, limit: int = LARGEST) -> Any:
-    """The value in a JSON file of at most `limit` bytes, without NaN and Infinity; BadInput says what is wrong with the file, then the remedy.
-
-    missing  the remedy where there is no such file, if that is another
-    """
+def read_json(path: Path, remedy: str, *, limit: int = LARGEST) -> Any:
+    """The value in a JSON file of at most `limit` bytes, without NaN and Infinity; BadInput says what is wrong with the file, then the remedy."""
     try:
         return files.read_json(path, limit)
     except FileNotFoundError as error:
-        raise BadInput(f"{printable(path)}: {error.strerror}. {remedy if missing is None else missing}".strip()) from error
+        raise BadInput(f"{printable(path)}: {error.strerror}. {remedy}".strip()) from error
     except files.Unreadable as error:
         raise BadInput(f"{printable(path)}: {error}. {remedy}".strip()) from error
 

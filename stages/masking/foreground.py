@@ -29,12 +29,11 @@ from stages.framing.mask_use import LEAST_OVERLAP, MIN_AGREEING, alike, hull_ove
 from stages.io.capture import FOREGROUND, Capture, Photo, without
 from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header
-from stages.masking.first_training import FIRST, RAYS, SIDE, FirstField, first_field
+from stages.masking.first_training import RAYS, SIDE, FirstField, first_field, first_training_needed
 from stages.masking.made import write_mask
 from stages.masking.subject import Subject, coverage, subject_of
 from stages.memory.need import refuse_what_does_not_fit
 from stages.scratch import note, noted
-from stages.train.memory import first_training_needed
 
 # docs/experiments/silhouettes.md
 LEAST_SAMPLE = 1e-3  # weight of a sample of the field that is looked at
@@ -81,7 +80,7 @@ def _made_anew(job: Job, capture: Capture, images: list[np.ndarray], folder: Pat
 
     @compiling_kernels
     def make(job: Job) -> None:
-        refuse_what_does_not_fit(job, first_training_needed(len(images), SIDE, FIRST, RAYS), "Omit --mask foreground.")
+        refuse_what_does_not_fit(job, first_training_needed(len(images)), "Omit --mask foreground.")
         field = first_field(job, capture, images)
         found.append(_made(job, capture, field, _subject(field), folder))
 

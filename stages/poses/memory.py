@@ -95,10 +95,9 @@ def memory_needed(known: Known) -> Need:
     features = resolved(own.max_features) or features_for(count)
     needs = [features_needed([largest] * count, own.feature_image_size, features, count_cores(), networks=own.features_model != "off"), video_needed(films)]
     if own.mask_from == FOREGROUND:
-        from stages.masking.first_training import FIRST, RAYS, SIDE  # without it the stage needs no torch
-        from stages.train.memory import first_training_needed  # likewise
+        from stages.masking.first_training import first_training_needed  # without it the stage needs no torch
 
-        needs.append(first_training_needed(count, SIDE, FIRST, RAYS))
+        needs.append(first_training_needed(count))
     return max(needs, key=lambda need: need.total)
 
 

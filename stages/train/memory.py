@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from efficientnerf.fields.hash import FEATURES, grids, level_sizes
-from efficientnerf.geometry.cameras import Camera
-from efficientnerf.geometry.spaces import Space, space_from
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE, PixelRows
 from efficientnerf.training.settings import TrainSettings
@@ -159,20 +156,3 @@ def _before(known: Known) -> tuple[tuple[View, ...], TrainSettings, Space]:
     s = load(known.inputs(TrainInputs).poses.folder)
     views = views_of(s, "train")
     return views, with_auto_sizes(known.settings["train"], s, count_pixels(views)), space_of(s)
-
-
-FIELD_SAMPLES = 300  # bytes of a ray in which a first training's subject is looked for
-
-
-def first_training_needed(count: int, side: int, settings: TrainSettings, rays: int) -> Need:
-    """Memory of a first quick training of so many photographs, from which silhouettes are made.
-
-    side      of the photographs at most, pixels
-    settings  without "auto" where `stages.train.hash_resolution` has numbers
-    rays      in which the subject is looked for
-    """
-    space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=True)
-    camera = Camera("", side, side, "SIMPLE_PINHOLE", (side, side / 2, side / 2), np.eye(4))
-    view = View("", None, "train", camera, camera, 0.1, 1.0)
-    need = needed(settings, [view] * count, 3, space, stored=False)
-    return Need({**need.terms, "samples of the field": FIELD_SAMPLES * rays})

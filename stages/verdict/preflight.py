@@ -26,14 +26,12 @@ from stages.io.capture import FOREGROUND
 from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
 from stages.io.reader import PhotoReader
-from stages.masking.first_training import FIRST, RAYS
-from stages.masking.first_training import SIDE as SIDE_OF_FIRST
+from stages.masking.first_training import first_training_needed
 from stages.masking.turning import masks_of_turning_subject
 from stages.poses.memory import decoding_needed, features_needed
 from stages.sfm import pairs
 from stages.sfm.attempts import MORE_FEATURES
 from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
-from stages.train.memory import first_training_needed
 from stages.verdict import looks, run_forecast
 from stages.verdict.grades import GRADES
 from stages.verdict.verdict import FEW, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, plural, zooms
@@ -297,7 +295,7 @@ def forecast(
     memory = 0
     if settings.mask_from == FOREGROUND:
         reading += slower * (FIRST_TRAINING + A_SILHOUETTE * count) / threads
-        memory = first_training_needed(count, SIDE_OF_FIRST, FIRST, RAYS).total
+        memory = first_training_needed(count).total
     if posed:
         seconds = {"poses_seconds": round(reading, 1), "poses_seconds_at_most": round(reading, 1)}
         return {**seconds, "poses_bytes": max(memory, int(decoding_needed(sizes).total)), "pairs": 0}

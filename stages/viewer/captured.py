@@ -20,15 +20,15 @@ SIDE = 400  # of a photograph, pixels
 QUALITY = 80  # of its JPEG
 
 
-def captured_views(poses: Path, train: Path, background: tuple[float, float, float] | None = None) -> tuple[list[Camera], dict[str, bytes]]:
-    """Cameras, training frame, and JPEGs of some by the cameras' names, of the artifacts of these stages. `background` is behind photographs with alpha.
+def captured_views(poses: Path, train: Path) -> tuple[list[Camera], dict[str, bytes]]:
+    """Cameras, training frame, and JPEGs of some by the cameras' names, of the artifacts of these stages.
 
     Raises CorruptArtifact, and BadInput where there is no scene.
     """
     scene = load_scene(poses, train)
     known = [view for view in scene.views if view.split != LEFT_OUT]
     views = [known[n] for n in _spread(len(known), CAMERAS)]
-    behind = background or scene.background or (1.0, 1.0, 1.0)
+    behind = scene.background or (1.0, 1.0, 1.0)
     shown = [views[n] for n in _spread(len(views), PHOTOGRAPHS)]
     return [_pinhole(view.camera) for view in views], {view.camera.name: photograph(poses, view, behind) for view in shown}
 

@@ -32,18 +32,9 @@ NAME = "viewer.html"
 PART = 3 * 2**18  # bytes of compressed data in an element of the page; a multiple of 3
 
 
-def write_viewer(
-    asset: Path, target: Path, *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str | None = None
-) -> int:
-    """Write the page of an asset file, whole or not at all; returns its bytes.
-
-    cameras      captured cameras, training frame, to jump to; none: those of the asset's captured path
-    photographs  JPEG of the image of a camera, by the camera's name; as a pinhole camera of the same lens takes it
-    title        of the page; by default the file's name
-
-    Raises FormatError for a file that is no asset.
-    """
-    page = viewer_page(compact_bytes(asset), cameras=cameras, photographs=photographs, title=title or asset.stem)
+def write_viewer(asset: Path, target: Path) -> int:
+    """Write the page of an asset file, whole or not at all; returns its bytes. Raises FormatError for a file that is no asset."""
+    page = viewer_page(compact_bytes(asset), title=asset.stem)
     write_atomically(target, page)
     return len(page)
 
@@ -59,7 +50,11 @@ def compact_bytes(asset: Path) -> bytes:
 def viewer_page(
     asset: bytes, *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene"
 ) -> bytes:
-    """The page of the bytes of an asset in the layout `compact`, which the page checks."""
+    """The page of the bytes of an asset in the layout `compact`, which the page checks.
+
+    cameras      captured cameras, training frame, to jump to; none: those of the asset's captured path
+    photographs  JPEG of the image of a camera, by the camera's name; as a pinhole camera of the same lens takes it
+    """
     title = printable(title, 200)
     entries = [_camera(camera, (photographs or {}).get(camera.name)) for camera in cameras] or _captured_path(asset)
     facts = {"title": title, "bytes": len(asset), "cameras": entries, "home": None}

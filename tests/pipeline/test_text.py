@@ -28,10 +28,6 @@ def test_what_cannot_be_shown_is_escaped(text: object, shown: str) -> None:
     assert printable(text) == shown
 
 
-def test_line_ends_of_our_own_may_stay() -> None:
-    assert printable("one\ntwo\x1b", keep="\n") == "one\ntwo\\x1b"
-
-
 @given(st.text(st.characters(codec=None)), st.integers(1, 40))
 def test_every_text_comes_out_short_and_encodable(text: str, limit: int) -> None:
     whole, cut = printable(text), printable(text, limit)

@@ -75,9 +75,9 @@ def sentence(event: Event) -> str:
             return ""
 
 
-def warning(text: str, stage: str = "") -> Event:
+def warning(text: str) -> Event:
     """The event that shows a warning."""
-    return {"event": "warning", "stage": stage, "text": text, "time": time.time()}
+    return {"event": "warning", "stage": "", "text": text, "time": time.time()}
 
 
 def _line(stage: str, words: str) -> str:

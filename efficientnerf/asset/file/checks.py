@@ -7,6 +7,7 @@ from typing import Any
 from efficientnerf.asset.file.container import FormatError
 
 FARTHEST = 2.0**40  # in units of the grid: 64-bit floats tell places to a thousandth of one there
+MAX_CELLS = 2**30  # coarse, of all grids together
 
 
 def number(name: str, meta: dict[str, Any], key: str, low: float, high: float, *, whole: bool) -> float:
@@ -23,10 +24,10 @@ def numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, h
     return value
 
 
-def coarse_shape(name: str, meta: dict[str, Any], most: int) -> tuple[int, int, int]:
-    """`shape`: at most 65,536 coarse cells along an axis and `most` in all."""
+def coarse_shape(name: str, meta: dict[str, Any]) -> tuple[int, int, int]:
+    """`shape`: at most 65,536 coarse cells along an axis and MAX_CELLS in all."""
     shape = numbers(name, meta, "shape", 3, 1, 2**16)
-    if not all(type(n) is int for n in shape) or shape[0] * shape[1] * shape[2] > most:
-        raise FormatError(f"{name}: shape {shape}; expected whole numbers with a product of at most {most}")
+    if not all(type(n) is int for n in shape) or shape[0] * shape[1] * shape[2] > MAX_CELLS:
+        raise FormatError(f"{name}: shape {shape}; expected whole numbers with a product of at most {MAX_CELLS}")
     x, y, z = (int(n) for n in shape)
     return x, y, z

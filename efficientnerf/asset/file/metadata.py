@@ -8,7 +8,7 @@ import numpy as np
 
 from efficientnerf.asset.file.checks import FARTHEST, coarse_shape, number, numbers
 from efficientnerf.asset.file.container import FormatError
-from efficientnerf.asset.file.whole_scene import MAX_CELLS, MINOR, NEAREST_PREFIX, NESTED_PREFIX, check_whole_scene
+from efficientnerf.asset.file.whole_scene import MINOR, NEAREST_PREFIX, NESTED_PREFIX, check_whole_scene
 from efficientnerf.asset.tree import MAX_STEP, MIN_STEP, STEP_SIZE
 from efficientnerf.geometry.ndc import NUMBERS, Ndc
 from efficientnerf.rendering.harmonics import MAX_DEGREE
@@ -134,7 +134,7 @@ def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) ->
     if meta.get("sh_convention") != "real-orthonormal-plenoctree" or meta.get("colour_space") != "srgb-sigmoid":
         found = f"harmonics {str(meta.get('sh_convention'))[:60]} in {str(meta.get('colour_space'))[:60]}"
         raise FormatError(f"{name}: {found}; expected real-orthonormal-plenoctree in srgb-sigmoid")
-    coarse_shape(name, meta, MAX_CELLS)
+    coarse_shape(name, meta)
     number(name, meta, "brick", 1, 16, whole=True)
     number(name, meta, "sh_degree", 0, MAX_DEGREE, whole=True)
     far = FARTHEST * number(name, meta, "voxel", 1e-30, 1e30, whole=False)

@@ -12,7 +12,7 @@ B bricks, N stored voxels, K harmonics.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -55,17 +55,15 @@ def bytes_per_voxel(writer: str, degree: int) -> int:
     return {"compact": 4 + (harmonics - 1), "packed": PACKED_BYTES, "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
 
 
-def most_voxels(
-    size: int, writer: str, degree: int, shape: tuple[int, int, int], brick: int, *, outer: Sequence[tuple[int, int, int]] = (), environment: int = 0
-) -> int:
+def most_voxels(size: int, writer: str, degree: int, cells: int, brick: int, *, environment: int) -> int:
     """How many voxels, of all cascades together, fit a file of `size` bytes, if a quarter of the voxels of its bricks are stored (usually more are).
 
-    shape        coarse cells of the grid; `outer` those of the cascades around it
+    cells        coarse cells of all grids
     environment  rows of the environment map, 0 without one
     """
     palette = {"compact": 256, "packed": 256, "small": SMALL_ENTRIES, "sparse": 0}[writer] * (harmonics_count(degree) - 1) * 6
     coded = writer == "packed"  # hardly any bits of cells and masks are left
-    fixed = 2**14 + sum(math.prod(cells) // (256 if coded else 8) for cells in (shape, *outer)) + palette + 6 * environment**2
+    fixed = 2**14 + cells // (256 if coded else 8) + palette + 6 * environment**2
     mask = 0.0 if coded else 8 * math.ceil(brick**3 / 64) / max(1.0, brick**3 / 4)
     return max(0, int((size - fixed) / (bytes_per_voxel(writer, degree) + mask)))
 

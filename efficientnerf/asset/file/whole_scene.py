@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.asset.cascades import MAX_CASCADES, check_nesting
-from efficientnerf.asset.file.checks import FARTHEST, coarse_shape, number, numbers
+from efficientnerf.asset.file.checks import FARTHEST, MAX_CELLS, coarse_shape, number, numbers
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.tree import Region
 
 NEAREST_PREFIX = "nearest-"  # of layouts whose voxels are not interpolated; before the other prefix where both hold
 NESTED_PREFIX = "nested-"  # of layouts with several grids, or with an environment map
 MINOR = 4  # the version that brought them, and regions
-MAX_CELLS = 2**30  # of all grids together
 MAX_ENVIRONMENT = 2048  # rows of an environment map
 OCCUPANCY, ENVIRONMENT, REGION = "coarse.occupancy", "environment", "x.region.bricks"  # tensors
 
@@ -93,7 +92,7 @@ def _check_cascades(name: str, meta: dict[str, Any]) -> None:
     cells, far = math.prod(meta["shape"]), FARTHEST * float(meta["voxel"])
     for n, entry in enumerate(found, 1):
         try:
-            cells += math.prod(coarse_shape(name, entry, MAX_CELLS))
+            cells += math.prod(coarse_shape(name, entry))
             numbers(name, entry, "bounds_min", 3, -far, far)
         except FormatError as error:
             raise FormatError(f"{error} (cascade {n})") from None

@@ -87,10 +87,10 @@ def corner_frames(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return split.faces, tangents(mesh.vertices[split.vertex], mesh.normals[split.vertex], split.coordinates.astype(np.float64), split.faces)
 
 
-def dense_normals(dense: Dense, tick: Callable[[], None], rounds: int = ROUNDS, sharpness: float = SHARPNESS) -> np.ndarray:
+def dense_normals(dense: Dense, tick: Callable[[], None]) -> np.ndarray:
     """(V, 3) unit normals of the dense mesh's vertices: means of those of its faces, which are smoothed first."""
     faces = dense.faces
-    normals, area = smoothed_face_normals(dense.vertices, faces, rounds, sharpness, tick)
+    normals, area = smoothed_face_normals(dense.vertices, faces, ROUNDS, SHARPNESS, tick)
     weighted = area[:, None] * normals
     total = np.stack([np.bincount(faces.ravel(), np.repeat(weighted[:, axis], 3), minlength=len(dense.vertices)) for axis in range(3)], 1)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))

@@ -220,15 +220,14 @@ class PhotographTexture:
     atlas: Atlas
     density: np.ndarray
     sharpness: float
-    kept: int = KEPT
     seen: np.ndarray = field(init=False)
     grades: np.ndarray = field(init=False)
     halvings: int = field(init=False)  # of photographs, before texels look at them: several of whose pixels lie in a texel
 
     def __post_init__(self) -> None:
         count = len(self.texels.place)
-        self.seen = np.zeros((count, self.kept, 3), np.uint8)
-        self.grades = np.zeros((count, self.kept), np.float32)
+        self.seen = np.zeros((count, KEPT, 3), np.uint8)
+        self.grades = np.zeros((count, KEPT), np.float32)
         self.density = np.ascontiguousarray(self.density, np.float32)
         ratio = self.texels_per_pixel()
         self.halvings = max(0, int(np.floor(np.log(1 / ratio) / np.log(FINEST) + 1e-9))) if ratio > 0 else 0
@@ -266,12 +265,10 @@ class PhotographTexture:
         around = carried_on(mesh, self.atlas, *self.colours(expected, tick=tick), expected, tick)
         return self.colours(interpolated(replace(mesh, colours=around), self.atlas, tick), tick=tick)
 
-    def colours(
-        self, expected: np.ndarray, views: int = KEPT, power: float = POWER, scale: float = SCALE, tick: Callable[[], None] = _untold
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def colours(self, expected: np.ndarray, tick: Callable[[], None] = _untold) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the texels (T, 3) uint8, and what share of each is from photographs (T,); `expected` (T, 3) uint8 where they show nothing."""
         out, known = np.empty((len(self.seen), 3), np.uint8), np.empty(len(self.seen), np.float32)
         for part in pieces(len(self.seen), first=4096):
             tick()
-            blend(part.start, part.stop, self.seen, self.grades, min(views, self.kept), power, scale, expected, VOTE, TRUST, out, known)
+            blend(part.start, part.stop, self.seen, self.grades, KEPT, POWER, SCALE, expected, VOTE, TRUST, out, known)
         return out, known

@@ -21,13 +21,11 @@ class ExposureFit:
     """
     gains       (C, 3) logarithms of gains, of mean zero
     vignetting  (K, 2) a and b of `efficientnerf.training.exposure.model`
-    observed    (C,) observations that were used
     explained   share of the weighted squares of the differences between observations of a point that these account for
     """
 
     gains: np.ndarray
     vignetting: np.ndarray
-    observed: np.ndarray
     explained: float
 
 
@@ -69,7 +67,7 @@ def fit_exposure(light: np.ndarray, point: np.ndarray, view: np.ndarray, radius:
     after = float((weight[:, None] * unexplained**2).sum())
     gains = solved[:count, 1:]
     explained = 0.0 if before <= 0 else max(0.0, 1 - after / before)
-    return ExposureFit(gains - gains.mean(axis=0), solved[count:, 0].reshape(-1, 2), np.bincount(view, minlength=count), explained)
+    return ExposureFit(gains - gains.mean(axis=0), solved[count:, 0].reshape(-1, 2), explained)
 
 
 def _within(light: np.ndarray, points: np.ndarray, weight: np.ndarray, total: np.ndarray) -> np.ndarray:

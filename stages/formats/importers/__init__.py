@@ -43,10 +43,10 @@ class Importer:
         with one_line_errors(folder):
             return bool(self._function("recognises")(folder, allow_outside, *self._dialect))
 
-    def holds_less_than(self, other: str, folder: Path, allow_outside: bool = False) -> bool:
-        """Whether another format of the same images in the folder says more of them; of formats that know of one such."""
+    def holds_less_than_colmap(self, folder: Path, allow_outside: bool) -> bool:
+        """Whether a COLMAP model of the same images in the folder says more of them; of LLFF alone."""
         with one_line_errors(folder):
-            return bool(self._function(f"holds_less_than_{other}")(folder, allow_outside))
+            return bool(self._function("holds_less_than_colmap")(folder, allow_outside))
 
     def read(self, folder: Path, settings: ImportSettings) -> Capture:
         """The capture, whose names and sentences may be shown; raises BadInput."""
@@ -129,7 +129,7 @@ def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str
         with one_line_errors(folder):
             photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
         found.append("photographs")
-    if {"llff", "colmap"} <= set(found) and llff_factor == "auto" and IMPORTERS["llff"].holds_less_than("colmap", folder, allow_outside):
+    if {"llff", "colmap"} <= set(found) and llff_factor == "auto" and IMPORTERS["llff"].holds_less_than_colmap(folder, allow_outside):
         found.remove("colmap")
         found.insert(found.index("llff"), "colmap")
     return found

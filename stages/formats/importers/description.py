@@ -28,13 +28,12 @@ class Defaults:
     llff_factor: int | Auto = "auto"
 
 
-def describe_source(folder: Path, format: str = "auto") -> dict[str, Any]:
+def describe_source(folder: Path) -> dict[str, Any]:
     """What `enerf inspect SOURCE` prints of a data set: count, resolutions, camera models, bounds, warnings. Raises BadInput."""
-    possible = candidates(folder, Defaults.allow_outside)
-    name = possible[0] if format == "auto" else format
+    name, *others = candidates(folder, Defaults.allow_outside)
     with one_line_errors(folder):
         described = _posed(IMPORTERS[name].read(folder, Defaults())) if IMPORTERS[name].posed else _photographs(folder)
-    others = [other for other in possible if other not in (name, "photographs")]
+    others = [other for other in others if other != "photographs"]
     if others:
         described["warnings"].append(f"can also be read --as {' or '.join(others)}.")
     return {"what": "source", "format": name} | described

@@ -58,7 +58,6 @@ class Frame:
     camera: Callable[[str, tuple[int, int]], Camera]
     bare: bool = False
     mask: Path | None = None
-    mask_ignore: str = "black"
     split: str | None = None
 
 
@@ -261,7 +260,7 @@ def _photos(source: Source, listing: Listing[Frame]) -> tuple[list[Photo], list[
         if remark is not None:
             remarks.setdefault(remark, []).append(camera.name)
         mask = frame.mask or beside.get(path)
-        photos.append(Photo(camera, source.real(path), None if mask is None else source.real(mask), frame.mask_ignore, frame.split))
+        photos.append(Photo(camera, source.real(path), None if mask is None else source.real(mask), split=frame.split))
         names.append(frame.name)
     return photos, names, unreadable, remarks
 

@@ -30,7 +30,7 @@ def recognises(folder: Path, allow_outside: bool = False) -> bool:
     return (folder / POSES).is_file()
 
 
-def holds_less_than_colmap(folder: Path, allow_outside: bool = False) -> bool:
+def holds_less_than_colmap(folder: Path, allow_outside: bool) -> bool:
     """Whether the folder's COLMAP model has all images of poses_bounds.npy, and they look round about, as in mip-NeRF 360's data.
 
     The file was made from the model, and has one focal length for its lens and none of its points. For forward-facing captures its depths give the space of

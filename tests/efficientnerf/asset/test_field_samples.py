@@ -46,14 +46,15 @@ def boxes(count: int, voxel: float = 0.05) -> list[np.ndarray]:
 def test_the_samples_are_those_of_the_pixels(made: Made) -> None:
     _, pixels, samples = made
     np.testing.assert_array_equal(samples.pixel, spread_pixels(pixels, 10**6))
-    total = np.bincount(samples.ray(), weights=samples.weight, minlength=len(samples.pixel))
+    ray = np.repeat(np.arange(len(samples.pixel)), np.diff(samples.first))
+    total = np.bincount(ray, weights=samples.weight, minlength=len(samples.pixel))
     np.testing.assert_allclose(total, samples.opacity, atol=0.03)  # light ones are left out
     assert (samples.weight > 1e-3).all()
     assert len(samples.first) == len(samples.pixel) + 1
     some = surface_points(samples)
     hit = np.isfinite(some).all(axis=1)
     assert 0.5 < hit.mean() < 0.98
-    np.testing.assert_array_equal(hit, np.bincount(samples.ray(), weights=samples.weight, minlength=len(hit)) >= 0.5)
+    np.testing.assert_array_equal(hit, np.bincount(ray, weights=samples.weight, minlength=len(hit)) >= 0.5)
     away = np.abs(np.linalg.norm(some[hit], axis=1) - RADIUS)
     plan = np.linalg.norm(some[hit][:, :2], axis=1)
     on_something = (away < 0.1) | (np.abs(some[hit][:, 2] - GROUND) < 0.3) | ((plan > WALL - 0.5) & (plan < WALL + 1.5))

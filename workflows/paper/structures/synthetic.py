@@ -13,6 +13,7 @@ from workflows.paper.structures.voxels import Voxels
 
 BODIES = 24  # half of them solid, half shells
 LEVELS = 1 << 16  # quantisation levels of the score
+CAMERAS, WIDTH = 8, 800  # of the rays
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -118,15 +119,15 @@ def random_points(side: int, count: int, seed: int) -> np.ndarray:
     return np.minimum(points, np.nextafter(np.float32(side), np.float32(0)))
 
 
-def ray_points(side: int, count: int, seed: int, *, cameras: int = 8, width: int = 800) -> np.ndarray:
+def ray_points(side: int, count: int, seed: int) -> np.ndarray:
     """At least `count` points along camera rays, ray by ray as a renderer marches them: (M, 3) float32, voxel coordinates.
 
-    Cameras around the grid, at twice its side, point at its centre; each contributes some rows of its image of width x width pixels, spread over the height.
+    Cameras around the grid, at twice its side, point at its centre; each contributes some rows of its image of WIDTH x WIDTH pixels, spread over the height.
     A ray is sampled once per voxel length between entering and leaving the grid.
     """
     rng = np.random.default_rng(seed)
-    per_row = 0.45 * width * side  # points of a row, roughly
-    rows = max(round(count / cameras / per_row), 1)
+    per_row = 0.45 * WIDTH * side  # points of a row, roughly
+    rows = max(round(count / CAMERAS / per_row), 1)
     parts: list[np.ndarray] = []
     total = images = 0
     while total < count:
@@ -136,13 +137,13 @@ def ray_points(side: int, count: int, seed: int, *, cameras: int = 8, width: int
         right /= np.linalg.norm(right)
         up = np.cross(right, forward)
         v = ((np.arange(rows) + rng.random()) / rows - 0.5) * 0.9
-        u = (np.arange(width) + 0.5) / width - 0.5
+        u = (np.arange(WIDTH) + 0.5) / WIDTH - 0.5
         rays = (forward + 0.7 * (u[None, :, None] * right + v[:, None, None] * up)).reshape(-1, 3)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         marched = _march(side, side * (0.5 - 2 * forward), rays)
         parts.append(marched)
         total, images = total + len(marched), images + 1
-        if images > 100 * cameras:
+        if images > 100 * CAMERAS:
             raise ValueError(f"ray_points: {total} points after {images} images of a grid of side {side}; expected {count}, use fewer")
     return np.concatenate(parts)
 
