@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
@@ -121,7 +120,7 @@ def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: 
     except UnreadableImage as error:
         return None, str(error)
     details, file = photo.details, f"{index:05d}.png"
-    _link(photo.image, work / "images" / file)
+    shutil.copyfile(photo.image, work / "images" / file)  # no hard link: a run that was killed here has to be resumed, and what is linked is refused
     mask, remark = None if photo.opaque is None else read_png(photo.opaque) > 0, ""
     if (mask_path := masks.get(name)) is None:
         mask = None if name in masks else mask
@@ -142,15 +141,6 @@ def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: 
     fisheye = lens == "fisheye" or (lens == "auto" and details.fisheye)
     key = f"{details.width}x{details.height} {maker} {focal if focal is None else round(focal, 1)}{' fisheye' if fisheye else ''}"
     return WorkImage(name, file, details.width, details.height, details.work_width, details.work_height, focal, key, fisheye), remark
-
-
-def _link(source: Path, target: Path) -> None:
-    """A second name for a file, or where the file system has none a copy."""
-    remove(target)
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
 
 
 def _holds(path: Path, data: bytes) -> bool:

@@ -123,8 +123,8 @@ def fit() -> None:
         outputs = tree_gradients.forward(g, rays, *values)
         tree_gradients.backward(g, rays, *values, outputs, (outputs[0], outputs[1]), sums, stamp, 7)
         tree_gradients.max_contributions(g, rays, values[0], outputs[1], squares[0])
-        for momentum, total_variation in ((0.0, 0.0), (0.9, 0.1)):
-            rule = Hyperparameters(0.1, 0.1, 0.5, 0.9, 1e-10, momentum, total_variation)
+        for total_variation in (0.0, 0.1):
+            rule = Hyperparameters(0.1, 0.1, 0.5, 0.9, 1e-10, total_variation=total_variation)
             neighbours = tree_steps.Neighbours(torch.zeros(count), torch.zeros(count, 6, dtype=torch.int32))
             tree_steps.step(g, values, sums, Moments(*values, *squares, visits), stamp, rule, neighbours, number=7, rays=8)
 

@@ -148,7 +148,7 @@ def test_files_missing_on_disk(tmp_path: Path) -> None:
     assert [photo.camera.name for photo in capture.photos] == [f"images/img_{i}.png" for i in (0, 2, 3, 5)]
     assert [name for name, _ in capture.rejected] == ["images/img_1.png", "images/img_4.png"]
     warnings = " ".join(capture.warnings)
-    assert all(name in warnings for name in ("images/img_1.png", "img_4.png", "1 masks", "cloud.ply"))
+    assert all(name in warnings for name in ("images/img_1.png", "img_4.png", "1 listed masks", "cloud.ply"))
     (folder / "cloud.ply").write_text("nothing")
     assert "not readable as a PLY" in " ".join(read(folder).warnings)
     refusal(folder, "1 of 6", "--strict", strict=True)

@@ -113,7 +113,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path:
     events: list[dict[str, Any]] = []
     assert run(job(tmp_path, settings(**QUICK), poses=scene, events=events)) == undisturbed
     assert any(event["event"] == "warning" and "checkpoint_00000009" in event["text"] for event in events)
-    assert any("goes on from step 8" in event.get("text", "") for event in events)
+    assert any("resuming training from step 8" in event.get("text", "") for event in events)
 
 
 def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) -> None:
