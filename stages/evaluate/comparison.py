@@ -9,7 +9,7 @@ holes_excess_error, floaters_excess_error  the asset's squared error less the ne
           `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there
 
 Where training learned exposure, vignetting and response, renders are compared as the camera would show them. The exposure of a held-back photograph is not
-learned but foretold by those of its neighbours (`efficientnerf.training.exposure.held_out`): psnr_colour_fitted is the PSNR after the affine change of the
+learned but predicted by those of its neighbours (`efficientnerf.training.exposure.held_out`): psnr_colour_fitted is the PSNR after the affine change of the
 render's colours, twelve numbers a view, that fits the photograph best (`metrics.colour_fitted`).
 """
 

@@ -38,7 +38,7 @@ def averaged_views(folder: Path, trained: Path) -> ReadView:
 
 def as_taken(trained: Path, s: Scene) -> Taken | None:
     """A function that shows a render (H, W, 3) of every stride-th pixel of a view as its camera would, by what the train stage in `trained` learned; None: it
-    learned nothing. Held-back views are exposed as the nearest training photographs foretell (`predicted_gains`)."""
+    learned nothing. Held-back views are exposed as the nearest training photographs predict (`predicted_gains`)."""
     known = exposures_of(trained)
     if known is None:
         return None
@@ -47,8 +47,8 @@ def as_taken(trained: Path, s: Scene) -> Taken | None:
     gains = {name: learned[number] for name, number in numbers.items()}
     train, others = ([view for view in s.views if (view.split == "train") is used and view.image in numbers] for used in (True, False))
     own = np.array([gains[view.image] for view in train]).reshape(-1, 3)
-    foretold = predicted_gains(own, [view.camera for view in train], [view.camera for view in others])
-    gains |= {view.image: one for view, one in zip(others, foretold, strict=True)}
+    predicted = predicted_gains(own, [view.camera for view in train], [view.camera for view in others])
+    gains |= {view.image: one for view, one in zip(others, predicted, strict=True)}
 
     def taken(view: View, image: np.ndarray, stride: int) -> np.ndarray:
         if view.image not in numbers:

@@ -1,6 +1,6 @@
 """The exposure of photographs that training did not see: a camera that sets exposure by itself sets it alike for views that are alike.
 
-It is that of the nearest training photographs, times how well theirs foretells a training photograph's own: 1 where exposure changes slowly from view to
+It is that of the nearest training photographs, times how well theirs predicts a training photograph's own: 1 where exposure changes slowly from view to
 view, 0 where each photograph has an exposure at random and the mean is the better guess. No held-back photograph is looked at.
 """
 
@@ -25,8 +25,8 @@ def predicted_gains(gains: np.ndarray, cameras: Sequence[Camera], others: Sequen
         return np.zeros((len(others), 3))
     apart = _distances(cameras, cameras)
     np.fill_diagonal(apart, np.inf)
-    foretold = _mean_of_nearest(gains, apart)
-    trust = (gains * foretold).sum() / max(float((foretold**2).sum()), 1e-12)
+    predicted = _mean_of_nearest(gains, apart)
+    trust = (gains * predicted).sum() / max(float((predicted**2).sum()), 1e-12)
     return np.asarray(np.clip(trust, 0, 1) * _mean_of_nearest(gains, _distances(others, cameras)))
 
 

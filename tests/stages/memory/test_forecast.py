@@ -1,4 +1,4 @@
-"""What stages take and write, foretold: fleets admit them by it. Of memory it is what the stage itself says once it begins."""
+"""What stages take and write, predicted: fleets admit them by it. Of memory it is what the stage itself says once it begins."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_it_is_what_the_stage_says_that_it_needs(run: tuple[Path, dict[str, int]
     assert memory_needed(stage, place, (), OWN) == caught.value.needed
 
 
-def test_training_and_baking_take_no_more_than_was_foretold(run: tuple[Path, dict[str, int], Any]) -> None:
+def test_training_and_baking_take_no_more_than_was_predicted(run: tuple[Path, dict[str, int], Any]) -> None:
     place, said, _ = run
     assert memory_needed("train", place, (), OWN) == said["train"]
     at_most = memory_needed("bake", place, (), OWN)
@@ -92,13 +92,13 @@ def test_training_and_baking_take_no_more_than_was_foretold(run: tuple[Path, dic
 
 
 @pytest.mark.parametrize("stage", MODULES)
-def test_a_stage_writes_what_was_foretold_and_no_less_than_half(run: tuple[Path, Any, dict[str, int]], stage: str) -> None:
+def test_a_stage_writes_what_was_predicted_and_no_less_than_half(run: tuple[Path, Any, dict[str, int]], stage: str) -> None:
     """But for logs and pictures whose size does not follow from the scene's."""
-    foretold, written = space_needed(stage, run[0], (), OWN), run[2][stage]
-    assert written <= foretold <= 2 * written + 3 * LEAST
+    predicted, written = space_needed(stage, run[0], (), OWN), run[2][stage]
+    assert written <= predicted <= 2 * written + 3 * LEAST
 
 
-def test_photographs_are_foretold_by_their_headers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_are_predicted_by_their_headers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     for number in range(3):
         Image.fromarray(np.zeros((30, 40 + number, 3), np.uint8)).save(tmp_path / f"{number}.png")
@@ -156,7 +156,7 @@ def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
     assert disk.has_room(60 * 10**6, (tmp_path, needed), [(tmp_path, needed)], written=lambda _: 0)
 
 
-def test_no_more_gaussians_are_foretold_than_a_picture_has_pixels() -> None:
+def test_no_more_gaussians_are_predicted_than_a_picture_has_pixels() -> None:
     assert [most_gaussians(replace(DEFAULTS["splats"], count=count), [300, 200, 100]) for count in (50, 1000)] == [50, 200]
 
 
@@ -164,13 +164,13 @@ def test_pixels_that_do_not_fit_into_memory_and_checkpoints_are_written(run: tup
     roomy, tight = (space_needed("train", run[0], (), OWN, memory) for memory in (None, 1000))
     assert tight - roomy == 4 * 7 * 16 * 16
     one, three = (space_needed("train", run[0], (), {**OWN, "train": replace(OWN["train"], checkpoint_every=every)}) - LEAST for every in (1000, 1))
-    assert 1.5 * one < three < 3 * one, "a checkpoint that no step reaches is foretold for an interruption alone"
+    assert 1.5 * one < three < 3 * one, "a checkpoint that no step reaches is predicted for an interruption alone"
 
 
 @pytest.mark.parametrize(("background", "channels"), [("auto", 3), ("transparent", 4)])
 @pytest.mark.parametrize(("exr", "deep"), [("off", 0), ("first", 1), ("all", 3)])
-def test_a_turntables_frames_of_noise_fit_into_what_was_foretold(background: str, channels: int, exr: str, deep: int, tmp_path: Path) -> None:
-    """Nothing is harder to compress; and what is foretold, in scratch and artifact, is no more than a sixth above."""
+def test_a_turntables_frames_of_noise_fit_into_what_was_predicted(background: str, channels: int, exr: str, deep: int, tmp_path: Path) -> None:
+    """Nothing is harder to compress; and what is predicted, in scratch and artifact, is no more than a sixth above."""
     own = replace(DEFAULTS["turntable"], frames=3, width=512, height=384, background=background, exr=exr)
     random = np.random.default_rng(0)
     camera = Camera("noise", own.width, own.height, "SIMPLE_PINHOLE", (400.0, own.width / 2, own.height / 2), np.eye(4))

@@ -93,7 +93,7 @@ def _choose_bases(values, weight, table, neighbours, bits, codes, channel, begin
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def choose_bases(values, weight, table, neighbours, bits, codes, channel, first, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (3 N,) uint8 of one channel, of those between the nearest one, which is there before, and the one that is foretold.
+    """Codes (3 N,) uint8 of one channel, of those between the nearest one, which is there before, and the one that is predicted.
 
     values  (N, 3) float32; weight (N, 3); table (T, 3)
     bits    (136, 256) float32
