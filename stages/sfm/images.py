@@ -120,6 +120,7 @@ def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: 
     except UnreadableImage as error:
         return None, str(error)
     details, file = photo.details, f"{index:05d}.png"
+    remove(work / "images" / file)  # a link there would be followed
     shutil.copyfile(photo.image, work / "images" / file)  # no hard link: a run that was killed here has to be resumed, and what is linked is refused
     mask, remark = None if photo.opaque is None else read_png(photo.opaque) > 0, ""
     if (mask_path := masks.get(name)) is None:
