@@ -16,15 +16,15 @@ Taken = Callable[[View, np.ndarray, int], np.ndarray]
 ReadView = Callable[[View], tuple[np.ndarray, np.ndarray | None]]  # (H, W, 3 or 4) uint8, and (H, W) bool or None
 
 
-def averaged_views(folder: Path, trained: Path) -> ReadView:
+def averaged_views(folder: Path, trained: Path | None) -> ReadView:
     """A reader of views and their masks: where exposure was learned, with the average exposure, and without clipped pixels.
 
     folder   of the scene
-    trained  of the stage train
+    trained  of the stage train; None: photographs are read as they are
 
     Raises CorruptArtifact.
     """
-    known = exposures_of(trained)
+    known = None if trained is None else exposures_of(trained)
 
     def read(view: View) -> tuple[np.ndarray, np.ndarray | None]:
         image, mask = read_image(folder, view), read_mask(folder, view)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,11 @@ from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.errors import UsageError
+from stages.cores import count_cores, in_order
 from stages.io import scene
 from stages.io.scene import Scene, View
 from stages.scratch import Warn
-from stages.train.averaged import averaged_views, exposures_of
+from stages.train.averaged import averaged_views
 from stages.train.settings import refuse_planes_out_of_order
 
 MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
@@ -27,18 +29,22 @@ MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than th
 
 
 def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None, trained: Path | None = None) -> Pixels:
-    """All pixels of some views of a scene, as bytes; one image at a time is held besides them.
+    """All pixels of some views of a scene, as bytes; two images for each core are held besides them.
 
     rows     where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
     trained  of the stage train, where it learned the photographs' exposure: they are as if all had been exposed alike; None: as they are
     """
-    images = (scene.read_image(folder, view) for view in views)
-    masks = (scene.read_mask(folder, view) for view in views)
-    if trained is not None and exposures_of(trained) is not None:
-        read = averaged_views(folder, trained)
-        images, masks = (read(view)[0] for view in views), (read(view)[1] for view in views)
+    read = averaged_views(folder, trained)
+    kept: list[np.ndarray | None] = []
+
+    def images() -> Iterator[np.ndarray]:
+        for image, mask in in_order(read, views, count_cores(), lambda: None):
+            kept.append(None if mask is None else np.packbits(mask))  # images are taken before masks
+            yield image
+
+    masks = (None if bits is None else np.unpackbits(bits, count=view.camera.width * view.camera.height) for bits, view in zip(kept, views, strict=True))
     near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
-    return Pixels([view.camera for view in views], images, masks, near, far, channels_of(folder, views), rows)
+    return Pixels([view.camera for view in views], images(), masks, near, far, channels_of(folder, views), rows)
 
 
 def count_pixels(views: tuple[View, ...]) -> int:

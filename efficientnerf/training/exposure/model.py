@@ -19,8 +19,9 @@ R rays, C photographs, K cameras.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -38,6 +39,9 @@ CLIPPED = 253  # level from which a photograph says no more than that the scene 
 OVEREXPOSED = 0.1  # logarithm of a gain from which clipped pixels of a photograph are left out
 FOCAL_STEP = 1.2  # focal lengths, over the longer side, of one camera are within this factor
 VIGNETTING, SHOULDER, OFFSET = slice(0, 2), 2, 3  # of a camera's numbers
+# Light of photographs is within these, which are floats with such numbers in their order; bits of a float that a cell of `_levels_of_light` leaves out
+DARKEST, DARKEST_NUMBER, BRIGHTEST_NUMBER, CELL_BITS = -0.25, -0x3E800000, 0x7F7FFFFF, 12
+CELLS = 2 ** (31 - CELL_BITS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,19 +133,71 @@ def averaged(colour: Tensor, view: Tensor, radius: Tensor, e: Exposure) -> Tenso
 
 def averaged_image(image: np.ndarray, mask: np.ndarray | None, number: int, e: Exposure) -> tuple[np.ndarray, np.ndarray | None]:
     """Photograph `number` as if all had been exposed alike: (H, W, 3 or 4) uint8, alpha as it was, and the mask (H, W) bool of what is to be used of it:
-    clipped pixels of a photograph exposed more do not show how bright the scene is."""
+    clipped pixels of a photograph exposed more do not show how bright the scene is.
+
+    The bytes of `averaged`, by tables: light of a level depends on the camera alone, and the level of averaged light on nothing.
+    """
     height, width = image.shape[:2]
-    at = _places_of_image(number, width, height)
-    colour = torch.from_numpy(image[..., :3].reshape(-1, 3).astype(np.float32) / np.float32(255))
     with torch.no_grad():
-        seen = averaged(colour, *at, e)
-        more = _response_and_gain(*at, e)[2] > math.exp(OVEREXPOSED)
+        light = _light_of_levels(e)[int(e.camera_of[number])]
+        radius = _places_of_image(number, width, height)[1]
+        gain = torch.exp(e.log_gains()[number] + _falloff(_numbers(e)[e.camera_of[number]], radius)[:, None])
+        shown = light.index_select(0, torch.from_numpy(image[..., :3].astype(np.int32).reshape(-1))).view(-1, 3)
+        levels = _levels_of_light(e)(shown / gain)
+        more = gain > math.exp(OVEREXPOSED)
     out = image.copy()
-    out[..., :3] = torch.round(255 * seen.clamp(0, 1)).to(torch.uint8).numpy().reshape(height, width, 3)
-    blind = np.asarray((more.numpy().reshape(height, width, 3) & (image[..., :3] >= CLIPPED)).any(axis=-1))
+    out[..., :3] = levels.numpy().reshape(height, width, 3)
+    lost = more.numpy().reshape(height, width, 3) & (image[..., :3] >= CLIPPED)
+    blind = lost[..., 0] | lost[..., 1] | lost[..., 2]
     if not blind.any():
         return out, mask
     return out, ~blind if mask is None else mask & ~blind
+
+
+@lru_cache(maxsize=1)
+def _light_of_levels(e: Exposure) -> Tensor:
+    """(K, 256) float32 light that levels of each camera's photographs show."""
+    level = torch.arange(256, dtype=torch.float32) / np.float32(255)
+    return _light(level[:, None], _numbers(e)[:, None, SHOULDER:])[..., 0]
+
+
+@lru_cache(maxsize=1)
+def _levels_of_light(e: Exposure) -> Callable[[Tensor], Tensor]:
+    """The levels (R, 3) uint8 that the average response shows light (R, 3) as: how many of the 255 least lights of a level it reaches. These lie in cells of
+    floats, of which a table says how many come before."""
+    ends = _least_light_of_levels(_numbers(e).mean(dim=0)[SHOULDER:])
+    of_ends = _cells_of_light(ends)
+    before = torch.bucketize(torch.arange(CELLS), of_ends.long()).to(torch.uint8)
+    most, beyond = int(torch.bincount(of_ends).max()), torch.cat([ends, torch.tensor([math.inf])])
+
+    def levels(light: Tensor) -> Tensor:
+        found = before.index_select(0, _cells_of_light(light).view(-1)).view_as(light)
+        for _ in range(most):  # once, but where a response is steep
+            found += light >= beyond.index_select(0, found.int().view(-1)).view_as(light)
+        return found
+
+    return levels
+
+
+def _cells_of_light(light: Tensor) -> Tensor:
+    """(...) int32 number of a cell, in the order of the light."""
+    return (light - DARKEST).clamp(min=0).view(torch.int32) >> CELL_BITS
+
+
+def _least_light_of_levels(response: Tensor) -> Tensor:
+    """(255,) float32 least light that a response (2,) shows as level 1, 2, ... 255, by bisection of all floats in their order."""
+    low, high = torch.full((255,), DARKEST_NUMBER), torch.full((255,), BRIGHTEST_NUMBER)
+    while (high - low > 1).any():
+        middle = (low + high) // 2
+        shown = torch.round(255 * _seen(_ordered_floats(middle)[:, None], response).clamp(0, 1))[:, 0]
+        reached = shown >= torch.arange(1, 256)
+        low, high = torch.where(reached, low, middle), torch.where(reached, middle, high)
+    return _ordered_floats(high)
+
+
+def _ordered_floats(number: Tensor) -> Tensor:
+    """The float32 of these numbers (int64) in their order, 0 being 0."""
+    return torch.where(number < 0, -1.0, 1.0) * number.abs().to(torch.int32).view(torch.float32)
 
 
 def image_as_taken(image: np.ndarray, number: int, e: Exposure, gains: np.ndarray, size: tuple[int, int], stride: int = 1) -> np.ndarray:
@@ -172,11 +228,20 @@ def _places_of_image(number: int, width: int, height: int, stride: int = 1) -> t
 
 def _response_and_gain(view: Tensor, radius: Tensor, e: Exposure, gains: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Response (R, 2) of the rays' cameras, that (2,) of all on average, and gains (R, 3); with logarithms (3,) in place of the photographs' own."""
-    cameras = torch.cat([SCALE * e.cameras[:, :OFFSET], OFFSET_SCALE * e.cameras[:, OFFSET:]], dim=1)
+    cameras = _numbers(e)
     of = cameras[e.camera_of[view]]  # (R, 4)
-    falloff = of[:, 0] * (radius - 1 / 3) + of[:, 1] * (radius**2 - 1 / 9)
     own = e.log_gains()[view] if gains is None else gains
-    return of[:, SHOULDER:], cameras.mean(dim=0)[SHOULDER:], torch.exp(own + falloff[:, None])
+    return of[:, SHOULDER:], cameras.mean(dim=0)[SHOULDER:], torch.exp(own + _falloff(of, radius)[:, None])
+
+
+def _numbers(e: Exposure) -> Tensor:
+    """(K, 4) a, b, shoulder and offset of each camera."""
+    return torch.cat([SCALE * e.cameras[:, :OFFSET], OFFSET_SCALE * e.cameras[:, OFFSET:]], dim=1)
+
+
+def _falloff(numbers: Tensor, radius: Tensor) -> Tensor:
+    """(R,) d of cameras' numbers (..., 4) at r^2 = `radius` (R,)."""
+    return numbers[..., 0] * (radius - 1 / 3) + numbers[..., 1] * (radius**2 - 1 / 9)
 
 
 def _light(colour: Tensor, response: Tensor) -> Tensor:

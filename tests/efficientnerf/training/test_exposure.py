@@ -120,6 +120,20 @@ def test_a_photograph_as_if_exposed_like_the_others() -> None:
     assert (bright[..., 3].tolist(), image[0, 0].tolist()) == ([[7, 255]], [100, 200, 10, 7])
 
 
+@pytest.mark.parametrize("strength", [0.0, 1.0, 8.0])
+def test_a_photograph_has_the_bytes_of_averaged(strength: float) -> None:
+    """Of any response, offset and vignetting: tables are exact."""
+    draw = torch.Generator().manual_seed(7)
+    e = Exposure(strength * torch.randn(3, 3, generator=draw), strength * torch.randn(2, 4, generator=draw), torch.tensor([0, 1, 0]))
+    image = np.random.default_rng(1).integers(0, 256, (40, 50, 3), np.uint8)
+    y, x = np.divmod(np.arange(2000), 50)
+    radius = torch.from_numpy(squared_radius(x, y, 50, 40))
+    for number in range(3):
+        colour = torch.from_numpy(image.reshape(-1, 3).astype(np.float32) / np.float32(255))
+        expected = torch.round(255 * averaged(colour, torch.full((2000,), number), radius, e).clamp(0, 1)).to(torch.uint8)
+        assert np.array_equal(averaged_image(image, None, number, e)[0].reshape(-1, 3), expected.numpy())
+
+
 def test_a_render_as_its_camera_shows_it() -> None:
     """With gains that are given; at every stride-th pixel the same as there of all."""
     e = Exposure(torch.zeros(2, 3), torch.tensor([[-4.0, -1.0, 3.0, 0.0]]), torch.zeros(2, dtype=torch.int64))
