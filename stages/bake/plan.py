@@ -25,11 +25,13 @@ from efficientnerf.settings import resolved
 from stages.bake.resolution import MAX_CELLS, MAX_OVERSHOOT, MAX_RESOLUTION, MIN_RESOLUTION, Choice, finest_resolution, mib_for_voxels, timed_mib, usual_mib
 from stages.bake.settings import BakeSettings
 from stages.evaluate.views import constant_background
-from stages.io.scene import Scene
+from stages.io.scene import Scene, views_of
 
 MAX_CASCADES = 8
 ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
-UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
+# bake.view_dependent_lr_ratio without a constant background: for each training view, at least and at most. Of a voxel that few views see, view dependence is
+# overfitted. docs/experiments/tree-training.md
+VIEW_LR_RATIO, MIN_VIEW_DEPENDENT_LR_RATIO, MAX_VIEW_DEPENDENT_LR_RATIO = 0.0025, 0.2, 0.6
 
 
 def coarse_cells(grids: Sequence[Grid]) -> int:
@@ -152,10 +154,11 @@ def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: in
     mib, usual, seconds = resolved(settings.max_mib), usual_mib(s, packed=packed), resolved(settings.time_budget)
     timed = mib is None and seconds is not None and device == "cpu"
     if mib is None:
-        mib = timed_mib(usual, seconds, cores, whole=whole, packed=packed) if seconds is not None and timed else usual
+        mib = timed_mib(usual, seconds, cores, packed=packed) if seconds is not None and timed else usual
     ratio, error_map = resolved(settings.view_dependent_lr_ratio), resolved(settings.error_map)
     if ratio is None:
-        ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if s.background is None else 1.0
+        of_views = float(np.clip(VIEW_LR_RATIO * len(views_of(s, "train")), MIN_VIEW_DEPENDENT_LR_RATIO, MAX_VIEW_DEPENDENT_LR_RATIO))
+        ratio = of_views if s.background is None else 1.0
     if error_map is None:
         error_map = ERROR_MAP if s.forward is None else 0.0
     common = _Bake(

@@ -20,13 +20,13 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.bake.holes import find_holes, voxels_of_holes
-from stages.bake.plan import Bake, NdcBake
+from stages.bake.plan import Bake, NdcBake, ObjectBake, SceneBake
 from stages.bake.voxels import FEW_VIEWS_RATIO, seen_by_few
 from stages.io.scene import Scene
 
-# Training rays per voxel that are rendered to see which voxels show, at least bake.visibility_rays; in normalised device coordinates, where no ray
-# misses and each meets many voxels, fewer. docs/experiments/refinement.md
-RAYS_PER_VOXEL, NDC_RAYS_PER_VOXEL = 1.0, 0.25
+# Training rays per voxel that are rendered to see which voxels show, at least bake.visibility_rays: fewer where many of the voxels that are baked do not stay,
+# and in normalised device coordinates, where no ray misses and each meets many voxels. docs/experiments/refinement.md
+RAYS_PER_VOXEL = {ObjectBake: 1.0, SceneBake: 0.4, NdcBake: 0.25}
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,7 @@ def prune(
 
 def count_rays(job: Job, plan: Bake, voxels: int, targets: Targets) -> int:
     """Training rays that are rendered to find which of so many voxels show."""
-    per_voxel = NDC_RAYS_PER_VOXEL if isinstance(plan, NdcBake) else RAYS_PER_VOXEL
-    return min(max(job.settings.visibility_rays, int(per_voxel * voxels)), 4 * len(targets.pixels))
+    return min(max(job.settings.visibility_rays, int(RAYS_PER_VOXEL[type(plan)] * voxels)), 4 * len(targets.pixels))
 
 
 def greatest_weights(job: Job, plan: Bake, state: RefinementState, targets: Targets) -> np.ndarray:

@@ -95,7 +95,9 @@ class BakeSettings:
     density_lr: NonNegative = setting(0.3, "Learning rate of the refinement for the logarithm of a voxel's optical thickness.", advanced=True)
     sh_lr: NonNegative = setting(0.1, "Learning rate of the refinement for the spherical harmonics.", advanced=True)
     view_dependent_lr_ratio: Fraction | Auto = setting(
-        "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 1 for objects with alpha, 0.2 in unbounded scenes.", advanced=True
+        "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 1 for objects with alpha; in unbounded scenes 0.2 for up to 80 training"
+        " images, rising to 0.6 for 240.",
+        advanced=True,
     )
     total_variation: NonNegative = setting(
         0.01, "Weight of the total variation of the logarithm of the optical thickness between neighbouring voxels.", advanced=True
@@ -120,7 +122,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=22,
+    version=23,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=ByName("stages.bake.run:run"),
