@@ -205,15 +205,3 @@ def test_voxels_without_density_are_neighbours_and_absent_ones_are_not(made: Cal
         assert slope_of(values, beside, v, thickness[v], sides[v]) == pytest.approx(wanted, rel=1e-5, abs=1e-5)
         counts.append(sum(n is not None for n in found))
     assert max(counts) > min(counts)
-
-
-@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
-def test_total_variation_smooths_what_was_met_alone(made: Callable[[], NerfTree]) -> None:
-    tree = made()
-    o = initial_state(tree)
-    before = o.density.copy()
-    values = values_of(cells_of(tree), o.density, o.sh)
-    step(records_of(tree, o, 2), values, moments_of(o), rule_of(total_variation=1e6),
-         neighbours_of(cells_of(tree)))  # fmt: skip
-    np.testing.assert_array_equal(o.density[o.visits == 0], before[o.visits == 0])
-    assert (o.density != before)[o.visits > 0].mean() > 0.8
