@@ -62,7 +62,7 @@ def use(tree: Any) -> None:
     queries.density_at(tree, points), queries.normal_at(tree, points), queries.colour_at(tree, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
     with suppress(NoSurface):
         surface(volume_of(tree), None, faces=200)
-    serialize(tree, "sparse" if tree.ndc is None else None)
+    serialize(tree)
 
 
 def open_asset(folder: Path) -> Opened:
@@ -80,6 +80,8 @@ def open_asset(folder: Path) -> Opened:
                 raise AssertionError("read, but not described") from error
             use(tree)
 
+    for data in seeds():  # compiles or loads the kernels, for which there is no limit of time
+        read(data)
     return Opened(read, (("inspect", str(path)), ("inspect", str(path), "--json")))
 
 
