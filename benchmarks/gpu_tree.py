@@ -64,7 +64,7 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
     grid, density, sh = refinement.values_of(tree, torch.device(device))
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp, none = torch.zeros(len(density), dtype=torch.int32, device=device), torch.zeros(0, device=device)
-    moments = Moments(none, none, torch.zeros_like(density), torch.zeros_like(density), torch.zeros_like(stamp))
+    moments = Moments(torch.zeros_like(density), torch.zeros_like(density), torch.zeros_like(stamp))
     neighbours = tree_steps.Neighbours(none, torch.zeros(0, 6, dtype=torch.int32, device=device))
 
     def loss_gradients() -> None:

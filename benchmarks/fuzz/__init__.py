@@ -4,7 +4,7 @@
     python -m benchmarks.fuzz READER --file FILE     one input again
 
 reader.py       what a reader is, how an outcome is judged
-table.py        the readers, one for each kind of file; datasets, meshes, pictures, requests, runs and scratch hold them
+table.py        the readers, one for each kind of file; assets, datasets, meshes, pictures, requests, runs and scratch hold them
 values.py       numbers and texts that break readers
 json_text.py, toml_text.py, lines.py, binary.py, safetensors_bytes.py, image_bytes.py   mutations that know a format
 worker.py       a process that reads one input after another, guided by coverage where atheris is installed

@@ -20,7 +20,6 @@ from benchmarks.fuzz import campaign, nursery, worker
 from benchmarks.fuzz.reader import ROOT
 
 RESULT = ROOT / "benchmarks" / "results" / "fuzz.json"
-FORMAT_RESULT = ROOT / "benchmarks" / "results" / "fuzz_format.json"
 LIBRARIES = ("atheris", "msgspec", "numpy", "pillow", "pillow-heif", "safetensors", "torch")
 
 
@@ -116,7 +115,7 @@ def _tell(name: str, found: dict[str, Any], folder: Path) -> None:
 
 
 def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: bool) -> None:
-    """The result, with the fuzzing of the asset's format beside it."""
+    """Add what was found to the file of results."""
     from benchmarks.fuzz.table import READERS
     from benchmarks.machine import processor
 
@@ -126,7 +125,6 @@ def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: boo
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    asset = json.loads(FORMAT_RESULT.read_text(encoding="utf-8")) if FORMAT_RESULT.exists() else {}
     former = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"readers": {}, "seeds": [], "versions": {}}
     now = {
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
@@ -146,7 +144,6 @@ def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: boo
         "limit_s": 5.0,
         "room_mib": worker.EXTRA_MEMORY // 2**20,
         "readers": {name: readers[name] for name in READERS if name in readers},
-        "asset": {key: asset[key] for key in ("inputs", "read", "refused", "seed", "slowest_s", "peak_rss_mib") if key in asset} | {"file": FORMAT_RESULT.name},
     }
     path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from benchmarks.fuzz import datasets, meshes, pictures, requests, runs, scratch, splats
+from benchmarks.fuzz import assets, datasets, meshes, pictures, requests, runs, scratch, splats
 from benchmarks.fuzz.reader import Reader
 
-READERS: dict[str, Reader] = {**datasets.READERS, **meshes.READERS, **pictures.READERS, **requests.READERS, **runs.READERS, **scratch.READERS, **splats.READERS}
+MODULES = (assets, datasets, meshes, pictures, requests, runs, scratch, splats)
+READERS: dict[str, Reader] = {name: reader for module in MODULES for name, reader in module.READERS.items()}

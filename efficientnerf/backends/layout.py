@@ -52,11 +52,9 @@ class RayTargets(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Running means of the gradients by the logarithm of the optical thickness (N,) and by the coefficients (N, 3 K), without rows where there is no momentum;
-    of their squares (N,), (N,); and the number of steps that met a voxel (N,) int32."""
+    """Running means of the squared gradients by the logarithm of the optical thickness (N,) and by the coefficients (N,), and the number of steps that met a
+    voxel (N,) int32."""
 
-    density: Any
-    sh: Any
     square_density: Any
     square_sh: Any
     visits: Any
@@ -70,7 +68,6 @@ class Hyperparameters(NamedTuple):
     view_share       of that for harmonics of degree 1 and above
     decay            of the running mean of the squared gradient
     epsilon          added to its root
-    momentum         of the running mean of the gradient; 0: RMSprop
     total_variation  weight of this term of `efficientnerf.backends.numba.tree_training.steps`
     """
 
@@ -79,5 +76,4 @@ class Hyperparameters(NamedTuple):
     view_share: float
     decay: float = 0.99
     epsilon: float = 1e-10
-    momentum: float = 0.0
     total_variation: float = 0.0

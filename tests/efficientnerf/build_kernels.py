@@ -126,7 +126,7 @@ def fit() -> None:
         for total_variation in (0.0, 0.1):
             rule = Hyperparameters(0.1, 0.1, 0.5, 0.9, 1e-10, total_variation=total_variation)
             neighbours = tree_steps.Neighbours(torch.zeros(count), torch.zeros(count, 6, dtype=torch.int32))
-            tree_steps.step(g, values, sums, Moments(*values, *squares, visits), stamp, rule, neighbours, number=7, rays=8)
+            tree_steps.step(g, values, sums, Moments(*squares, visits), stamp, rule, neighbours, number=7, rays=8)
 
 
 if __name__ == "__main__":

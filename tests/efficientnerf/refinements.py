@@ -84,9 +84,7 @@ def ball_tree(side: int = 20) -> NerfTree:
     return replace(tree, bounds_min=BOUNDS[0], harmonics=sh, background=(1.0, 1.0, 1.0))
 
 
-def device_gradients(
-    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str
-) -> tuple[np.ndarray, ...]:
+def device_gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str) -> tuple[np.ndarray, ...]:
     """`gradients` by Triton's kernels, and the voxels that rays meet are stamped."""
     from efficientnerf.asset.refinement.device import rays_in_voxels, values_of
     from efficientnerf.backends.triton import tree_gradients
@@ -115,9 +113,8 @@ def records_of(tree: NerfTree, state: RefinementState, seed: int, packet: int = 
     return kernels.forward_backward(cells, first, start, along, basis, values.dense, values.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
 
 
-def empty_moments(state: RefinementState, *, adam: bool) -> Moments:
-    count, width = state.sh.shape if adam else (0, state.sh.shape[1])
-    return Moments(np.zeros(count, np.float32), np.zeros((count, width), np.float32), state.square_density, state.square_sh, state.visits)
+def moments_of(state: RefinementState) -> Moments:
+    return Moments(state.square_density, state.square_sh, state.visits)
 
 
 def rule_of(**more: Any) -> Hyperparameters:

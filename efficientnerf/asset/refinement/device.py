@@ -48,8 +48,7 @@ class DeviceArrays:
         self.stamp = torch.zeros(count, dtype=torch.int32, device=device)
         beside = torch.from_numpy(voxels_beside(state.tree) if smooth else np.zeros((0, 6), np.int32)).to(device)
         self.neighbours = Neighbours(torch.zeros(len(beside), device=device), beside)
-        none = torch.zeros(0, device=device)
-        self.moments = Moments(none, none, *(self.values[name] for name in MOMENTS))
+        self.moments = Moments(*(self.values[name] for name in MOMENTS))
 
     def to_host(self) -> dict[str, np.ndarray]:
         """The arrays on the host; all losses are recorded then."""

@@ -51,8 +51,7 @@ def optimise(
     patches = PatchGrid(targets.host_pixels, patch_side)
     errors = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=error_map)
     state.errors = errors.errors
-    none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
-    moments = Moments(*none, state.square_density, state.square_sh, state.visits)
+    moments = Moments(state.square_density, state.square_sh, state.visits)
     neighbours = neighbours_of(cells) if total_variation > 0 else NO_NEIGHBOURS
     while state.step < until:
         number = state.step + 1

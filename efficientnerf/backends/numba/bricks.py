@@ -89,7 +89,7 @@ def resample_weights(
 MAX_PIECES = 64  # of a sample that reaches through many voxels
 
 
-MARGIN = 0.5  # voxels, by which a ray's way through a box is taken too long, or too short: its samples are told apart one by one
+MARGIN = 0.5  # voxels; the box is enlarged and the hole shrunk by so much, to skip samples surely outside or hidden; the others are tested one by one
 
 
 @numba.njit(error_model="numpy")

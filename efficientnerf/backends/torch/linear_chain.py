@@ -48,34 +48,29 @@ def precision_of(setting: str, device: str) -> torch.dtype:
     return {"float32": torch.float32, "bfloat16": torch.bfloat16}[setting]
 
 
-def chain_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], skip: int | None, relu_last: bool) -> Tensor:
+def chain_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], skip: int | None) -> Tensor:
     """`chain` in plain torch: any type, any device, differentiable in everything."""
     skipped = x
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if layer == skip:
             x = torch.cat([x, skipped], dim=-1)
         x = torch.nn.functional.linear(x, weight, bias)
-        if relu_last or layer < len(weights) - 1:
+        if layer < len(weights) - 1:
             x = torch.relu(x)
     return x
 
 
-def chain(
-    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, skip: int | None = None, relu_last: bool = False, precision: torch.dtype
-) -> Tensor:
+def chain(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, skip: int | None = None, precision: torch.dtype) -> Tensor:
     """Linear layers with a ReLU after each but the last.
 
-    x          (N, I) float32
-    weights    (O, I) each, biases (O,) each
-    skip       the layer at which x enters again, behind the outputs of the layer before; x carries no gradient then
-    relu_last  a ReLU after the last too
-    returns    (N, O) of the last, float32
+    x        (N, I) float32
+    weights  (O, I) each, biases (O,) each
+    skip     the layer at which x enters again, behind the outputs of the layer before; x carries no gradient then
+    returns  (N, O) of the last, float32
     """
-    if x.dtype != torch.float32 or weights[0].dtype != torch.float32:
-        return chain_reference(x, weights, biases, skip, relu_last)
-    if skip is not None and x.requires_grad:
-        return chain_reference(x, weights, biases, skip, relu_last)
-    return _Chain.apply(x, skip, relu_last, precision, len(weights), *weights, *biases)
+    if x.dtype != torch.float32 or weights[0].dtype != torch.float32 or (skip is not None and x.requires_grad):
+        return chain_reference(x, weights, biases, skip)
+    return _Chain.apply(x, skip, precision, len(weights), *weights, *biases)
 
 
 def product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
@@ -95,7 +90,7 @@ def outer(grad: Tensor, x: Tensor) -> Tensor:
 
 class _Chain(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, skip: int | None, relu_last: bool, precision: torch.dtype, layers: int, *parameters: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, skip: int | None, precision: torch.dtype, layers: int, *parameters: Tensor) -> Tensor:
         inputs, outputs = x.shape[1], parameters[layers - 1].shape[0]
         split = [None if layer != skip else len(parameters[layer - 1]) for layer in range(layers)]
         weights = [_padded_weight(w.detach(), at, precision) for w, at in zip(parameters[:layers], split, strict=True)]
@@ -111,11 +106,11 @@ class _Chain(torch.autograd.Function):
             for layer in range(layers):
                 y = torch.cat([y, first], dim=1) if layer == skip else y
                 given.append(y)
-                y = product(y, weights[layer], biases[layer], relu_last or layer < layers - 1)
+                y = product(y, weights[layer], biases[layer], layer < layers - 1)
             out[begin : begin + rows] = y[: len(part), :outputs]
             if store:
-                activations.append([*given, y] if relu_last else given)
-        ctx.activations, ctx.weights, ctx.relu_last, ctx.split, ctx.rows = activations, weights, relu_last, split, rows
+                activations.append(given)
+        ctx.activations, ctx.weights, ctx.split, ctx.rows = activations, weights, split, rows
         ctx.shapes = [p.shape for p in parameters]
         return out
 
@@ -132,8 +127,6 @@ class _Chain(torch.autograd.Function):
             begin = number * ctx.rows
             part = grad[begin : begin + ctx.rows]
             g = _padded(part, len(activations[0]), len(weights[-1]), weights[0].dtype)
-            if ctx.relu_last:
-                g = _relu_backward(g, activations[layers])
             for layer in reversed(range(layers)):
                 y = activations[layer]
                 weight_grads[layer] += outer(g, y)
@@ -145,7 +138,7 @@ class _Chain(torch.autograd.Function):
                     x_grad[begin : begin + ctx.rows] = product(g, transposed[0], None, False)[: len(part), :inputs]
         ctx.activations = None
         of_weights = [_unpadded(g, shape, at) for g, shape, at in zip(weight_grads, ctx.shapes[:layers], ctx.split, strict=True)]
-        return (x_grad, None, None, None, None, *of_weights, *(g[: shape[0]] for g, shape in zip(bias_grads, ctx.shapes[layers:], strict=True)))
+        return (x_grad, None, None, None, *of_weights, *(g[: shape[0]] for g, shape in zip(bias_grads, ctx.shapes[layers:], strict=True)))
 
 
 def _round_up(count: int, step: int) -> int:

@@ -31,7 +31,7 @@ class Neighbours(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """voxel: side of cascade 0's voxels; the numbers of Hyperparameters, logarithms of two of them, and `total_variation` the share of the differences;
+    """voxel: side of cascade 0's voxels; the numbers of Hyperparameters, the logarithm of the decay, and `total_variation` the share of the differences;
     limits of `efficientnerf.backends.layout`."""
 
     voxel: Any
@@ -41,8 +41,6 @@ class Rule(NamedTuple):
     decay: Any
     log_decay: Any
     epsilon: Any
-    momentum: Any
-    log_momentum: Any
     total_variation: Any
     min_thickness: Any
     max_thickness: Any
@@ -63,9 +61,9 @@ def _total_variation(v, met, thickness, side, weight, before, beside, least):  #
 @triton.jit(do_not_specialize=["number"])
 def _step(  # type: ignore[no-untyped-def]
     values, sums, moments, neighbours, stamp, cascade_of, place, voxels, number, unit, rule,
-    CASCADES: tl.constexpr, MOMENTUM: tl.constexpr, SMOOTH: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
+    CASCADES: tl.constexpr, SMOOTH: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each. MOMENTUM: Adam. SMOOTH: with total variation.
+    """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each. SMOOTH: with total variation.
 
     values  density and harmonics; sums: gradients by optical thickness and harmonics
     """
@@ -76,9 +74,6 @@ def _step(  # type: ignore[no-untyped-def]
         visited = tl.minimum(tl.load(moments.visits + v, met, other=0) + 1, h.max_visits)
         tl.store(moments.visits + v, visited, met)
         correction = 1 / (1 - tl.exp(visited.to(tl.float32) * h.log_decay))
-        ahead = 1.0
-        if MOMENTUM:
-            ahead = 1 / (1 - tl.exp(visited.to(tl.float32) * h.log_momentum))
         side = h.voxel
         if CASCADES > 1:
             side = h.voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
@@ -86,10 +81,7 @@ def _step(  # type: ignore[no-untyped-def]
         depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, h.min_thickness)
         g = tl.load(sums[0] + v, met, other=0).to(tl.float32) * unit * depth
         square = h.decay * tl.load(moments.square_density + v, met, other=0.0) + (1 - h.decay) * g * g
-        if MOMENTUM:
-            g = h.momentum * tl.load(moments.density + v, met, other=0.0) + (1 - h.momentum) * g
-            tl.store(moments.density + v, g, met)
-        change = h.density_rate * ahead * g / (tl.sqrt(square * correction) + h.epsilon)
+        change = h.density_rate * g / (tl.sqrt(square * correction) + h.epsilon)
         if SMOOTH:
             change += _total_variation(v, met, depth, side, h.total_variation, neighbours.density, neighbours.beside, h.min_thickness)
         tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), h.min_thickness), h.max_thickness) / side, met)
@@ -101,10 +93,7 @@ def _step(  # type: ignore[no-untyped-def]
         by_sh = tl.load(sums[1] + at, there, other=0).to(tl.float32) * unit
         square = h.decay * tl.load(moments.square_sh + v, met, other=0.0) + (1 - h.decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
         tl.store(moments.square_sh + v, square, met)
-        if MOMENTUM:
-            by_sh = h.momentum * tl.load(moments.sh + at, there, other=0.0) + (1 - h.momentum) * by_sh
-            tl.store(moments.sh + at, by_sh, there)
-        scale = h.sh_rate * ahead / (tl.sqrt(square * correction) + h.epsilon)
+        scale = h.sh_rate / (tl.sqrt(square * correction) + h.epsilon)
         share = tl.where(column < 3, 1.0, h.view_share)
         tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * share[None, :] * by_sh, there)
         tl.store(sums[1] + at, tl.zeros_like(at), there)
@@ -121,11 +110,11 @@ def step(
     voxels = len(moments.visits)
     if h.total_variation > 0:
         neighbours.density.copy_(values[0])
-    rates = (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))
+    rates = (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon)
     variation = min(h.density_rate * h.total_variation, MOST_VARIATION)
     rule = Rule._make([*map(float, (*rates, variation, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS])
     _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
         values, sums, moments, neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, 1 / fixed_point_scale(rays), rule,
-        CASCADES=len(g.cascades.first), MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
+        CASCADES=len(g.cascades.first), SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
         BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

@@ -93,16 +93,6 @@ def test_images_of_voxels_that_are_not_interpolated() -> None:
         agree(device_image(tree, camera, supersample=supersample), render(tree, camera, supersample=supersample), faces=0.03)
 
 
-def test_supersampling() -> None:
-    tree = random_tree(4, share=0.7, sigma=20.0)
-    camera = looking(tree, 7)
-    found = device_image(tree, camera, background=(1.0, 0.5, 0.0), supersample=2)
-    agree(found, render(tree, camera, background=(1.0, 0.5, 0.0), supersample=2), faces=0.02)
-    assert np.array_equal(np.isfinite(found.depth), found.opacity >= 0.5)
-    with pytest.raises(ValueError, match="at least 1"):
-        device_image(tree, camera, supersample=0)
-
-
 def test_an_empty_tree_and_no_rays() -> None:
     tree = tree_from_voxels((2, 3, 1), 0.1, LOW, np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
     found = device_image(tree, looking(tree), background=(0.2, 0.4, 0.6))
@@ -182,14 +172,3 @@ def test_cascades_on_the_device_render_as_on_the_cpu() -> None:
     tree = random_cascades(4, count=4, cells=8, brick=4, degree=2, share=0.2)
     camera = looking(tree, 200)
     agree(render(tree.to("cuda"), camera), render(tree, camera), faces=0.01)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("supersample", [1, 2])
-def test_a_tree_on_the_device_renders_as_on_the_cpu(supersample: int) -> None:
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    tree = random_tree(4, shape=(20, 18, 22), brick=4, degree=2, share=0.3)
-    camera = looking(tree, 200)
-    found = render(tree.to("cuda"), camera, background=(1.0, 1.0, 1.0), supersample=supersample)
-    agree(found, render(tree, camera, background=(1.0, 1.0, 1.0), supersample=supersample), faces=0.01)

@@ -18,7 +18,7 @@ from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training import steps as host
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.refinements import GRIDS, empty_moments, records_of, rule_of, sum_gradients
+from tests.efficientnerf.refinements import GRIDS, moments_of, records_of, rule_of, sum_gradients
 
 device = pytest.importorskip("efficientnerf.backends.triton.tree_steps")
 refinement = pytest.importorskip("efficientnerf.asset.refinement.device")
@@ -34,11 +34,10 @@ def sent(values: np.ndarray) -> torch.Tensor:
 class OnDevice:
     """A state on the device, and steps of it from given gradients."""
 
-    def __init__(self, tree: NerfTree, state: RefinementState, *, adam: bool, smooth: bool) -> None:
+    def __init__(self, tree: NerfTree, state: RefinementState, *, smooth: bool) -> None:
         self.grid = kernels.device_grid(tree, DEVICE)
         self.values = sent(state.density), sent(state.sh)
-        means = (np.zeros_like(a) if adam else np.zeros(0, np.float32) for a in (state.density, state.sh))
-        self.moments = device.Moments(*map(sent, means), sent(state.square_density), sent(state.square_sh), sent(state.visits))
+        self.moments = device.Moments(sent(state.square_density), sent(state.square_sh), sent(state.visits))
         beside = sent(refinement.voxels_beside(tree) if smooth else np.zeros((0, 6), np.int32))
         self.neighbours = device.Neighbours(torch.zeros(len(beside), device=DEVICE), beside)
 
@@ -52,16 +51,16 @@ class OnDevice:
             assert not part.cpu().numpy()[met].any()  # ready for the next step
 
 
-TERMS: list[dict[str, Any]] = [{}, {"momentum": 0.8}, {"total_variation": 0.7}, {"momentum": 0.6, "total_variation": 0.1}]
+TERMS: list[dict[str, Any]] = [{}, {"total_variation": 0.7}]
 
 
 @pytest.mark.parametrize(("made", "more"), [(GRIDS[n % 2], more) for n, more in enumerate(TERMS)])
 def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str, Any]) -> None:
     tree = made()
-    o, adam, smooth = initial_state(tree), "momentum" in more, "total_variation" in more
-    there = OnDevice(tree, o, adam=adam, smooth=smooth)
+    o, smooth = initial_state(tree), "total_variation" in more
+    there = OnDevice(tree, o, smooth=smooth)
     cells = cells_of(tree)
-    moments, neighbours = empty_moments(o, adam=adam), neighbours_of(cells) if smooth else NO_NEIGHBOURS
+    moments, neighbours = moments_of(o), neighbours_of(cells) if smooth else NO_NEIGHBOURS
     rule = rule_of(**more)
     for number in (1, 2, 3):
         records = records_of(tree, o, number)
@@ -97,7 +96,7 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     sides = voxel_sides(tree)
     thickness = np.random.default_rng(0).permutation(np.geomspace(1e-3, 20, len(sides)))
     o = initial_state(replace(tree, density_values=(thickness / sides).astype(np.float32)))
-    there = OnDevice(tree, o, adam=False, smooth=True)
+    there = OnDevice(tree, o, smooth=True)
     there.step(np.zeros_like(o.density), np.zeros_like(o.sh), np.ones(len(sides), bool), 1, total_variation=weight)
     logarithm = torch.from_numpy(np.log(o.density.astype(np.float64) * sides)).requires_grad_()
     (slope,) = torch.autograd.grad(penalty(tree, logarithm), logarithm)

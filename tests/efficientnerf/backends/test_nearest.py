@@ -56,17 +56,6 @@ def test_the_kernel_matches_the_torch_reference(brick: int, degree: int) -> None
     assert np.abs(other.colour - outputs.colour).max() > 0.05
 
 
-@pytest.mark.parametrize("share", [0.02, 0.3])
-def test_skipping_changes_no_value(share: float) -> None:
-    tree = nearest(2, share=share, shape=(7, 6, 8))
-    origins, directions = rays_at(tree, 400)
-    usual, timid = render_rays(tree, origins, directions), replace(tree)
-    timid.__dict__["leap"] = np.minimum(tree.leap, 1)
-    other = render_rays(timid, origins, directions)
-    for name in ("colour", "opacity", "depth", "normal"):
-        assert np.array_equal(getattr(usual, name), getattr(other, name)), name
-
-
 def test_a_uniform_box_has_its_closed_form_to_its_very_face() -> None:
     tree = replace(uniform_tree(sigma=2.0), lookup="nearest")
     middle = (tree.bounds_min + tree.bounds_max) / 2

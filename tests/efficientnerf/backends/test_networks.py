@@ -20,11 +20,10 @@ def layers(sizes: list[tuple[int, int]]) -> tuple[list[torch.Tensor], list[torch
 
 
 CASES = {
-    "skip": ([(7, 16), (16, 16), (23, 16), (16, 5)], 2, False),
-    "no skip": ([(7, 16), (16, 3)], None, False),
-    "relu last": ([(7, 16), (23, 16)], 1, True),
-    "one layer": ([(7, 4)], None, False),
-    "odd widths": ([(7, 13), (13, 11), (18, 9), (9, 5)], 2, False),
+    "skip": ([(7, 16), (16, 16), (23, 16), (16, 5)], 2),
+    "no skip": ([(7, 16), (16, 3)], None),
+    "one layer": ([(7, 4)], None),
+    "odd widths": ([(7, 13), (13, 11), (18, 9), (9, 5)], 2),
 }
 
 
@@ -32,13 +31,13 @@ CASES = {
 def test_passes_by_hand_are_those_of_autograd(case: str, precision: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over several chunks, the last of them short; gradients of weights, biases and, where nothing skips, of the input."""
     monkeypatch.setattr(linear_chain, "ROWS", 48)
-    sizes, skip, relu_last = CASES[case]
+    sizes, skip = CASES[case]
     weights, biases = layers(sizes)
     generator = torch.Generator().manual_seed(2)
     x = torch.randn(100, 7, generator=generator).requires_grad_(skip is None)
     towards = torch.randn(100, sizes[-1][1], generator=generator)
     leaves = [*weights, *biases, *([x] if skip is None else [])]
-    ours, theirs = chain(x, weights, biases, skip=skip, relu_last=relu_last, precision=precision), chain_reference(x, weights, biases, skip, relu_last)
+    ours, theirs = chain(x, weights, biases, skip=skip, precision=precision), chain_reference(x, weights, biases, skip)
     assert ours.dtype == torch.float32
     assert (ours - theirs).norm() < TOLERANCE[precision] * theirs.norm()
     for mine, its in zip(torch.autograd.grad((ours * towards).sum(), leaves), torch.autograd.grad((theirs * towards).sum(), leaves), strict=True):
@@ -49,7 +48,7 @@ def test_passes_by_hand_are_those_of_autograd(case: str, precision: torch.dtype,
 def test_gradients_of_a_chain_are_finite_differences() -> None:
     weights, biases = ([p.detach().double().requires_grad_() for p in group] for group in layers(CASES["skip"][0]))
     x = torch.randn(5, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x, *p: chain_reference(x, p[:4], p[4:], 2, False), (x, *weights, *biases))
+    assert torch.autograd.gradcheck(lambda x, *p: chain_reference(x, p[:4], p[4:], 2), (x, *weights, *biases))
 
 
 @pytest.mark.parametrize(

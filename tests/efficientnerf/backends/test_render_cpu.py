@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.queries import normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.packed import packed_of
@@ -111,19 +110,6 @@ def test_images_match_the_torch_reference_from_near_and_far(degree: int, distanc
     assert (outputs.opacity > 0.9).mean() > 0.1
 
 
-def test_images_depend_not_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=0.6, sigma=100.0)
-    packed_of(tree)  # made once, for both
-    for distance in (40.0, 2000.0):
-        camera = far_camera(tree, distance)
-        usual = render(tree, camera, supersample=2)
-        with monkeypatch.context() as patch:
-            patch.setattr("numba.get_num_threads", lambda: 3)
-            other = render(tree, camera, supersample=2)
-        for name in FIELDS:
-            assert np.array_equal(getattr(usual, name), getattr(other, name)), name
-
-
 @pytest.mark.parametrize("kind", ["packed", "supersampled", "nearest", "ndc"])
 def test_images_without_normals_are_otherwise_the_same(kind: str) -> None:
     tree = random_tree(3, share=0.6, degree=1)
@@ -173,18 +159,6 @@ def test_images_of_every_camera_model_match_single_rays(model: str, supersample:
         np.testing.assert_allclose(image.depth[solid], (flat.depth.reshape(solid.shape) * slant)[solid], rtol=1e-3)
 
 
-@pytest.mark.parametrize(("model", "share", "distance"), [("PINHOLE", 0.01, 9.0), ("OPENCV", 0.05, 1.5), ("OPENCV_FISHEYE", 0.4, 0.1)])
-def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
-    tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=share)
-    timid = replace(tree)
-    packed = packed_of(tree)
-    timid.derived["packed"] = packed._replace(leap=np.minimum(packed.leap, 1), octants=np.minimum(packed.octants, 1))
-    camera = camera_of(tree, model, distance)
-    usual, other = render(tree, camera), render(timid, camera)
-    for name in FIELDS:
-        assert np.array_equal(getattr(usual, name), getattr(other, name)), name
-
-
 def test_leaps_in_every_direction_alike_change_no_value(monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a grid of more cells than leaps of eight directions are held for."""
     tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=0.05)
@@ -214,17 +188,6 @@ def test_a_camera_inside_and_one_facing_away() -> None:
     assert np.isinf(empty.depth).all()
     assert not empty.normal.any()
     np.testing.assert_allclose(empty.colour, np.broadcast_to(np.float32([0.2, 0.4, 0.6]), empty.colour.shape))
-
-
-def test_normals_are_those_of_the_tree_where_the_transmittance_is_one_half() -> None:
-    tree = random_tree(6, shape=(5, 6, 4), brick=4, share=0.7, sigma=60.0)
-    origins, directions = rays_at(tree, 400)
-    outputs = render_rays(tree, origins, directions)
-    hit = np.isfinite(outputs.depth)
-    assert hit.sum() > 50
-    at = origins[hit] + outputs.depth[hit, None] * directions[hit]
-    # The gradient bends where a difference reaches from one voxel to the next; rounding may put it on either side.
-    assert np.quantile(np.abs(outputs.normal[hit] - normal_at(tree, at)), 0.98) < 1e-3
 
 
 def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> None:

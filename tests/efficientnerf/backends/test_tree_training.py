@@ -21,7 +21,7 @@ from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, p
 from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
 from efficientnerf.backends.numba.tree_training.steps import Values, step, values_of
 from efficientnerf.backends.numba.vector.memory import pointer
-from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random, sum_gradients
+from tests.efficientnerf.refinements import GRIDS, gradients, gradients_by_autograd, moments_of, records_of, rule_of, seen_at_random, sum_gradients
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
 # brick, degree, lookup
@@ -60,21 +60,20 @@ def test_a_packet_grows_until_all_its_rays_fit() -> None:
     assert (one[1] != 0).sum() > 2 * kernels.FIRST_BLOCKS
 
 
-@pytest.mark.parametrize(("made", "momentum"), [(GRIDS[0], 0.0), (GRIDS[1], 0.8)])
-def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: float) -> None:
+@pytest.mark.parametrize("made", GRIDS)
+def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree]) -> None:
     tree = made()
     sides, o = voxel_sides(tree), initial_state(tree)
     rates = np.where(np.arange(o.sh.shape[1]) < 3, 0.01, 0.005)
-    moments, count = empty_moments(o, adam=momentum > 0), len(o.density)
+    moments, count = moments_of(o), len(o.density)
     density, sh = o.density.astype(np.float64), o.sh.astype(np.float64)
-    square_density, square_sh, visits, m_density, m_sh = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(sh.shape)
+    square_density, square_sh, visits = np.zeros(count), np.zeros(count), np.zeros(count)
     for number in (1, 2, 3):
         records = records_of(tree, o, number)
         by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
         sum_gradients(records, by_density, by_sh)
-        rule = rule_of(momentum=momentum)
         values = values_of(cells_of(tree), o.density, o.sh)
-        step(records, values, moments, rule)
+        step(records, values, moments, rule_of())
         np.testing.assert_array_equal(values.dense[values.places], o.density)
         met = np.zeros(count, bool)
         for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
@@ -83,11 +82,9 @@ def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: 
         slope, flat = by_density * np.maximum(density, MIN_THICKNESS / sides), by_sh
         square_density = np.where(met, 0.9 * square_density + 0.1 * slope**2, square_density)
         square_sh = np.where(met, 0.9 * square_sh + 0.1 * (flat**2).mean(axis=1), square_sh)
-        m_density = np.where(met, momentum * m_density + (1 - momentum) * slope, m_density)
-        m_sh = np.where(met[:, None], momentum * m_sh + (1 - momentum) * flat, m_sh)
-        right, ahead = np.maximum(1 - 0.9**visits, 1e-30), np.maximum(1 - momentum**visits, 1e-30) if momentum else 1.0
-        density = np.where(met, density * np.exp(-0.1 * m_density / ahead / (np.sqrt(square_density / right) + 1e-12)), density)
-        sh -= met[:, None] * rates * m_sh / ((np.sqrt(square_sh / right) + 1e-12) * ahead)[:, None]
+        right = np.maximum(1 - 0.9**visits, 1e-30)
+        density = np.where(met, density * np.exp(-0.1 * slope / (np.sqrt(square_density / right) + 1e-12)), density)
+        sh -= met[:, None] * rates * flat / (np.sqrt(square_sh / right) + 1e-12)[:, None]
         np.testing.assert_array_equal(o.visits, visits)
         np.testing.assert_allclose(o.density, density, rtol=2e-3, atol=1e-5)
         np.testing.assert_allclose(o.sh, sh, atol=2e-3)
@@ -105,11 +102,11 @@ def test_the_same_bytes_on_any_number_of_threads() -> None:
         for count in (1, threads):
             numba.set_num_threads(count)
             o = initial_state(tree)
-            moments, cells = empty_moments(o, adam=True), cells_of(tree)
+            moments, cells = moments_of(o), cells_of(tree)
             values = values_of(cells, o.density, o.sh)
             for _ in range(2):
                 loss, records = kernels.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer())
-                step(records, values, moments, rule_of(momentum=0.9))
+                step(records, values, moments, rule_of())
             found.append((loss, o.density, o.sh, *moments))
     finally:
         numba.set_num_threads(threads)
@@ -149,7 +146,7 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     cells = cells_of(tree)
     old = np.log(plain.density.astype(np.float64) * voxel_sides(tree))
     for o, more in ((plain, {}), (smooth, {"total_variation": weight})):
-        step(records_of(tree, o, 1), values_of(cells, o.density, o.sh), empty_moments(o, adam=False), rule_of(**more), neighbours_of(cells))
+        step(records_of(tree, o, 1), values_of(cells, o.density, o.sh), moments_of(o), rule_of(**more), neighbours_of(cells))
     np.testing.assert_array_equal(plain.square_density, smooth.square_density)
     moved = np.log(plain.density / smooth.density)
     np.testing.assert_array_equal(moved[plain.visits == 0], 0)
@@ -181,7 +178,7 @@ def test_rows_of_any_length_take_their_own_gradient_and_no_other(degree: int) ->
     records, before = records_of(tree, o, 1), o.sh.copy()
     by_density, by_sh = np.zeros(o.density.shape), np.zeros(o.sh.shape)
     sum_gradients(records, by_density, by_sh)
-    step(records, values_of(cells_of(tree), o.density, o.sh), empty_moments(o, adam=False), rule_of())
+    step(records, values_of(cells_of(tree), o.density, o.sh), moments_of(o), rule_of())
     met = o.visits > 0
     assert 0 < met.sum() < len(met)
     np.testing.assert_array_equal(o.sh[~met], before[~met])
@@ -208,15 +205,3 @@ def test_voxels_without_density_are_neighbours_and_absent_ones_are_not(made: Cal
         assert slope_of(values, beside, v, thickness[v], sides[v]) == pytest.approx(wanted, rel=1e-5, abs=1e-5)
         counts.append(sum(n is not None for n in found))
     assert max(counts) > min(counts)
-
-
-@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
-def test_total_variation_smooths_what_was_met_alone(made: Callable[[], NerfTree]) -> None:
-    tree = made()
-    o = initial_state(tree)
-    before = o.density.copy()
-    values = values_of(cells_of(tree), o.density, o.sh)
-    step(records_of(tree, o, 2), values, empty_moments(o, adam=False), rule_of(total_variation=1e6),
-         neighbours_of(cells_of(tree)))  # fmt: skip
-    np.testing.assert_array_equal(o.density[o.visits == 0], before[o.visits == 0])
-    assert (o.density != before)[o.visits > 0].mean() > 0.8

@@ -13,7 +13,7 @@ from efficientnerf.asset.cascades import cascade_grids, cascade_tree, cascades_o
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
 from efficientnerf.asset.rendering import Rendering, ray_parts, render, render_rays, render_reference, tree_density
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.geometry.cameras import Camera, rays
@@ -161,24 +161,6 @@ def test_the_environment_is_seen_along_the_ray_through_what_is_not_opaque(lookup
     assert np.array_equal(seen.opacity, alone.opacity)
 
 
-def without_voxels(tree: NerfTree) -> NerfTree:
-    """Its box alone."""
-    none = np.zeros((0, tree.harmonics_count, 3), np.float32)
-    return tree_from_voxels(tree.shape, tree.voxel, tree.bounds_min, np.zeros((0, 3), int), np.zeros(0, np.float32), none, brick=tree.brick)
-
-
-def test_outer_cascades_that_hold_nothing_change_nothing() -> None:
-    tree = random_tree(3, shape=(4, 4, 8), brick=4, degree=2, share=0.5)
-    grids = cascade_grids(np.stack([tree.bounds_min, tree.bounds_max]), tree.voxel, tree.brick, 4)
-    box = without_voxels(tree)
-    empty = [replace(box, shape=shape, voxel=voxel, bounds_min=low, brick_index=np.full(shape, -1, np.int32)) for shape, voxel, low in grids[1:]]
-    whole = nested([tree, *empty])
-    for distance in (0.1, 1.5, 6.0):
-        one, other = render(tree, camera_of(tree, distance=distance)), render(whole, camera_of(tree, distance=distance))
-        for name in FIELDS:
-            assert np.array_equal(getattr(one, name), getattr(other, name)), name
-
-
 def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     tree = random_cascades(5, count=4, brick=4, degree=2, share=0.5)
     packed_of(tree)
@@ -237,15 +219,6 @@ def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: flo
     assert focal < 200 or filled[-1] < 0.9
     for name in FIELDS:
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
-
-
-@pytest.mark.parametrize("distance", [1e15, 1e200])
-def test_rays_from_far_away_end(distance: float) -> None:
-    tree = random_cascades(0, count=4)
-    directions = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [-0.48, 0.6, 0.64], [np.sqrt(1 / 3)] * 3])
-    found = render_rays(tree, (tree.bounds_min + tree.bounds_max) / 2 - distance * directions, directions)
-    assert ((found.opacity >= 0) & (found.opacity <= 1)).all()
-    assert np.isfinite(found.colour).all()
 
 
 def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:

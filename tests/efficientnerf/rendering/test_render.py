@@ -81,39 +81,6 @@ def test_a_uniform_box_has_its_closed_form() -> None:
     np.testing.assert_allclose(seen.colour[0], seen.opacity[0] * reference.sigmoid(0.7), atol=1e-3)
 
 
-def test_pictures_are_their_rays() -> None:
-    from efficientnerf.geometry.cameras import rays
-
-    tree = random_tree(0, share=0.7)
-    camera = looking(tree)
-    picture = render(tree, camera)
-    flat = render_rays(tree, *rays(camera))
-    shape = (camera.height, camera.width)
-    np.testing.assert_allclose(picture.colour.reshape(-1, 3), flat.colour, atol=1e-4)  # what weighs less than that is shaded with its neighbours
-    np.testing.assert_allclose(picture.opacity.reshape(-1), flat.opacity, atol=1e-6)
-    slant = (rays(camera)[1] @ camera.forward).reshape(shape)
-    np.testing.assert_allclose(picture.depth, flat.depth.reshape(shape) * slant, rtol=1e-5)
-    assert np.array_equal(np.isinf(picture.depth), picture.opacity < 0.5)
-    assert [getattr(picture, name).dtype for name in ("colour", "opacity", "depth", "normal")] == [np.float32] * 4
-
-
-def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
-    from efficientnerf.geometry.cameras import resized
-
-    tree = random_tree(0, share=0.7)
-    camera = looking(tree)
-    fine = render(tree, resized(camera, camera.width * 3, camera.height * 3))
-    coarse = render(tree, camera, supersample=3)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return values.reshape(camera.height, 3, camera.width, 3, -1).mean((1, 3))
-
-    np.testing.assert_allclose(coarse.colour, mean(fine.colour), atol=1e-5)
-    np.testing.assert_allclose(coarse.opacity, mean(fine.opacity)[..., 0], atol=1e-5)
-    with pytest.raises(ValueError, match="expected at least 1"):
-        render(tree, camera, supersample=0)
-
-
 @pytest.mark.parametrize("supersample", [1, 3])
 def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: int) -> None:
     tree = random_tree(4, share=0.7, sigma=20.0)

@@ -10,7 +10,6 @@ import torch
 
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
-from efficientnerf.rendering.compositing import composite
 from efficientnerf.rendering.field_renderer import valid_count
 from efficientnerf.sampling.importance import IMPORTANCE_FLOOR, importance_samples
 from efficientnerf.sampling.pivotal import pivotal_samples
@@ -156,25 +155,6 @@ def test_where_samples_lie_is_differentiable_in_the_rays() -> None:
         return even.point, even.length, valid.point, valid.length, fine.point, fine.length, drawn.point, drawn.length
 
     assert torch.autograd.gradcheck(all_of, tuple(t.requires_grad_() for t in (o, d, near, far)), eps=1e-7, atol=1e-5)
-
-
-def test_colours_are_differentiable_through_every_sampler() -> None:
-    """Compositing over samples of each kind by what the field says, against finite differences in float64."""
-    coarse, at = pruned()
-    o, d, _, _ = rays()
-    quantile = torch.tensor([[0.2, 0.7]], dtype=torch.float64).expand(len(o), 2)
-    drawn = importance_samples(SPACE, o, d, coarse, at, torch.ones_like(at), quantile)
-    fine = pivotal_samples(SPACE, o, d, torch.full((len(o),), 0.5, dtype=torch.float64), coarse, torch.arange(len(at)) % 3 == 0, 2)
-    harmonics, behind = torch.ones(len(o), 1, dtype=torch.float64), torch.rand(len(o), 3, dtype=torch.float64)
-    for samples in (coarse, drawn, fine):
-        raw = torch.randn(len(samples.start), 4, dtype=torch.float64, generator=torch.Generator().manual_seed(5)).requires_grad_()
-        for activation in ("exp", "softplus"):
-
-            def seen(raw: torch.Tensor, samples: Samples = samples, activation: str = activation) -> tuple[torch.Tensor, ...]:
-                out = composite(raw, samples.length, samples.first, harmonics, behind, activation)
-                return out.colour, out.opacity, out.weight, out.distortion
-
-            assert torch.autograd.gradcheck(seen, (raw,), fast_mode=True)
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,8 @@ import torch
 from efficientnerf.backends import dispatch
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace, space_from
 from efficientnerf.rendering.compositing import ray_of_sample
-from efficientnerf.sampling import pivotal as pivotal_sampling
-from efficientnerf.sampling import valid as valid_sampling
 from tests import reference
 from tests.efficientnerf.coarse_rays import BOUNDS, SIDE, STEP, Rays, coarse_samples_of, make_rays, voxels_of
-
-FINDERS = {"torch": valid_sampling.valid_samples, "kernel": dispatch.valid_samples}
-DIVIDERS = {"torch": pivotal_sampling.pivotal_samples, "kernel": dispatch.pivotal_samples}
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -35,10 +30,9 @@ def test_a_ray_that_is_nowhere_leaves_its_neighbours_alone(contracted: bool, los
         assert torch.equal(found.point[ours], alone.point[theirs])
 
 
-@pytest.mark.parametrize("finder", FINDERS)
 @pytest.mark.parametrize("contracted", [False, True])
-def test_the_first_rays_can_be_left_unpruned(contracted: bool, finder: str) -> None:
-    rays, space, find = make_rays("outside"), space_from(BOUNDS, contracted=contracted), FINDERS[finder]
+def test_the_first_rays_can_be_left_unpruned(contracted: bool) -> None:
+    rays, space, find = make_rays("outside"), space_from(BOUNDS, contracted=contracted), dispatch.valid_samples
     some = find(space, *rays, STEP, 60, voxels_of(), 0.4, unpruned=7)
     parts = [find(space, *(t[which] for t in rays), STEP, 60, voxels_of(), threshold) for which, threshold in ((slice(7), -math.inf), (slice(7, None), 0.4))]
     assert torch.equal(some.first, torch.cat([parts[0].first, parts[1].first[1:] + parts[0].first[-1]]))
@@ -48,22 +42,20 @@ def test_the_first_rays_can_be_left_unpruned(contracted: bool, finder: str) -> N
     assert len(parts[0].start) == parts[0].tried > 0
 
 
-@pytest.mark.parametrize("finder", FINDERS)
-def test_a_voxel_at_the_threshold_is_not_valid(finder: str) -> None:
+def test_a_voxel_at_the_threshold_is_not_valid() -> None:
     rays = make_rays("outside")
     space, voxels = BoundedSpace(BOUNDS), torch.full((SIDE, SIDE, SIDE), 0.5)
-    find = FINDERS[finder]
+    find = dispatch.valid_samples
     assert len(find(space, *rays, STEP, 60, voxels, 0.5).start) == 0
     above = find(space, *rays, STEP, 60, voxels, 0.5 - 1e-6)
     assert len(above.start) == above.tried > 0
 
 
-@pytest.mark.parametrize("finder", FINDERS)
 @pytest.mark.parametrize("contracted", [False, True])
-def test_intervals_lie_end_to_end_and_samples_in_them(finder: str, contracted: bool) -> None:
+def test_intervals_lie_end_to_end_and_samples_in_them(contracted: bool) -> None:
     rays, space = make_rays("outside"), space_from(BOUNDS, contracted=contracted)
     rays = rays._replace(far=torch.full_like(rays.far, 1e6))
-    found = FINDERS[finder](space, *rays, STEP, 200, voxels_of(), -math.inf)
+    found = dispatch.valid_samples(space, *rays, STEP, 200, voxels_of(), -math.inf)
     ray = ray_of_sample(found.first, len(found.start))
     same = ray[1:] == ray[:-1]
     torch.testing.assert_close((found.start + found.extent)[:-1][same], found.start[1:][same], rtol=1e-5, atol=1e-5)
@@ -100,11 +92,11 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     assert reach.min() > reference.FARTHEST
 
 
-@pytest.mark.parametrize(("divider", "contracted", "per_pivot"), [(each, *how) for each in DIVIDERS for how in [(False, 1), (True, 4), (False, 5)]])
-def test_pivotal_slots_tile_their_intervals(divider: str, contracted: bool, per_pivot: int) -> None:
+@pytest.mark.parametrize(("contracted", "per_pivot"), [(False, 1), (True, 4), (False, 5)])
+def test_pivotal_slots_tile_their_intervals(contracted: bool, per_pivot: int) -> None:
     rays = make_rays("outside")
     space, coarse, pivotal = coarse_samples_of(rays, contracted)
-    fine = DIVIDERS[divider](space, rays.origins, rays.directions, rays.offset, coarse, pivotal, per_pivot)
+    fine = dispatch.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, pivotal, per_pivot)
     pivots, ray = int(pivotal.sum()), ray_of_sample(coarse.first, len(pivotal))[pivotal]
     assert fine.first.tolist() == [0, *(per_pivot * torch.bincount(ray, minlength=len(rays.origins))).cumsum(0).tolist()]
     start, extent = fine.start.reshape(pivots, per_pivot), fine.extent.reshape(pivots, per_pivot)

@@ -23,7 +23,7 @@ from stages.formats.exporters import VOLUME_EXPORTERS
 from stages.formats.exporters.vdb import Grid, grids_of, write_grids
 from tests.stages.io.meshes import Y_DOWN, Z_UP
 
-# An interpreter that has OpenVDB's library: `openvdb`, or Blender as a module, which brings it. benchmarks/blender_check.py says how to make one.
+# An interpreter that has OpenVDB's library: `openvdb`, or Blender as a module (`pip install bpy`), which brings it.
 READER = os.environ.get("BLENDER_PYTHON") or (sys.executable if importlib.util.find_spec("openvdb") or importlib.util.find_spec("bpy") else None)
 READ = """
 import sys
@@ -60,7 +60,7 @@ def scattered() -> list[Grid]:
     return [Grid("density", at, values[:, 0].astype(np.float32), matrix), Grid("color", at, values[:, 1:].astype(np.float16), matrix)]
 
 
-@pytest.mark.skipif(READER is None, reason="needs OpenVDB's library: set BLENDER_PYTHON to an interpreter with bpy (benchmarks/blender_check.py)")
+@pytest.mark.skipif(READER is None, reason="needs OpenVDB's library: set BLENDER_PYTHON to an interpreter with bpy")
 def test_openvdb_reads_what_was_written(tmp_path: Path) -> None:
     grids = scattered()
     write_grids(grids, tmp_path / "a.vdb")

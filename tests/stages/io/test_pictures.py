@@ -45,7 +45,7 @@ def grey(values: np.ndarray) -> np.ndarray:
 
 
 def test_pictures_are_opened_in_one_place() -> None:
-    """Only there are the formats limited; tests may open what they wrote, and benchmarks compare with readers of others."""
+    """Only there are the formats limited; tests may open what they wrote."""
     opening = {"open": "Image", "imread": "cv2", "imdecode": "cv2", "imreadmulti": "cv2"}
     wrong = []
     for package in ("pipeline", "efficientnerf", "stages", "workflows", "benchmarks", "docs", "examples"):
@@ -56,7 +56,7 @@ def test_pictures_are_opened_in_one_place() -> None:
                     wrong.append(str(path.relative_to(ROOT)))
                 if isinstance(node, ast.Import | ast.ImportFrom) and "imageio" in ast.unparse(node):
                     wrong.append(str(path.relative_to(ROOT)))
-    assert wrong == ["stages/io/pictures.py", "benchmarks/format_readers.py", "benchmarks/format_readers.py"]
+    assert wrong == ["stages/io/pictures.py"]
 
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 24\n%%EndComments\n(x) run\n%%EOF\n"

@@ -8,9 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-
-from benchmarks.memory import write_images
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[3]
 COUNT, DIFFERENT, WIDTH = 100, 5, 4000
@@ -21,6 +21,23 @@ resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv.pop(1)),) * 2)
 from workflows.cli.main import main
 sys.exit(main())
 """
+
+
+def write_images(folder: Path, count: int, width: int) -> None:
+    """Noise of low frequency from cameras on a circle, with their transforms.json."""
+    height, rng, frames = 3 * width // 4, np.random.default_rng(0), []
+    for n in range(count):
+        small = rng.integers(0, 256, (30, 40, 3), np.uint8)
+        Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC).save(folder / f"{n:04d}.jpg", quality=92)
+        centre = np.array([4 * np.cos(2.4 * n), 4 * np.sin(2.4 * n), 0.6 + 2.4 * n / count])
+        pose = np.eye(4)  # x right, y up, looking along -z at the middle
+        pose[:3, 2], pose[:3, 3] = centre / np.linalg.norm(centre), centre
+        pose[:3, 0] = np.cross([0.0, 0.0, 1.0], pose[:3, 2])
+        pose[:3, 0] /= np.linalg.norm(pose[:3, 0])
+        pose[:3, 1] = np.cross(pose[:3, 2], pose[:3, 0])
+        frames.append({"file_path": f"{n:04d}.jpg", "transform_matrix": pose.tolist()})
+    lens = {"camera_model": "PINHOLE", "w": width, "h": height, "fl_x": 0.9 * width, "fl_y": 0.9 * width, "cx": width / 2, "cy": height / 2}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}), encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

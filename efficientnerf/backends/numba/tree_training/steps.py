@@ -1,7 +1,7 @@
 """Optimiser steps on a tree's values, restricted to the voxels that rays met (numba, all cores).
 
-RMSprop, or Adam (Kingma and Ba 2015) where there is a momentum, with bias corrections by how often a voxel was met. The second moment of a voxel's harmonics is
-the mean of its coefficients'. Plenoxels (Fridovich-Keil et al. 2022) are optimised with RMSprop. N voxels, K harmonics, L cascades, B bricks.
+RMSprop with bias corrections by how often a voxel was met. The second moment of a voxel's harmonics is the mean of its coefficients'.
+Plenoxels (Fridovich-Keil et al. 2022) are optimised with RMSprop. N voxels, K harmonics, L cascades, B bricks.
 
 A step minimises the rays' losses. Then it takes  density_rate total_variation sum_n (log tau - log tau_n)  from log tau, with tau the optical thickness of a
 voxel that rays met, n over the voxels beyond its faces that are stored and tau_n before the step: the gradient of half the squared differences, apart from
@@ -85,7 +85,7 @@ class StepPointers(NamedTuple):
     following      of `_link`
     row            (padded,) the gradient by a voxel's coefficients
     width          3 K
-    of_*           `corrections` of the moments, and the last one of these
+    of_square      `corrections` of the moments, and the last one of these
     """
 
     numbers: Any
@@ -99,8 +99,6 @@ class StepPointers(NamedTuple):
     sh: Any
     places: Any
     dense: Any
-    mean_density: Any
-    mean_sh: Any
     square_density: Any
     square_sh: Any
     visits: Any
@@ -109,8 +107,6 @@ class StepPointers(NamedTuple):
     rates: Any
     of_square: Any
     of_square_end: int
-    of_mean: Any
-    of_mean_end: int
     around: Any
     brick: int
 
@@ -180,7 +176,7 @@ def _gather(number, p):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy")
 def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     """A step of one voxel, whose gradient by coefficients is `p.row` and the sum of its squares `squares`."""
-    decay, epsilon, momentum = h.decay, h.epsilon, h.momentum
+    decay, epsilon = h.decay, h.epsilon
     visits = np.int64(min(p.visits[v] + 1, MAX_VISITS))
     p.visits[v] = np.int32(visits)
     correction, voxel = np.float64(p.of_square[min(visits, p.of_square_end)]), p.sides[p.cascades[v]]
@@ -189,12 +185,7 @@ def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     slope = by_density / voxel * thickness
     square = decay * p.square_density[v] + (1 - decay) * slope * slope
     p.square_density[v] = np.float32(square)
-    ahead = 1.0
-    if momentum > 0:
-        ahead = np.float64(p.of_mean[min(visits, p.of_mean_end)])
-        slope = momentum * p.mean_density[v] + (1 - momentum) * slope
-        p.mean_density[v] = np.float32(slope)
-    change = h.density_rate * ahead * slope / (np.sqrt(square * correction) + epsilon)
+    change = h.density_rate * slope / (np.sqrt(square * correction) + epsilon)
     if h.total_variation > 0:
         share = min(h.density_rate * h.total_variation, MOST_VARIATION)
         change += share * differences(p.places[v], thickness, voxel, MIN_THICKNESS, p.brick, p.dense, p.around)
@@ -202,12 +193,9 @@ def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     p.density[v] = np.float32(thickness / voxel)
     square = decay * p.square_sh[v] + (1 - decay) * squares / p.width
     p.square_sh[v] = np.float32(square)
-    scale = np.float32(-ahead / (np.sqrt(square * correction) + epsilon))
+    scale = np.float32(-1.0 / (np.sqrt(square * correction) + epsilon))
     for j in range(0, p.width, LANES):
         by, at, count = load(p.row, j, LANES), v * p.width + j, p.width - j
-        if momentum > 0:
-            by = load_first(p.mean_sh, at, count, LANES) * np.float32(momentum) + by * np.float32(1 - momentum)
-            store_first(p.mean_sh, at, by, count)
         store_first(p.sh, at, fma(load(p.rates, j, LANES) * scale, by, load_first(p.sh, at, count, LANES)), count)
 
 
@@ -226,18 +214,18 @@ def _fetch(v, number, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square):  # type: ignore[no-untyped-def]
     """See `StepPointers`."""
     return StepPointers(
         pointer(records.numbers), pointer(records.gradient), pointer(rows), pointer(following), pointer(row), values.sh.shape[1], rows.shape[1],
-        pointer(values.density), pointer(values.sh), pointer(values.places), pointer(values.dense), pointer(moments.density), pointer(moments.sh),
+        pointer(values.density), pointer(values.sh), pointer(values.places), pointer(values.dense),
         pointer(moments.square_density), pointer(moments.square_sh), pointer(moments.visits), pointer(values.sides), pointer(values.cascades), pointer(rates),
-        pointer(of_square), len(of_square) - 1, pointer(of_mean), len(of_mean) - 1, pointer(neighbours.around), neighbours.brick,
+        pointer(of_square), len(of_square) - 1, pointer(neighbours.around), neighbours.brick,
     )  # fmt: skip
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square):  # type: ignore[no-untyped-def]
     """Takes bins until none is left."""
     bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
     met, some, row = np.empty(size, np.int64), np.zeros(size >> 6, np.int64), np.empty(rows.shape[1], np.float32)
@@ -246,7 +234,7 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
     while slab < bins:
         low = slab << BIN_BITS
         following = _link_all(low, slab, records, head, following, some)
-        p = _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean)
+        p = _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square)
         count = _take_voxels(some, met)
         for n in range(count):
             v = low + met[n]
@@ -261,9 +249,9 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
-        _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean)
+        _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -288,13 +276,13 @@ def _copy(workers, task, records, values):  # type: ignore[no-untyped-def]
 def step(records: Records, values: Values, moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS) -> None:
     """A step for the voxels that the records name; the others stay. float32.
 
-    s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
-    p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
+    s <- decay s + (1 - decay) g^2
+    p <- p - rate g / (sqrt(s / (1 - decay^visits)) + epsilon)
     """
     h, count = Hyperparameters._make(map(float, hyperparameters)), records.begin.shape[1] - 1
     rows, workers = rows_of(records.basis), min(numba.get_num_threads(), count)
     rates = np.full(rows.shape[1], h.sh_rate * h.view_share, np.float32)
     rates[:3] = h.sh_rate
-    _step(workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum))
+    _step(workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay))
     # Not before all bins are done: total variation is that of the densities before the step.
     _copy(workers, np.zeros(1, np.int64), records, values)
