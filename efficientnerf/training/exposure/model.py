@@ -157,7 +157,7 @@ def averaged_image(image: np.ndarray, mask: np.ndarray | None, number: int, e: E
 @lru_cache(maxsize=1)
 def _light_of_levels(e: Exposure) -> Tensor:
     """(K, 256) float32 light that levels of each camera's photographs show."""
-    level = torch.arange(256, dtype=torch.float32) / np.float32(255)
+    level = torch.arange(256, dtype=torch.float32) / 255
     return _light(level[:, None], _numbers(e)[:, None, SHOULDER:])[..., 0]
 
 
