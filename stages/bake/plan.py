@@ -154,7 +154,7 @@ def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: in
     mib, usual, seconds = resolved(settings.max_mib), usual_mib(s, packed=packed), resolved(settings.time_budget)
     timed = mib is None and seconds is not None and device == "cpu"
     if mib is None:
-        mib = timed_mib(usual, seconds, cores, packed=packed) if seconds is not None and timed else usual
+        mib = timed_mib(usual, seconds, cores, whole=whole, packed=packed) if seconds is not None and timed else usual
     ratio, error_map = resolved(settings.view_dependent_lr_ratio), resolved(settings.error_map)
     if ratio is None:
         of_views = float(np.clip(VIEW_LR_RATIO * len(views_of(s, "train")), MIN_VIEW_DEPENDENT_LR_RATIO, MAX_VIEW_DEPENDENT_LR_RATIO))

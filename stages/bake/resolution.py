@@ -27,8 +27,9 @@ MAX_MIB = 38
 SCENE_BYTES, SCENE_MAX_MIB, MAX_BEYOND, MAX_CELLS = 0.7, 76, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
 NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
-# With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. docs/experiments/tree-training.md
-TIMED_MIB, MIN_TIMED_MIB = 0.115, 2.0
+# With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of an unbounded scene
+# takes fewer rays. docs/experiments/tree-training.md
+TIMED_MIB, SCENE_TIMED_MIB, MIN_TIMED_MIB = 0.115, 0.23, 2.0
 MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: of which the refinement keeps the heaviest
 OVERSHOOT = 1.7  # the same where the resolution is chosen: few of the dilated voxels show. docs/experiments/bake-resolution.md
 MIN_FILL = 0.93  # of the size that is used, at least
@@ -105,9 +106,9 @@ def mib_for_voxels(mib: float, usual: float, *, packed: bool, fixed: bool) -> fl
     return min(mib, usual) if packed and not fixed else mib
 
 
-def timed_mib(mib: float, seconds: float, cores: int, *, packed: bool = False) -> float:
+def timed_mib(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:
     """MiB of those that an asset may have, which can be refined in so many seconds: fewer voxels that rays have met often are better than more of them."""
-    timed = max(MIN_TIMED_MIB, TIMED_MIB * seconds * cores)
+    timed = max(MIN_TIMED_MIB, (SCENE_TIMED_MIB if whole else TIMED_MIB) * seconds * cores)
     return min(mib, timed / 3 if packed else timed)
 
 
