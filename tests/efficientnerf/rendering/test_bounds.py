@@ -38,6 +38,13 @@ def test_rays_from_far_away_end(lookup: str, distance: float) -> None:
     assert torch.isfinite(reference[0]).all()
 
 
+def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
+    tree = random_tree(0)
+    origins, directions = np.full((4, 3), 0.5), np.full((4, 3), 0.5)
+    origins[0, 1], origins[1, 2], directions[2, 0], directions[3] = np.nan, np.inf, np.nan, np.inf
+    assert not render_rays(tree, origins, directions).opacity.any()
+
+
 @pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
 @pytest.mark.parametrize("least", [-1e-42, 1e-42, -1e-320, 1e-31, 0.0])
 def test_rays_along_a_face_of_cells_end(lookup: str, least: float) -> None:
