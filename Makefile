@@ -85,6 +85,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet torch==2.13.0
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	@touch $@
+	@$(BIN)/python -m workflows.precompilation  # some minutes, in the background
 
 # Runs are kept: they are the user's.
 clean:

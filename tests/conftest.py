@@ -20,6 +20,7 @@ import pytest
 for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ[variable] = "1"
 
+os.environ["ENERF_PRECOMPILE"] = "off"  # a test compiles what it uses, and no more
 os.environ["ENERF_FEATURE_CACHE_MIB"] = "0"  # a test detects features itself
 
 IN_MEMORY, ROOM = Path("/dev/shm"), 4 << 30

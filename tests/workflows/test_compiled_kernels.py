@@ -1,10 +1,11 @@
-"""A run that compiles its kernels and one that finds them compiled make the same artifacts.
+"""A run that compiles its kernels and one that finds them compiled make the same artifacts; what is compiled in the background is what runs need.
 
 It begins before other tests: on a new machine these load what was compiled for it, instead of each worker compiling the same again.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -16,6 +17,9 @@ import pytest
 from benchmarks.torture import sources
 from benchmarks.torture.comparison import digests
 from efficientnerf.backends import kernel_cache
+from workflows.asset import WORKFLOW
+from workflows.cli.resolve import Settings, table_of
+from workflows.precompilation.start import small_settings
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,25 +35,41 @@ def hand_on(compiled: Path, place: Path) -> None:
                 os.replace(folder / f"{file.name}.new", folder / file.name)
 
 
+PRECOMPILES = """
+import json, sys
+from pathlib import Path
+from workflows.precompilation.run import precompile
+precompile(json.loads(sys.argv[1]), Path(sys.argv[2]))
+"""
+FEW = 3  # kernels that only some scenes need
+
+
 @pytest.mark.slow
 @pytest.mark.first
 @pytest.mark.timeout(900)
 def test_compiled_or_loaded_the_artifacts_are_the_same(tmp_path: Path) -> None:
-    """numba keeps copies of what a kernel calls; the process that compiles uses other ones than those which load."""
+    """numba keeps copies of what a kernel calls; the process that compiles uses other ones than those which load. And a run finds what was precompiled."""
     source = sources.make("llff", tmp_path / "source")
     cache = tmp_path / "cache"
     environment = {**os.environ, "ENERF_CACHE_DIR": str(cache), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
+    built = Settings({stage.name: stage.settings for stage in WORKFLOW.stages})
+    for setting in sources.SETTINGS:
+        built.put_option(setting)
+    small = json.dumps(small_settings(table_of(built.resolved())))
     made, kernels = [], []
     for name in ("compiles", "loads"):
-        command = [sys.executable, "-m", "workflows.cli.main", *source.arguments(tmp_path / name)]
+        command = [sys.executable, "-c", PRECOMPILES, small, str(tmp_path / name)]
         subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
-        made.append(digests(tmp_path / name))
+        made.append(digests(tmp_path / name / "run"))
         kernels.append(set(cache.rglob("*.nbc")))
     assert None not in made[0].values()
     assert made[0] == made[1]
     assert kernels[0] == kernels[1]
     assert len(kernels[0]) > 20
+    command = [sys.executable, "-m", "workflows.cli.main", *source.arguments(tmp_path / "run")]
+    subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
+    assert len(set(cache.rglob("*.nbc")) - kernels[0]) <= FEW
     compiled, place = cache / "kernels" / kernel_cache.key(), kernel_cache.folder()
     hand_on(compiled, place)
     assert all((place / index.relative_to(compiled)).stat().st_size > 0 for index in compiled.rglob("*.nbi"))

@@ -22,6 +22,7 @@ from workflows.cli.progress import display, warning
 from workflows.cli.request import Options, Plan, plan_run
 from workflows.cli.resolve import nearest
 from workflows.cli.target import open_run
+from workflows.precompilation.start import precompiling
 from workflows.report.pages import has_pages, write_pages
 from workflows.report.summary import graded, in_words, summary
 
@@ -112,8 +113,9 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
             for text in plan.warnings:
                 show(warning(text))
             with nullcontext(run) if dry_run else plan.written() as run, nullcontext() if dry_run else kept_in(run.path):
-                how: dict[str, Any] = {"device": device, "memory": plan.memory, "report": show, "dry_run": dry_run, "execute": execute_alone}
-                outcomes = run_stages(run, workflow().stages, **how, **selection)
+                with precompiling(execute_alone, run.settings, device, plan.memory) as execute:
+                    how: dict[str, Any] = {"device": device, "memory": plan.memory, "report": show, "dry_run": dry_run, "execute": execute}
+                    outcomes = run_stages(run, workflow().stages, **how, **selection)
                 if not dry_run and (any(outcome.action == "ran" for outcome in outcomes) or not has_pages(run, workflow().stages)):
                     write_pages(run, workflow().stages)
     except (Exception, KeyboardInterrupt) as error:

@@ -9,6 +9,7 @@ import click
 from workflows.cli.options import common_options, folder_type, json_option, memory_limit, memory_option, quiet_option, set_option, workflow
 from workflows.cli.output import closing, listing, write_json
 from workflows.inspection.check import check_source, in_words
+from workflows.precompilation.start import start_alone
 
 
 @click.command()
@@ -25,6 +26,7 @@ def check(source: Path, format_name: str | None, sets: tuple[str, ...], memory: 
 
     The grade is good, usable, poor or failed. The exit code is 0, or 2 if no cameras can be found.
     """
+    start_alone()
     settings = ("poses.format=" + format_name,) if format_name else ()
     found = check_source(source, (*sets, *settings), memory_limit(memory), workflow())
     code = 2 if found["grade"] == "failed" else 0

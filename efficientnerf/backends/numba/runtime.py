@@ -6,15 +6,18 @@ numba ends the process where two threads call kernels at once. The stages call k
 or a lock of its own. NUMBA_THREADING_LAYER and NUMBA_THREADING_LAYER_PRIORITY, where set, hold.
 
 Cache: `kernel_cache.folder()`, for functions of this package alone. It only saves time: files in it that are damaged are removed and compiled again, and a
-disk that takes or gives no file is not an error. Both are said in a RuntimeWarning.
+disk that takes or gives no file is not an error. Both are said in a RuntimeWarning. Of several processes that need a form of a function at the same moment
+one compiles it, and the others wait for it and load it.
 """
 
 from __future__ import annotations
 
+import errno
 import functools
 import hashlib
 import io
 import os
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,6 +27,11 @@ from typing import Any
 
 import numba
 from numba.core import caching, event
+
+try:
+    import fcntl
+except ImportError:  # Windows: two processes may compile the same
+    fcntl = None  # type: ignore[assignment]
 
 from efficientnerf.backends import LAYERS, Notice, kernel_cache
 
@@ -68,6 +76,35 @@ def _warn_once(text: str) -> None:
     warnings.warn(text, Notice, stacklevel=2)
 
 
+class ByteLocks:
+    """Locks of processes, one for each text: bytes of one file, which the system frees when a process ends, however it does."""
+
+    def __init__(self) -> None:
+        self._file: int | None = None
+        self._held: set[int] = set()
+
+    def take(self, text: str, *, wait: bool) -> bool:
+        """Whether the lock is held now, or cannot be had on this system; False where another process holds it and `wait` is off."""
+        if fcntl is None:
+            return True
+        try:
+            if self._file is None:  # stays open: closing any descriptor of the file would free all of its locks
+                self._file = os.open(kernel_cache.folder() / "compiling.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            fcntl.lockf(self._file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, self._place(text))
+        except OSError as error:  # a file system without locks, or two processes that wait for each other: both compile
+            return wait or error.errno not in (errno.EACCES, errno.EAGAIN)
+        self._held.add(self._place(text))
+        return True
+
+    def give_back(self, text: str) -> None:
+        if self._file is not None and self._place(text) in self._held:
+            self._held.remove(self._place(text))
+            fcntl.lockf(self._file, fcntl.LOCK_UN, 1, self._place(text))
+
+    def _place(self, text: str) -> int:
+        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "little")
+
+
 class KernelFiles(caching.IndexDataCacheFile):
     """The files of a function's compiled forms, those of this package with their SHA-256 at the end.
 
@@ -76,6 +113,8 @@ class KernelFiles(caching.IndexDataCacheFile):
     numba numbers the files of compiled forms by what its index holds: two processes that compile different forms of a function at the same moment take the
     same number, and the index may then lead to the code of the other form. Here a file is named by its form, and written before the index leads to it. Of two
     indices written at the same moment one stays: a form that it lacks is compiled again.
+
+    numba loads a form before it compiles it, and saves it after that: the lock of the form is taken and given back here.
     """
 
     def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
@@ -89,16 +128,37 @@ class KernelFiles(caching.IndexDataCacheFile):
         name = self._index_name.removesuffix("nbi") + hashlib.sha256(self._dump(key)).hexdigest()[:32] + ".nbc"
         try:
             self._save_data(name, data)
+            _locks.take(self._index_path, wait=True)
             self._save_index({**self._load_index(), key: name})
         except OSError as error:
             _warn_once(f"{self._cache_path}: {error.strerror or error}; compiled kernels are not kept.")
+        finally:
+            _locks.give_back(self._index_path)
+            _compilations.end_form(self._form(key))
 
     def load(self, key: Any) -> Any:
+        if not self._own:
+            return super().load(key)
+        found = self._loaded(key)
+        if found is None:
+            form = self._form(key)
+            if not _locks.take(form, wait=False):
+                with _compilations.waiting():
+                    _locks.take(form, wait=True)
+            found = self._loaded(key)  # another process may have saved it meanwhile
+            if found is None:
+                _compilations.begin_form(form)
+            else:
+                _locks.give_back(form)
+        return found
+
+    def _form(self, key: Any) -> str:
+        return f"{self._index_path} {key}"
+
+    def _loaded(self, key: Any) -> Any:
         try:
             return super().load(key)
         except OSError:
-            if not self._own:
-                raise
             return None
 
     def _load_index(self) -> dict[Any, str]:
@@ -132,11 +192,12 @@ class KernelFiles(caching.IndexDataCacheFile):
 
 
 class _Compilations(event.Listener):
-    """Passes on what numba compiles; a function compiled for the sake of another counts with that one."""
+    """Passes on what numba compiles, or waits for; a function compiled for the sake of another counts with that one. Holds the locks of what is compiled."""
 
     def __init__(self) -> None:
         self._depth = 0
         self._began = 0.0
+        self._forms: list[str] = []  # one compiled for the sake of another comes after it
 
     def on_start(self, event: Any) -> None:
         if self._depth == 0:
@@ -148,10 +209,30 @@ class _Compilations(event.Listener):
         self._depth -= 1
         if self._depth == 0:
             kernel_cache.note_end(time.perf_counter() - self._began)
+        if event is not None and sys.exc_info()[0] is not None and self._forms:
+            self.end_form(self._forms[-1])  # it could not be compiled: numba saves nothing
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        self.on_start(None)
+        try:
+            yield
+        finally:
+            self.on_end(None)
+
+    def begin_form(self, form: str) -> None:
+        self._forms.append(form)
+
+    def end_form(self, form: str) -> None:
+        if form in self._forms:
+            self._forms.remove(form)
+            _locks.give_back(form)
 
 
+_locks = ByteLocks()
+_compilations = _Compilations()
 caching.CacheImpl._locator_classes.insert(0, KernelLocator)
 caching.IndexDataCacheFile = KernelFiles
-event.register("numba:compile", _Compilations())
+event.register("numba:compile", _compilations)
 
 __all__ = ["numba"]

@@ -170,6 +170,68 @@ def test_a_process_that_is_killed_while_it_saves_leaves_no_other_forms_code(tmp_
         assert files.load("float64") is None
 
 
+WAITS = """
+import json, sys, time
+from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba.runtime import KernelFiles
+
+files = KernelFiles(sys.argv[1], "kernel", kernel_cache.key())
+found = files.load("float32")
+print(json.dumps(found), flush=True)
+if found is None:
+    sys.stdin.readline()  # it compiles
+    if sys.argv[2] == "saves":
+        files.save("float32", ["code"])
+        sys.stdin.readline()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks of bytes are POSIX's")
+@pytest.mark.parametrize("end", ["saves", "killed", "fails"])
+def test_who_needs_a_form_that_another_process_compiles_waits_for_it(tmp_path: Path, end: str) -> None:
+    """And compiles it where the other was killed meanwhile, or could not."""
+    environment = {**os.environ, "ENERF_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(kernel_cache.ROOT)}
+    command = [sys.executable, "-c", WAITS, str(tmp_path), end]
+
+    def begun() -> subprocess.Popen[str]:
+        return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    with begun() as first:
+        assert first.stdout is not None
+        assert first.stdin is not None
+        assert json.loads(first.stdout.readline()) is None
+        with begun() as second:
+            assert second.stdout is not None
+            with pytest.raises(subprocess.TimeoutExpired):
+                second.wait(timeout=4.0)  # long enough to import numba, and it would have printed a line and read another
+            if end == "killed":
+                first.kill()
+            else:
+                first.stdin.write("\n")
+                first.stdin.flush()
+            found = json.loads(second.stdout.readline())
+            assert found == (["code"] if end == "saves" else None)
+            second.kill()
+        first.kill()
+
+
+def test_the_lock_of_a_form_that_cannot_be_compiled_is_given_back(package: Path, tmp_path: Path) -> None:
+    program = """
+import json
+from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba import runtime
+from efficientnerf.backends.numba.inner import inner
+try:
+    inner("text")
+except Exception as error:
+    refused = type(error).__name__
+held = (len(runtime._locks._held), len(runtime._compilations._forms))
+print(json.dumps({"refused": refused, "held": held, "result": inner(3), "after": (len(runtime._locks._held), len(runtime._compilations._forms))}))
+"""
+    found = run(package, program, ENERF_CACHE_DIR=str(tmp_path / "cache"))
+    assert (found["refused"], found["held"], found["result"], found["after"]) == ("TypingError", [0, 0], 4, [0, 0])
+
+
 def test_a_disk_that_takes_no_kernels_is_no_error(package: Path, tmp_path: Path) -> None:
     full = PROGRAM.replace(
         "started = []",

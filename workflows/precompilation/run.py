@@ -1,0 +1,53 @@
+"""The process that `start` begins: it takes the made scene through all stages, so that their kernels are compiled."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import PipelineError
+from pipeline.run import Run
+from pipeline.runner import run_stages
+from workflows.asset import WORKFLOW
+from workflows.precompilation.scene import write_scene
+from workflows.precompilation.start import REQUEST, stamp_of
+
+NICE = 10  # it gives way to the run; not by so much that a kernel that the run waits for is never done
+
+
+def precompile(settings: dict[str, dict[str, Any]], folder: Path) -> None:
+    """Compile the kernels of all stages of a run with these settings. The folder is empty."""
+    write_scene(folder / "source")
+    run = Run.create(folder / "run", folder / "source", settings, device="cpu")
+    run_stages(run, WORKFLOW.stages, device="cpu")
+    stamp_of(settings).touch()
+
+
+def _end_with_parent(folder: Path) -> None:
+    """End this process when the one that began it has gone, or has closed its end of the pipe."""
+    with contextlib.suppress(OSError):
+        while os.read(0, 1):
+            pass
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(0)  # whatever is being compiled: a form is kept whole or not at all
+
+
+def main() -> None:
+    request = json.loads(os.environ[REQUEST])
+    if hasattr(os, "nice"):
+        os.nice(NICE)
+    with tempfile.TemporaryDirectory(prefix="efficientnerf-", ignore_cleanup_errors=True) as name:
+        if not request["detached"]:
+            threading.Thread(target=_end_with_parent, args=(Path(name),), daemon=True).start()
+        with contextlib.suppress(PipelineError):  # the run itself compiles what is missing
+            precompile(request["settings"], Path(name))
+
+
+if __name__ == "__main__":
+    main()
