@@ -5,18 +5,21 @@ from __future__ import annotations
 import contextlib
 import difflib
 import signal
+import threading
 import time
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from pipeline import artifact, files, manifest
 from pipeline.artifact import Workplace
 from pipeline.decide import Decision, decide, survey
-from pipeline.errors import BadInput, CorruptArtifact, Interrupted, UsageError
+from pipeline.errors import BadInput, CorruptArtifact, Interrupted, PipelineError, UsageError
 from pipeline.executors import local
 from pipeline.executors.local import Usage
 from pipeline.executors.memory import Limit
+from pipeline.executors.side_by_side import SideBySide
 from pipeline.failures import failed, interruption_in, translated
 from pipeline.hashes import Hashes
 from pipeline.interrupt import Stop, stopping
@@ -25,6 +28,8 @@ from pipeline.run import Run
 from pipeline.stage import Job, Report, Stage, settings_from
 
 Executor = Callable[[Stage, Job], Usage]
+
+POLL = 0.1  # seconds between two looks for a signal while stages run at the same time
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,7 @@ def run_stages(
     report: Report | None = None,
     dry_run: bool = False,
     execute: Executor = local.execute,
+    beside: SideBySide | None = None,
 ) -> list[Outcome]:
     """Bring a run up to date; returns an outcome for each stage considered, in order.
 
@@ -71,6 +77,8 @@ def run_stages(
     memory   handed to the stages; None: no limit
     report   takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
     dry_run  report what would be done, and do nothing
+    execute  runs a stage
+    beside   runs stages that do not need each other, at the same time, where the memory admits it; None: one stage after another
 
     Raises PipelineError. What was published before stays; the next call resumes what was interrupted.
     """
@@ -89,13 +97,23 @@ def run_stages(
         return run.how_to_resume(until=until, start=first)
 
     with run.locked(), stopping() as stop:
-        return _Runner(run, stages, device, memory, report, stop, execute).all(chosen, forced, only, go_on)
+        return _Runner(run, stages, device, memory, report, stop, execute, beside).all(chosen, forced, only, go_on)
 
 
 class _Runner:
     """One call of run_stages."""
 
-    def __init__(self, run: Run, stages: Sequence[Stage], device: str, memory: Limit | None, report: Report | None, stop: Stop, execute: Executor) -> None:
+    def __init__(
+        self,
+        run: Run,
+        stages: Sequence[Stage],
+        device: str,
+        memory: Limit | None,
+        report: Report | None,
+        stop: Stop,
+        execute: Executor,
+        beside: SideBySide | None,
+    ) -> None:
         self.run = run
         self.stages = stages
         self.work = run.path / artifact.WORK
@@ -103,7 +121,9 @@ class _Runner:
         self.memory = memory
         self.stop = stop
         self.execute = execute
-        self._report = report
+        self.beside = beside
+        self._report = None if report is None else _one_at_a_time(report)
+        self._lock = threading.Lock()  # of everything but the work of a stage
         self.hashes = Hashes(run.cache, safe_point=self.safe_point)
 
     def all(self, chosen: Sequence[Stage], forced: frozenset[str], only: str | None, go_on: Callable[[str], str]) -> list[Outcome]:
@@ -114,20 +134,64 @@ class _Runner:
                 self.emit("message", text.partition(":")[0], text=text)
             if only is not None:
                 _warn_of_stale_needs(self.run, self.stages, only, self._report, self.hashes)
-            for stage in chosen:
-                current = stage.name
+            waiting = list(chosen)
+            while waiting:
+                ready = [stage for stage in waiting if not {each.name for each in waiting} & set(stage.needs)]
+                current = ready[0].name
                 self.safe_point()
-                outcomes.append(self.one(stage, forced=stage.name in forced))
+                outcomes += self._together(ready, forced) if self._are_admitted(ready, forced) else [self.one(ready[0], forced=current in forced)]
+                waiting = [stage for stage in waiting if stage.name not in {outcome.stage for outcome in outcomes}]
         except (Interrupted, KeyboardInterrupt) as error:
             raise self._interrupted(error, current, go_on(current)) from error
         except OSError as error:  # outside of a stage: while looking, or while putting right
             raise failed(self.run.path, error) from error
         finally:
             self.hashes.save()
-        return outcomes
+        order = [stage.name for stage in chosen]
+        return sorted(outcomes, key=lambda outcome: order.index(outcome.stage))
 
-    def one(self, stage: Stage, *, forced: bool) -> Outcome:
-        """Decide about one stage, and run it if needed."""
+    def _are_admitted(self, ready: Sequence[Stage], forced: Collection[str]) -> bool:
+        """Whether these run at the same time: more than one has to run, and each has enough memory in a share of it."""
+        if self.beside is None or self.beside.jobs < 2 or len(ready) < 2:
+            return False
+        stale = [stage for stage in ready if stage.name in forced or not decide(stage, self.run, self.hashes).fresh]
+        if len(stale) < 2 or self.memory is None:
+            return len(stale) > 1
+        needs = [self.beside.need(stage) for stage in stale]
+        return all(need is not None and need <= self.memory.bytes // self.beside.jobs for need in needs)
+
+    def _together(self, ready: Sequence[Stage], forced: Collection[str]) -> list[Outcome]:
+        """`one` for each of these, at the same time. The first error is raised once all have ended; no other stage begins after it."""
+        assert self.beside is not None
+        memory = None if self.memory is None else Limit(self.memory.bytes // self.beside.jobs, self.memory.whose)
+        with ThreadPoolExecutor(self.beside.jobs, thread_name_prefix="stage") as pool:
+            futures = [pool.submit(self.one, stage, forced=stage.name in forced, execute=self.beside.execute, memory=memory) for stage in ready]
+            pending, asked = set(futures), False
+            while pending:
+                ended = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED).done
+                stop = self._is_to_stop()
+                if stop or any(not future.cancelled() and future.exception() is not None for future in ended):
+                    pool.shutdown(wait=False, cancel_futures=True)
+                if stop and not asked:
+                    asked = True
+                    self.beside.stop()
+                pending = {future for future in pending if not future.done()}
+        self.beside.rest()
+        self.safe_point()
+        for future in futures:
+            if not future.cancelled() and (error := future.exception()) is not None:
+                raise error
+        return [future.result() for future in futures]
+
+    def one(self, stage: Stage, *, forced: bool, execute: Executor | None = None, memory: Limit | None = None) -> Outcome:
+        """Decide about one stage, and run it if needed.
+
+        execute  in place of the usual executor, with this `memory`
+        """
+        with self._lock:
+            return self._one(stage, forced, execute or self.execute, memory if execute is not None else self.memory)
+
+    def _one(self, stage: Stage, forced: bool, execute: Executor, memory: Limit | None) -> Outcome:
         decision = decide(stage, self.run, self.hashes)
         if decision.note:
             self.emit("warning" if not decision.fresh else "message", stage.name, text=decision.note)
@@ -142,7 +206,7 @@ class _Runner:
         try:
             made = artifact.finished(place, stage.name)
             if made is None:
-                made = self._make(stage, request, place, reason)
+                made = self._make(stage, request, place, reason, execute, memory)
             else:
                 self.emit("message", stage.name, text=f"{stage.name} was done before; only its publication had been cut short")
             self.run.check_held()
@@ -155,7 +219,7 @@ class _Runner:
         self.emit("stage_done", stage.name, reason=reason, **facts)
         return _outcome(stage, "ran", reason, made)
 
-    def _make(self, stage: Stage, request: Request, place: Workplace, reason: str) -> Manifest:
+    def _make(self, stage: Stage, request: Request, place: Workplace, reason: str, execute: Executor, memory: Limit | None) -> Manifest:
         """Run the stage and seal its outputs."""
         resumed = artifact.prepare(place, self.work)
         self.emit("stage_started", stage.name, reason=reason, resumed=resumed)
@@ -167,12 +231,16 @@ class _Runner:
             out=place.out,
             work=place.scratch,
             device=self.device,
-            memory=self.memory,
+            memory=memory,
             stage=stage.name,
             report=self._report,
             stop=self.stopped,
         )
-        usage = self.execute(stage, job)
+        self._lock.release()
+        try:
+            usage = execute(stage, job)
+        finally:
+            self._lock.acquire()
         outputs = artifact.outputs_of(place.out, stage, self.hashes)
         made = Manifest(request, outputs, usage.seconds, usage.peak_memory, resumed, cpu_seconds=usage.cpu_seconds, cores=usage.cores, facts=job.facts)
         artifact.seal(place.out, made)
@@ -236,6 +304,12 @@ class _Runner:
         self.run.check_held()
         return self.stop()
 
+    def _is_to_stop(self) -> bool:
+        try:
+            return self.stopped() is not None
+        except PipelineError:  # the run is no longer ours: `safe_point` says so once all have ended
+            return True
+
     def safe_point(self) -> None:
         number = self.stopped()
         if number is not None:
@@ -243,6 +317,17 @@ class _Runner:
 
     def emit(self, event: str, stage: str, **facts: Any) -> None:
         _emit(self._report, event, stage, **facts)
+
+
+def _one_at_a_time(report: Report) -> Report:
+    """Stages that run at the same time report from several threads."""
+    lock = threading.Lock()
+
+    def reported(event: dict[str, Any]) -> None:
+        with lock:
+            report(event)
+
+    return reported
 
 
 def verify(run: Run, stages: Sequence[Stage], report: Report | None = None, *, altered: Sequence[str] = ()) -> list[Outcome]:

@@ -148,6 +148,11 @@ class Job:
         """Put a value that JSON can hold into the manifest, outside of every digest: what a stage decided that is no setting."""
         self.facts[name] = value
 
+    def pass_on(self, event: dict[str, Any]) -> None:
+        """An event of the process that does this job."""
+        if self._report is not None:
+            self._report(event)
+
     def safe_point(self) -> None:
         """Raise Interrupted if a signal has arrived. Call it where `work` holds all that is needed to resume."""
         number = self._stop() if self._stop is not None else None

@@ -4,7 +4,7 @@ A child works for one run (`pipeline.executors.serving` is its side) and is kept
 One that prepares runs goes on to the next run, until a run whose stages begin takes it over; so does one whose run is done, unless it holds much memory.
 Parent and child speak lines of JSON:
 
-    to the child    {"kind": "prepare" | "stage" | "finish" | "end", ...}, see `Children.work`
+    to the child    {"kind": "prepare" | "stage" | "job" | "finish" | "end", ...}, see `Children.work`
     from the child  the stages' events, then {"event": "result", "ok", ...}
 
 Each child leads a group of processes. It ends with its parent, and whatever it has started ends with it.
@@ -189,7 +189,7 @@ class Children:
         """What the child of a run answers to a request; never raises.
 
         request  {"kind": "prepare" | "stage" | "finish", "run": path, ...}; "prepare" with "scene" and "memory" (bytes or None), "stage" with "stage",
-                 "device" and "memory"
+                 "device" and "memory"; or {"kind": "job", ...}, see `side_by_side`: "run" is any name of the child then
         cores    that it computes on
         gpus     CUDA devices that it sees
         """

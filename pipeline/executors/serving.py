@@ -9,7 +9,9 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,12 +21,13 @@ from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, Pi
 from pipeline.executors.child import Event, end_with
 from pipeline.executors.local import execute_alone
 from pipeline.executors.memory import Limit, resident
-from pipeline.failures import history
+from pipeline.failures import history, interruption_in, translated
+from pipeline.interrupt import stopping
 from pipeline.library_output import warnings_for_users
 from pipeline.run import Run
 from pipeline.runner import run_stages
 from pipeline.sharing import take_over
-from pipeline.stage import Stage
+from pipeline.stage import Job, Stage, settings_from
 from pipeline.text import printable
 
 
@@ -109,6 +112,8 @@ def serve(program: Program) -> None:
 
 
 def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dict[str, Any]:
+    if request["kind"] == "job":
+        return _job_done(next(stage for stage in program.stages if stage.name == request["stage"]), request["job"], channel)
     path = Path(request["run"])
     if request["kind"] == "prepare":
         for text in program.prepare(path, request["scene"], request["memory"]):
@@ -128,6 +133,32 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     surveyed = _survey(program, path)
     made = next(each for each in surveyed if each["name"] == name)
     return {**made, "action": outcome.action, **_estimates(program, path, surveyed, request, channel), **program.describe(path)}
+
+
+def _job_done(stage: Stage, facts: dict[str, Any], channel: _Channel) -> dict[str, Any]:
+    """Run a stage as `SideBySide.execute` asks for it: its parent holds the run's lock, and publishes what is made."""
+    sources = [Path(path) for path in facts["sources"]]
+    with stopping() as stop:
+        try:
+            job = Job(
+                settings=settings_from(stage.settings, facts["settings"], where=stage.name),
+                inputs={need: Path(folder) for need, folder in facts["inputs"].items()},
+                source=sources[0] if sources else None,
+                also=sources[1:],
+                out=Path(facts["out"]),
+                work=Path(facts["work"]),
+                device=facts["device"],
+                memory=None if facts["memory"] is None else Limit(*facts["memory"]),
+                stage=stage.name,
+                report=channel.send,
+                stop=stop,
+            )
+            return {"usage": asdict(execute_alone(stage, job)), "facts": job.facts}
+        except (Exception, KeyboardInterrupt) as error:
+            failure = interruption_in(error, stop()) or translated(error, stage.name, Path(facts["out"]))
+            named = {name: getattr(failure, name, None) for name in ("number", "needed", "files")}
+            told = {"error": type(failure).__name__, "error_facts": named, "text": str(failure), "trace": "".join(traceback.format_exception(error))}
+            return {**told, "ok": False, "kind": "error"}
 
 
 def _opened(program: Program, path: Path) -> Run:

@@ -90,9 +90,7 @@ class Lines:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
-        self.started: dict[str, float] = {}
-        self.last_time = 0.0
-        self.last_share = 0.0
+        self.last: dict[str, tuple[float, float]] = {}  # of each stage the time of its last line, and the share that was done
 
     def __enter__(self) -> Lines:
         return self
@@ -103,8 +101,7 @@ class Lines:
     def __call__(self, event: Event) -> None:
         stage = event.get("stage") or ""
         if event["event"] == "stage_started":
-            self.started[stage] = self.last_time = time.monotonic()
-            self.last_share = 0.0
+            self.last[stage] = time.monotonic(), 0.0
         if event["event"] == "progress":
             self._progress(stage, event)
         elif words := sentence(event):
@@ -116,19 +113,20 @@ class Lines:
     def _progress(self, stage: str, event: Event) -> None:
         now, total = time.monotonic(), event.get("total") or 0
         share = event.get("done", 0) / total if total else 0.0
-        if share < self.last_share:
-            self.last_share = 0.0  # the stage has come to its next part
-        waited = now - self.last_time
-        if waited < SECONDS_BETWEEN_LINES and (waited < SECONDS_BETWEEN_TENTHS or share - self.last_share < 0.1):
+        last_time, last_share = self.last.get(stage, (0.0, 0.0))
+        if share < last_share:  # the stage has come to its next part
+            self.last[stage] = last_time, last_share = last_time, 0.0
+        waited = now - last_time
+        if waited < SECONDS_BETWEEN_LINES and (waited < SECONDS_BETWEEN_TENTHS or share - last_share < 0.1):
             return
-        self.last_time, self.last_share = now, share
+        self.last[stage] = now, share
         left = f"{duration(event['left'])} left" if event.get("left") else ""
         words = [f"{share:4.0%}" if total else "", str(event.get("text", "")), facts(event), left]
         self._line(stage, "  ".join(word for word in words if word))
 
 
 class Bars:
-    """A bar with the remaining time of the running stage, on a terminal."""
+    """A bar with the remaining time of each running stage, on a terminal."""
 
     def __init__(self) -> None:
         from rich.console import Console  # a log needs none
@@ -146,8 +144,7 @@ class Bars:
             console=self.console,
             transient=True,
         )
-        self.task: TaskID | None = None
-        self.part: tuple[Any, ...] = ()
+        self.tasks: dict[str, tuple[TaskID, float | None]] = {}  # of each stage its bar, and the total of the part that it shows
 
     def __enter__(self) -> Bars:
         self.progress.start()
@@ -162,25 +159,23 @@ class Bars:
             self._advance(stage, event)
             return
         if event["event"] in ("stage_done", "stage_failed", "interrupted"):
-            self._clear()
+            self._clear(stage)
         if words := sentence(event):
             style = "yellow" if event["event"] == "warning" else None
             self.console.print(_line(stage, words), style=style, markup=False, soft_wrap=True)
 
-    def _clear(self) -> None:
-        if self.task is not None:
-            self.progress.remove_task(self.task)
-        self.task, self.part = None, ()
+    def _clear(self, stage: str) -> None:
+        if stage in self.tasks:
+            self.progress.remove_task(self.tasks.pop(stage)[0])
 
     def _advance(self, stage: str, event: Event) -> None:
         total, text = event.get("total") or None, str(event.get("text", ""))
         # A bar of its own for each part of a stage, so that the time left is that of the part.
-        if (stage, total) != self.part:
-            self._clear()
-            self.task, self.part = self.progress.add_task(text, total=total, stage=stage), (stage, total)
-        if self.task is not None:
-            words = "  ".join(word for word in (text, facts(event)) if word)
-            self.progress.update(self.task, completed=event.get("done", 0), description=printable(words).replace("[", "\\["))
+        if stage not in self.tasks or self.tasks[stage][1] != total:
+            self._clear(stage)
+            self.tasks[stage] = self.progress.add_task(text, total=total, stage=stage), total
+        words = "  ".join(word for word in (text, facts(event)) if word)
+        self.progress.update(self.tasks[stage][0], completed=event.get("done", 0), description=printable(words).replace("[", "\\["))
 
 
 class JsonLines:

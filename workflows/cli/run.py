@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import click
 
-from pipeline.errors import UsageError
-from pipeline.executors.local import execute_alone
+from pipeline.errors import PipelineError, UsageError
+from pipeline.executors.local import cores, execute_alone
+from pipeline.executors.side_by_side import SideBySide
 from pipeline.library_output import kept_in, warnings_for_users
 from pipeline.run import Run
 from pipeline.runner import run_stages
+from pipeline.stage import Stage, settings_from
 from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
 from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_option, quiet_option, set_option, workflow
@@ -26,6 +29,7 @@ from workflows.precompilation.start import precompiling
 from workflows.report.pages import has_pages, write_pages
 from workflows.report.summary import graded, in_words, summary
 
+MOST_JOBS = 4  # stages that need nothing of each other: mesh, splats, turntable and points
 GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 
 
@@ -56,13 +60,14 @@ GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 @click.option("--strict", is_flag=True, help="Refuse a source with missing, unreadable or unregistered images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
 @click.option("--fail-on", type=click.Choice(["poor", "failed"]), help="Exit with code 6 if the result has this grade or worse; all files are still written.")
+@click.option("--jobs", type=click.IntRange(1, 64), metavar="N", help="Stages that run at once, if memory admits it; by default one a core, at most 4.")
 @click.option("--dry-run", is_flag=True, help="Show what would be done and why, and do nothing.")
 @json_option
 @quiet_option
 @common_options
 def run(
-    sources: tuple[Path, ...], run_folder: Path, until: str | None, start: str | None, fail_on: str | None, dry_run: bool, as_json: bool, quiet: bool,
-    **options: Any,
+    sources: tuple[Path, ...], run_folder: Path, until: str | None, start: str | None, fail_on: str | None, jobs: int | None, dry_run: bool, as_json: bool,
+    quiet: bool, **options: Any,
 ) -> int:  # fmt: skip
     """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or resume RUN.
 
@@ -75,7 +80,7 @@ def run(
     """
     options |= {"format": options.pop("format_name"), "source": sources[0] if sources else None, "also": sources[1:]}
     plan = plan_run(run_folder, workflow(), Options(**options))
-    return _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run, fail_on=fail_on)
+    return _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run, fail_on=fail_on, jobs=jobs)
 
 
 @click.command()
@@ -102,7 +107,7 @@ def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool
     _work(plan, as_json=as_json, quiet=quiet, only=name, force=force, dry_run=dry_run)
 
 
-def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str | None = None, **selection: Any) -> int:
+def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str | None = None, jobs: int | None = 1, **selection: Any) -> int:
     """Run a plan, display its progress, and print the summary; returns the exit code."""
     device = resolve_device(plan.device)
     _check_stages(selection)
@@ -113,8 +118,8 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
             for text in plan.warnings:
                 show(warning(text))
             with nullcontext(run) if dry_run else plan.written() as run, nullcontext() if dry_run else kept_in(run.path):
-                with precompiling(execute_alone, run.settings, device, plan.memory) as execute:
-                    how: dict[str, Any] = {"device": device, "memory": plan.memory, "report": show, "dry_run": dry_run, "execute": execute}
+                with precompiling(execute_alone, run.settings, device, plan.memory) as execute, _side_by_side(run, device, jobs) as beside:
+                    how: dict[str, Any] = {"device": device, "memory": plan.memory, "report": show, "dry_run": dry_run, "execute": execute, "beside": beside}
                     outcomes = run_stages(run, workflow().stages, **how, **selection)
                 if not dry_run and (any(outcome.action == "ran" for outcome in outcomes) or not has_pages(run, workflow().stages)):
                     write_pages(run, workflow().stages)
@@ -128,6 +133,21 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
     elif not quiet and not dry_run:
         closing(*in_words(run.path, outcomes))
     return code
+
+
+def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextManager[SideBySide | None]:
+    """What runs stages at the same time; on CUDA, or with one core, nothing does."""
+    jobs = min(MOST_JOBS, cores()) if jobs is None else jobs
+    if jobs < 2 or device != "cpu":
+        return nullcontext()
+    settings: dict[str, Any] = {stage.name: settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name) for stage in workflow().stages}
+
+    def need(stage: Stage) -> int | None:
+        with contextlib.suppress(PipelineError, OSError, ValueError):  # the stage itself says what is wrong
+            return workflow().memory(stage.name, run.path, tuple(run.sources.values()), settings, device)
+        return None
+
+    return SideBySide(workflow().child, jobs, cores(), need)
 
 
 def _check_stages(selection: dict[str, Any]) -> None:

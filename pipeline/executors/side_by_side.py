@@ -1,0 +1,101 @@
+"""Runs stages of one run at the same time, each in a child process, on a part of the cores; `pipeline.executors.serving` is the child's side."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+from pipeline import errors
+from pipeline.executors.child import Children
+from pipeline.executors.local import Usage
+from pipeline.stage import Job, Stage, settings_dict
+
+_PLAIN = (errors.BadInput, errors.UsageError, errors.UnknownSetting, errors.StageFailed, errors.DiskFull, errors.RunLocked)
+
+
+class FailureInChild(Exception):
+    """The traceback of what a child raised, as its text: the cause of the error that is raised here."""
+
+
+class SideBySide:
+    """An executor for stages that do not need each other. Used from `jobs` threads at most; closed by `with`.
+
+    module  what a child runs: it calls `serving.serve`
+    jobs    stages at a time
+    cores   that all of them together may use
+    need    stage -> bytes that it takes at its peak; None: not known
+    """
+
+    def __init__(self, module: str, jobs: int, cores: int, need: Callable[[Stage], int | None]) -> None:
+        self.jobs = jobs
+        self.cores = cores
+        self.need = need
+        self._children = Children(module, jobs)
+        self._lock = threading.Lock()
+        self._working: set[str] = set()
+        self._free: queue.SimpleQueue[str] = queue.SimpleQueue()
+        for number in range(jobs):
+            self._free.put(f"stages side by side {number}")
+
+    def __enter__(self) -> SideBySide:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._children.close()
+
+    def execute(self, stage: Stage, job: Job) -> Usage:
+        """Run the stage to its end, in a child that a stage before it may have left. Raises what the stage raised."""
+        facts = {
+            "settings": settings_dict(job.settings),
+            "inputs": {need: str(folder) for need, folder in job.inputs.items()},
+            "sources": [str(path) for path in job.sources.values()],
+            "out": str(job.out),
+            "work": str(job.work),
+            "device": job.device,
+            "memory": None if job.memory is None else [job.memory.bytes, job.memory.whose],
+        }
+        name = self._free.get()
+        with self._lock:
+            self._working.add(name)
+        try:
+            answer = self._children.work({"kind": "job", "run": name, "stage": stage.name, "job": facts}, job.pass_on, cores=max(1, self.cores // self.jobs))
+        finally:
+            with self._lock:
+                self._working.discard(name)
+            self._free.put(name)
+        if not answer["ok"]:
+            raise _error_of(stage.name, answer)
+        job.facts |= answer["facts"]
+        return Usage(**answer["usage"])
+
+    def rest(self) -> None:
+        """End the children, none of which works now: what follows has their memory."""
+        self._children.tidy(0.0)
+
+    def stop(self) -> None:
+        """Ask all stages that run to stop at their next safe points."""
+        with self._lock:
+            working = set(self._working)
+        for name in working:
+            self._children.stop(name)
+
+
+def _error_of(stage: str, answer: dict[str, Any]) -> errors.PipelineError:
+    text = str(answer["text"])
+    if "error" not in answer:  # the process itself ended
+        if answer["kind"] == "stopped":
+            return errors.Interrupted()
+        return errors.StageFailed(f"{stage}: {text} {' '.join(answer['lines'][-1:])}".rstrip())
+    name, facts = answer["error"], answer["error_facts"]
+    if name == errors.Interrupted.__name__:
+        return errors.Interrupted(facts["number"], text)
+    if name == errors.TooLittleMemory.__name__:
+        return errors.TooLittleMemory(text, facts["needed"])
+    if name == errors.CorruptArtifact.__name__:
+        return errors.CorruptArtifact(text, tuple(facts["files"]))
+    made = next((kind for kind in _PLAIN if kind.__name__ == name), errors.StageFailed)(text)
+    made.__cause__ = FailureInChild(answer["trace"])
+    return made
