@@ -15,6 +15,7 @@ from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs
 from stages.evaluate.asset import EvaluatedAsset
 from stages.figures.frames import RenderOptions, encode_frames, render_frames
+from stages.io.png import FAST
 from stages.io.scene import Scene
 
 LONGEST = 480  # pixels, the longer side of the video
@@ -22,7 +23,7 @@ FPS, CRF = 15, 20
 
 
 def write_captured_path(asset: EvaluatedAsset, tree: NerfTree, scene: Scene, frames: int, job: Job) -> None:
-    """Write the video. Frames are kept in job.work, so that a kill costs at most one.
+    """Write the video. Frames are kept in job.work, so that a kill costs at most the last few.
 
     tree  the asset's, whose metadata frames need
     """
@@ -37,6 +38,6 @@ def write_captured_path(asset: EvaluatedAsset, tree: NerfTree, scene: Scene, fra
         job.progress(done, total, "frames of the captured path")
 
     cameras = captured_cameras([view.camera for view in scene.views], frames, LONGEST)
-    options = RenderOptions(exr="off", fps=FPS, crf=CRF)
+    options = RenderOptions(exr="off", fps=FPS, crf=CRF, compress_level=FAST)
     written = render_frames(tree, cameras, job.work / "captured", options, each, reuse=True, draw=draw, warn=job.warn)
     encode_frames(written, EvaluateOutputs(job.out).captured_path, options, job.safe_point)

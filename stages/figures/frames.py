@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,24 +13,28 @@ import numpy as np
 
 from efficientnerf.asset.rendering import Rendering, render
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, Similarity
 from stages.formats.exporters.exr import write_exr
 from stages.formats.exporters.frames import NAMED, frame_background, frame_from_rendering, over_background
 from stages.formats.exporters.video import write_mp4
 from stages.framing.camera_paths import similarity_of
-from stages.io.png import read_png, write_png
+from stages.io.png import USUAL, read_png, write_png
 from stages.scratch import Warn, note, noted, once
+
+AHEAD = 2  # frames that are rendered and not written yet
 
 
 @dataclass(frozen=True)
 class RenderOptions:
     """How a camera path is rendered.
 
-    background   white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white; auto: the asset's environment, white where it has none
-    supersample  rays along each side of a pixel
-    exr          "off", "first" or "all": which frames are written as EXR too
-    video        name of the MP4 in the output folder, or None
-    fps, crf     of the video
+    background      white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white; auto: the asset's environment, white where it has
+                    none
+    supersample     rays along each side of a pixel
+    exr             "off", "first" or "all": which frames are written as EXR too
+    video           name of the MP4 in the output folder, or None
+    fps, crf        of the video
+    compress_level  of the PNGs
     """
 
     background: str = "auto"
@@ -37,6 +43,7 @@ class RenderOptions:
     video: str | None = "turntable.mp4"
     fps: int = 30
     crf: int = 18
+    compress_level: int = USUAL
 
 
 Progress = Callable[[int, int], None]
@@ -66,26 +73,47 @@ def render_frames(
         tree = replace(tree, environment=None)
     draw, warn = draw or render, once(warn)
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for k, camera in enumerate(cameras):
-        if progress is not None:
-            progress(k, len(cameras))
-        png, exr = folder / f"frame_{k:04d}.png", folder / f"frame_{k:04d}.exr"
-        with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
-        outputs = [png, exr] if with_exr else [png]
-        if not (reuse and noted(folder / f"frame_{k:04d}.json", list[str], warn, partial(_check, outputs, camera)) is not None):
-            output = draw(tree, camera, supersample=options.supersample, normals=with_exr)
-            opacity = np.ones_like(output.opacity) if surrounded else output.opacity  # nothing shows through the environment
-            if with_exr:
-                passes = {"colour": output.colour, "opacity": opacity, "depth": output.depth, "normal": output.normal}
-                write_exr(exr, **passes, camera=camera, world_from_capture=similarity)
-            write_png(frame_from_rendering(output.colour, opacity, background), png, durable=not reuse)
-            if reuse:
-                note(folder / f"frame_{k:04d}.json", [path.name for path in outputs], outputs)
-        written += outputs
+    written: list[Path] = []
+    writing: deque[Future[None]] = deque()
+    with ThreadPoolExecutor(1, "frames") as writer:  # a frame is compressed while the next ones are rendered
+        for k, camera in enumerate(cameras):
+            if progress is not None:
+                progress(k, len(cameras))
+            png, exr = folder / f"frame_{k:04d}.png", folder / f"frame_{k:04d}.exr"
+            with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
+            outputs = [png, exr] if with_exr else [png]
+            record = folder / f"frame_{k:04d}.json" if reuse else None
+            if record is None or noted(record, list[str], warn, partial(_check, outputs, camera)) is None:
+                output = draw(tree, camera, supersample=options.supersample, normals=with_exr)
+                if surrounded:
+                    output = replace(output, opacity=np.ones_like(output.opacity))  # nothing shows through the environment
+                writing.append(writer.submit(_write_frame, output, camera, similarity, background, outputs, record, options.compress_level))
+            while len(writing) > AHEAD:
+                writing.popleft().result()
+            written += outputs
+        for frame in writing:
+            frame.result()
     if progress is not None:
         progress(len(cameras), len(cameras))
     return written
+
+
+def _write_frame(
+    output: Rendering,
+    camera: Camera,
+    similarity: Similarity,
+    background: tuple[float, float, float] | None,
+    outputs: Sequence[Path],
+    record: Path | None,
+    level: int,
+) -> None:
+    """outputs  a PNG, and an EXR where one is wanted; `record` is their note, None where they are not kept for later."""
+    for exr in outputs[1:]:
+        passes = {"colour": output.colour, "opacity": output.opacity, "depth": output.depth, "normal": output.normal}
+        write_exr(exr, **passes, camera=camera, world_from_capture=similarity)
+    write_png(frame_from_rendering(output.colour, output.opacity, background), outputs[0], compress_level=level, durable=record is None)
+    if record is not None:
+        note(record, [path.name for path in outputs], outputs)
 
 
 def _check(outputs: Sequence[Path], camera: Camera, value: list[str], names: Collection[str]) -> None:

@@ -45,7 +45,7 @@ def cameras_of(tree: NerfTree, s: TurntableSettings, warn: Warn = lambda text: N
 
 
 def render_turntable(tree: NerfTree, job: Job, draw: Callable[..., Any] | None = None, cameras: Sequence[Camera] | None = None) -> None:
-    """Write frames and video, of the tree as it is. Frames are kept in job.work, so that a kill costs at most one; the video is encoded from the PNGs."""
+    """Write frames and video, of the tree as it is. Frames are kept in job.work, so that a kill costs the last few at most; the video is made of the PNGs."""
     s: TurntableSettings = job.settings
     cameras = cameras_of(tree, s) if cameras is None else cameras
     options = RenderOptions(background=s.background, supersample=s.supersample, exr=s.exr, fps=s.fps, crf=s.crf)

@@ -11,6 +11,9 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import filelock
+
+from efficientnerf.backends import kernel_cache
 from pipeline.errors import PipelineError
 from pipeline.run import Run
 from pipeline.runner import run_stages
@@ -45,7 +48,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="efficientnerf-", ignore_cleanup_errors=True) as name:
         if not request["detached"]:
             threading.Thread(target=_end_with_parent, args=(Path(name),), daemon=True).start()
-        with contextlib.suppress(PipelineError):  # the run itself compiles what is missing
+        # Another such process is enough for all runs that begin now; and what is missing in the end a run itself compiles.
+        with contextlib.suppress(filelock.Timeout, PipelineError), filelock.FileLock(kernel_cache.folder() / "precompilation.lock", timeout=0):
             precompile(request["settings"], Path(name))
 
 

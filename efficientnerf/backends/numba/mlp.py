@@ -62,10 +62,11 @@ def _pack_weight(weight, per_word, forward, back):  # type: ignore[no-untyped-de
     """weight (O, I) into the layouts of both passes."""
     outputs, inputs = weight.shape
     padded = np.zeros((per_word * len(back), back.shape[1]), np.float32)
-    padded[:outputs, :inputs] = weight
-    pack_row_pairs(Rows(pointer(padded), 0, back.shape[1]), back.shape[1], pointer(back), len(back), back.shape[1])
     transposed = np.zeros((per_word * len(forward), forward.shape[1]), np.float32)
-    transposed[:inputs, :outputs] = weight.T
+    for o in range(outputs):  # assignments to slices take seconds to compile
+        for i in range(inputs):
+            padded[o, i] = transposed[i, o] = weight[o, i]
+    pack_row_pairs(Rows(pointer(padded), 0, back.shape[1]), back.shape[1], pointer(back), len(back), back.shape[1])
     pack_row_pairs(Rows(pointer(transposed), 0, forward.shape[1]), forward.shape[1], pointer(forward), len(forward), forward.shape[1])
 
 

@@ -147,14 +147,11 @@ def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):
     longest = _geometry_gradients(p, at, lens, total, gradient)
     _colour_gradients(p, at, lens, degree, total, basis, gradient)
     store(m, to, select(moves, visits + _ONE, visits))
-    terms = 3 * (degree + 1) * (degree + 1)
-    _step_part(p, at, m, to, 0, MEAN, SCALE, longest * h.rates[0], ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 1, SCALE, ROTATION, broadcast(h.rates[1], LANES), ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 2, ROTATION, OPACITY, broadcast(h.rates[2], LANES), ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 3, OPACITY, HARMONICS, broadcast(h.rates[3], LANES), ahead, correction, moves, h, gradient)
-    _step_part(p, at, m, to, 4, HARMONICS, HARMONICS + 3, broadcast(h.rates[4], LANES), ahead, correction, moves, h, gradient)
-    if degree > 0:
-        _step_part(p, at, m, to, 5, HARMONICS + 3, HARMONICS + terms, broadcast(h.rates[5], LANES), ahead, correction, moves, h, gradient)
+    bounds = (MEAN, SCALE, ROTATION, OPACITY, HARMONICS, HARMONICS + 3, HARMONICS + 3 * (degree + 1) * (degree + 1))
+    for part in range(PARTS):  # one call: with literal numbers each would be compiled by itself
+        if bounds[part + 1] > bounds[part]:
+            rate = longest * h.rates[0] if part == 0 else broadcast(h.rates[part], LANES)
+            _step_part(p, at, m, to, part, bounds[part], bounds[part + 1], rate, ahead, correction, moves, h, gradient)
     for n in range(3):
         row = at + 16 * (SCALE + n)
         store(p, row, minimum(maximum(load(p, row, LANES), h.least), h.greatest))

@@ -103,7 +103,8 @@ def render_batch(  # type: ignore[no-untyped-def]
             cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointer(views.direction), views.direction_rate,
             pointer(views.min_distance), pointer(views.density_scale), views.step, views.degree,
         )  # fmt: skip
-        _render_blocks(worker, threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
+        # The index is of another type where numba infers types than where it runs: as it is, the function would be compiled for both.
+        _render_blocks(np.int64(worker), threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
     rows, columns = BLOCK * tile[0], BLOCK * tile[1]
     return progress[:threads, 0].min() >= (height + rows - 1) // rows * ((width + columns - 1) // columns)
 
