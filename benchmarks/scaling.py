@@ -28,6 +28,7 @@ from types import FrameType
 from typing import Any
 
 from benchmarks.machine import processor
+from pipeline.executors.cores import VARIABLES
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = tuple(str(ROOT / name) + os.sep for name in ("pipeline", "stages", "efficientnerf", "workflows"))
@@ -35,7 +36,6 @@ INTERVAL = 0.005  # seconds between two looks
 CORES = (4, 8, 16, 64)
 STAGES = ("poses", "train", "bake", "mesh", "splats", "evaluate", "turntable", "points")
 SHOWN = 12  # functions of a stage
-THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
 def serial_seconds(one: float, two: float) -> float:
@@ -116,7 +116,7 @@ def triad(cores: int) -> float:
 
 def _apart(arguments: list[str], cores: int) -> Any:
     """What this program answers in a process on so many cores."""
-    environment = {**os.environ, **dict.fromkeys(THREADS, str(cores)), "ENERF_PRECOMPILE": "off"}
+    environment = {**os.environ, **dict.fromkeys(VARIABLES, str(cores)), "ENERF_PRECOMPILE": "off"}
     command = [sys.executable, "-m", "benchmarks.scaling", *arguments, "--cores", str(cores)]
     done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True)
     return json.loads(done.stdout.splitlines()[-1])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from pipeline.executors.local import cores
+from pipeline.executors.cores import cores
 
 T = TypeVar("T")
 R = TypeVar("R")

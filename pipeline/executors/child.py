@@ -27,6 +27,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+from pipeline.executors.cores import VARIABLES
 from pipeline.text import printable
 
 Event = dict[str, Any]
@@ -318,7 +319,7 @@ def _stopped_result() -> Event:
 
 def _environment(cores: int, gpus: tuple[int, ...]) -> dict[str, str]:
     """That of a child: numerical libraries compute on its cores, CUDA sees its devices."""
-    found = {**os.environ, "OMP_NUM_THREADS": str(cores), "NUMBA_NUM_THREADS": str(cores), "OPENCV_FOR_THREADS_NUM": str(cores)}
+    found = {**os.environ, **dict.fromkeys(VARIABLES, str(cores))}
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     names = [name for name in visible.split(",") if name]
     found["CUDA_VISIBLE_DEVICES"] = ",".join(names[gpu] if gpu < len(names) else str(gpu) for gpu in gpus)

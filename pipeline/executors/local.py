@@ -13,6 +13,7 @@ import sys
 import time
 from dataclasses import dataclass
 
+from pipeline.executors.cores import cores
 from pipeline.executors.memory import give_back_freed
 from pipeline.stage import Job, Stage
 
@@ -56,11 +57,6 @@ def execute_alone(stage: Stage, job: Job) -> Usage:
 def cpu_seconds() -> float:
     """User and system time of this process and of its children that have ended."""
     return sum(os.times()[:4])
-
-
-def cores() -> int:
-    """CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _reset_peak() -> None:

@@ -16,9 +16,11 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pipeline.errors import UsageError
+from pipeline.executors.cgroups import cgroup_folders, first_number
+from pipeline.executors.cores import affinity
 from pipeline.text import printable
 
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
@@ -69,9 +71,8 @@ def usable_memory(root: Path = Path("/")) -> Limit | None:
 
     root  where /proc and /sys lie, for tests
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limits = [Limit(int((1 - KEPT_BACK) * limit.bytes), limit.whose) for limit in (*_machine(root), *_cgroups(root))]
-    limits += _rlimits(cores)
+    limits += _rlimits(affinity())
     return min(limits, key=lambda limit: limit.bytes, default=None)
 
 
@@ -84,8 +85,8 @@ def available_now(root: Path = Path("/")) -> int | None:
     if own is None or free is None:
         return None
     found = own + free
-    for folder, _ in _cgroup_folders(root):
-        limit, used = _first_number(folder, _LIMITS), _first_number(folder, ("memory.current", "memory.usage_in_bytes"))
+    for folder, _ in cgroup_folders(root, "memory"):
+        limit, used = first_number(folder, _LIMITS), first_number(folder, ("memory.current", "memory.usage_in_bytes"))
         if limit is not None and used is not None and limit < MOST:
             cached = sum(_statistic(folder / "memory.stat", name) for name in ("inactive_file", "active_file"))
             found = min(found, own + max(0, limit - used + cached))
@@ -119,38 +120,10 @@ def _machine(root: Path) -> Iterator[Limit]:
 
 def _cgroups(root: Path) -> Iterator[Limit]:
     """The limits of the control groups that the process is in, and of those around them, which hold for it too."""
-    for folder, name in _cgroup_folders(root):
-        limit = _first_number(folder, _LIMITS)
+    for folder, name in cgroup_folders(root, "memory"):
+        limit = first_number(folder, _LIMITS)
         if limit is not None and limit < MOST:
             yield Limit(limit, f"the control group {printable(name)}")
-
-
-def _cgroup_folders(root: Path) -> Iterator[tuple[Path, str]]:
-    """(folder, name) of each control group of this process that memory is limited by, the innermost first.
-
-    A line of /proc/self/cgroup is `number:controllers:/path`. In version 2 (number 0, no controllers) all are mounted at one place, /sys/fs/cgroup, or
-    `unified` in it together with version 1; in version 1 those of memory at `memory`. Within a container the path may be that of the host, and the
-    container's own group the root of the mount; so the root is always among them.
-    """
-    try:
-        lines = (root / "proc/self/cgroup").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = ["0::/"]
-    for line in lines:
-        number, _, rest = line.partition(":")
-        controllers, _, path = rest.partition(":")
-        if "memory" in controllers.split(","):
-            mounts = ["sys/fs/cgroup/memory"]
-        elif number == "0" and not controllers:
-            mounts = ["sys/fs/cgroup", "sys/fs/cgroup/unified"]
-        else:
-            continue
-        inner = PurePosixPath("/", path)
-        if ".." in inner.parts:  # the group of another namespace
-            inner = PurePosixPath("/")
-        for name in (inner, *inner.parents):
-            for mount in mounts:
-                yield root / mount / name.relative_to("/"), str(name)
 
 
 def _rlimits(cores: int) -> list[Limit]:
@@ -174,14 +147,6 @@ def _field(path: Path, name: str) -> int | None:
             key, _, value = line.partition(":")
             if key == name:
                 return int(value.split()[0]) * 1024
-    return None
-
-
-def _first_number(folder: Path, names: tuple[str, ...]) -> int | None:
-    """The number in the first file that holds one; "max" is none."""
-    for name in names:
-        with contextlib.suppress(OSError, ValueError):
-            return int((folder / name).read_text(encoding="ascii", errors="replace")[:32])
     return None
 
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from pipeline.executors.local import cores
+from pipeline.executors.cores import cores
 from stages.cores import count_cores, in_order
 
 

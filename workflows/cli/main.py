@@ -12,6 +12,7 @@ from importlib import import_module
 
 import click
 
+from pipeline.executors.cores import keep_to_quota
 from workflows.cli.failures import report_failure
 from workflows.cli.output import exit_code, watched
 from workflows.workflow import Workflow
@@ -78,6 +79,7 @@ def main(arguments: Sequence[str] | None = None, workflow: Workflow | None = Non
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     as_json, debug = "--json" in given, "--debug" in given
+    keep_to_quota()
     with watched(debug=debug) as out:
         try:
             result = enerf.main(args=given, prog_name="enerf", standalone_mode=False, obj=workflow)

@@ -11,12 +11,13 @@ from typing import Any
 import click
 
 from pipeline.errors import PipelineError, UsageError
-from pipeline.executors.local import cores, execute_alone
+from pipeline.executors.local import execute_alone
 from pipeline.executors.side_by_side import SideBySide
 from pipeline.library_output import kept_in, warnings_for_users
 from pipeline.run import Run
 from pipeline.runner import run_stages
 from pipeline.stage import Stage, settings_from
+from stages.cores import count_cores
 from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
 from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_option, quiet_option, set_option, workflow
@@ -137,7 +138,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
 
 def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextManager[SideBySide | None]:
     """What runs stages at the same time; on CUDA, or with one core, nothing does."""
-    jobs = min(MOST_JOBS, cores()) if jobs is None else jobs
+    jobs = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     if jobs < 2 or device != "cpu":
         return nullcontext()
     settings: dict[str, Any] = {stage.name: settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name) for stage in workflow().stages}
@@ -147,7 +148,7 @@ def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextMan
             return workflow().memory(stage.name, run.path, tuple(run.sources.values()), settings, device)
         return None
 
-    return SideBySide(workflow().child, jobs, cores(), need)
+    return SideBySide(workflow().child, jobs, count_cores(), need)
 
 
 def _check_stages(selection: dict[str, Any]) -> None:

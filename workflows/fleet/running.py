@@ -11,8 +11,8 @@ from typing import Any
 
 from pipeline import files
 from pipeline.errors import BadInput, CorruptArtifact, RunLocked
+from pipeline.executors.cores import cores
 from pipeline.executors.dask import DaskWorkers
-from pipeline.executors.local import cores
 from pipeline.executors.memory import Limit
 from pipeline.executors.processes import Processes
 from pipeline.failures import cannot_write

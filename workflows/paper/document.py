@@ -21,6 +21,7 @@ from typing import Any
 import torch
 
 from pipeline.errors import BadInput, UsageError
+from pipeline.executors.cores import affinity
 from pipeline.files import write_atomically
 from stages.figures.plots import curve, with_palette
 from workflows.paper import tables
@@ -104,8 +105,7 @@ def hardware(device: str) -> dict[str, Any]:
         name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
     except OSError:
         pass
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    found: dict[str, Any] = {"processor": name, "cores": cores, "device": device}
+    found: dict[str, Any] = {"processor": name, "cores": affinity(), "device": device}
     if hasattr(os, "getloadavg"):
         found["load"] = [round(x, 2) for x in os.getloadavg()]
     if device == "cuda":

@@ -13,7 +13,8 @@ from typing import Any
 
 from efficientnerf.backends import kernel_cache
 from pipeline.executors.child import command_for
-from pipeline.executors.local import Usage, cores
+from pipeline.executors.cores import VARIABLES, cores
+from pipeline.executors.local import Usage
 from pipeline.executors.memory import Limit, limit_for
 from pipeline.runner import Executor
 from pipeline.stage import Job, Stage
@@ -25,7 +26,6 @@ USUAL = "preview"  # preset
 SWITCH = "ENERF_PRECOMPILE"  # off: kernels are compiled when they are needed
 PATIENCE = 5.0  # seconds that the process has to end
 MEMORY = 4 << 30  # bytes that a run has to have: the other process takes up to a third of it
-THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 # Over the preset tiny: what no kernel depends on, and takes long.
@@ -95,7 +95,7 @@ def start(settings: Table, *, detached: bool = False) -> subprocess.Popen[bytes]
     small = small_settings(settings)
     if os.environ.get(SWITCH) == "off" or stamp_of(small).exists():
         return None
-    environment = {**os.environ, **dict.fromkeys(THREADS, "1"), REQUEST: json.dumps({"settings": small, "detached": detached})}
+    environment = {**os.environ, **dict.fromkeys(VARIABLES, "1"), REQUEST: json.dumps({"settings": small, "detached": detached})}
     streams: dict[str, Any] = {"stdin": subprocess.DEVNULL if detached else subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     # A session of its own would have as much of the processors as ours where Linux groups processes by session; a group of its own hears no Ctrl-C.
     where: dict[str, Any] = {"start_new_session": True} if detached else {"process_group": 0}
