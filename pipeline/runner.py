@@ -139,7 +139,8 @@ class _Runner:
                 ready = [stage for stage in waiting if not {each.name for each in waiting} & set(stage.needs)]
                 current = ready[0].name
                 self.safe_point()
-                outcomes += self._together(ready, forced) if self._are_admitted(ready, forced) else [self.one(ready[0], forced=current in forced)]
+                together = self._are_admitted(ready, forced, sum(outcome.seconds for outcome in outcomes))
+                outcomes += self._together(ready, forced) if together else [self.one(ready[0], forced=current in forced)]
                 waiting = [stage for stage in waiting if stage.name not in {outcome.stage for outcome in outcomes}]
         except (Interrupted, KeyboardInterrupt) as error:
             raise self._interrupted(error, current, go_on(current)) from error
@@ -150,9 +151,9 @@ class _Runner:
         order = [stage.name for stage in chosen]
         return sorted(outcomes, key=lambda outcome: order.index(outcome.stage))
 
-    def _are_admitted(self, ready: Sequence[Stage], forced: Collection[str]) -> bool:
-        """Whether these run at the same time: more than one has to run, and each has enough memory in a share of it."""
-        if self.beside is None or self.beside.jobs < 2 or len(ready) < 2:
+    def _are_admitted(self, ready: Sequence[Stage], forced: Collection[str], seconds: float) -> bool:
+        """Whether these run at the same time: it is worth it after so many seconds, more than one has to run, and each has enough memory in a share of it."""
+        if self.beside is None or self.beside.jobs < 2 or len(ready) < 2 or seconds < self.beside.least:
             return False
         stale = [stage for stage in ready if stage.name in forced or not decide(stage, self.run, self.hashes).fresh]
         if len(stale) < 2 or self.memory is None:

@@ -252,8 +252,9 @@ def _judged(hit: Hit, child: Child, began: bool, last: str) -> list[str]:
     done = child.code == 0 and summary.get("ok") is True
     all_done = last in child.seconds or any(event.get("event") == "stage_skipped" and event["stage"] == last for event in child.events)
     default = not began or all_done  # signals have their usual effect before the engine listens, and after
+    alone = child.code == 3 and "its process was ended by SIGKILL" in child.errors  # that of a stage which ran beside others
     good = {
-        "KILL": child.code == -signal.SIGKILL or (done and hit.moment == "time"),  # it may end between the look at it and the signal
+        "KILL": child.code == -signal.SIGKILL or alone or (done and hit.moment == "time"),  # it may end between the look at it and the signal
         "TERM": child.code == 143 or done or (default and child.code == -signal.SIGTERM),
         "INT": child.code == 130 or done or (default and child.code == -signal.SIGINT),
         "INT INT": child.code in (130, -signal.SIGINT) or done,

@@ -52,7 +52,7 @@ def make(kind: str, folder: Path, photographs: int = 6) -> Source:
         place.mkdir(parents=True)
         for path in sorted(PHOTOGRAPHS.glob("*.jpg"))[:photographs]:
             shutil.copyfile(path, place / path.name)
-        return Source(kind, place, options())
+        return Source(kind, place, (*options(), "--jobs", "2"))  # stages side by side, which so small a run would not have
     if kind == "llff":
         write_scene(recipes()["window"], place, {"train": 6, "val": 0, "test": 2}, 48, 1)
         (place / "transforms.json").unlink()

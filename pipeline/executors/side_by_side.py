@@ -27,12 +27,14 @@ class SideBySide:
     jobs    stages at a time
     cores   that all of them together may use
     need    stage -> bytes that it takes at its peak; None: not known
+    least   seconds that the stages before have taken for it to be worth it: each child takes some to begin
     """
 
-    def __init__(self, module: str, jobs: int, cores: int, need: Callable[[Stage], int | None]) -> None:
+    def __init__(self, module: str, jobs: int, cores: int, need: Callable[[Stage], int | None], least: float = 0.0) -> None:
         self.jobs = jobs
         self.cores = cores
         self.need = need
+        self.least = least
         self._children = Children(module, jobs)
         self._lock = threading.Lock()
         self._working: set[str] = set()

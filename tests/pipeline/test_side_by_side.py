@@ -133,6 +133,16 @@ def test_they_run_one_after_another_where_the_memory_is_too_little(tmp_path: Pat
     assert {read_manifest(run.folder(name)).facts["memory"] for name in MIDDLE} == {50 if together else 100}
 
 
+@pytest.mark.parametrize("least", [0.0, 1e6])
+def test_they_run_at_the_same_time_only_where_the_stages_before_took_long(tmp_path: Path, least: float) -> None:
+    (tmp_path / "place").mkdir()
+    run = make_run(tmp_path / "run", place=tmp_path / "place")
+    with SideBySide(CHILD, 2, 2, lambda stage: 1, least) as sides:
+        run_stages(run, STAGES, beside=sides)
+    ours = {(tmp_path / "place" / name).read_text().split()[0] == str(os.getpid()) for name in MIDDLE}
+    assert ours == {least > 0}
+
+
 def test_a_single_stage_runs_in_this_process(tmp_path: Path) -> None:
     (tmp_path / "place").mkdir()
     run = make_run(tmp_path / "run", place=tmp_path / "place")

@@ -31,6 +31,7 @@ from workflows.report.pages import has_pages, write_pages
 from workflows.report.summary import graded, in_words, summary
 
 MOST_JOBS = 4  # stages that need nothing of each other: mesh, splats, turntable and points
+WORTH_IT = 20.0  # seconds of poses, training and baking; a child takes two to five to import what a stage needs
 GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 
 
@@ -138,6 +139,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
 
 def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextManager[SideBySide | None]:
     """What runs stages at the same time; on CUDA, or with one core, nothing does."""
+    least = 0.0 if jobs is not None else WORTH_IT
     jobs = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     if jobs < 2 or device != "cpu":
         return nullcontext()
@@ -148,7 +150,7 @@ def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextMan
             return workflow().memory(stage.name, run.path, tuple(run.sources.values()), settings, device)
         return None
 
-    return SideBySide(workflow().child, jobs, count_cores(), need)
+    return SideBySide(workflow().child, jobs, count_cores(), need, least)
 
 
 def _check_stages(selection: dict[str, Any]) -> None:
