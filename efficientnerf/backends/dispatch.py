@@ -40,6 +40,8 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
     "encode": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "hash_network": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "update_occupancy_maximum": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
+    "random_cells": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
+    "points_in_cells": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
     "adam": {"torch": "backends.torch.adam", "numba": "backends.numba.operations", "triton": "backends.triton.adam"},
     "ray_directions": {"torch": "backends.torch.rays", "numba": "backends.numba.operations"},
     "tree_rays": {"numba": "backends.numba.operations", "triton": "backends.triton.tree"},
@@ -152,9 +154,19 @@ def hash_network(
     return implementation("hash_network", backend_of(points, table))(points, table, levels, weights, offset, precision, gradient)
 
 
-def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str) -> None:
+def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str, cell: Tensor | None = None) -> None:
     """See `efficientnerf.backends.torch.occupancy.update_occupancy_maximum`."""
-    implementation("update_occupancy_maximum", backend_of(values, point, raw))(values, point, raw, activation)
+    implementation("update_occupancy_maximum", backend_of(values, point, raw))(values, point, raw, activation, cell)
+
+
+def random_cells(values: Tensor, threshold: float, count: int, seed: int) -> Tensor:
+    """See `efficientnerf.backends.torch.occupancy.random_cells`; the numbers drawn are those of the backend."""
+    return implementation("random_cells", backend_of(values))(values, threshold, count, seed)
+
+
+def points_in_cells(cell: Tensor, side: int, seed: int) -> Tensor:
+    """See `efficientnerf.backends.torch.occupancy.points_in_cells`; the numbers drawn are those of the backend."""
+    return implementation("points_in_cells", "numba" if cell.device.type == "cpu" else "torch")(cell, side, seed)
 
 
 def adam(

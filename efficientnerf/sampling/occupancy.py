@@ -20,8 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from efficientnerf.backends import transfer
-from efficientnerf.backends.transfer import to_device
+from efficientnerf.backends import dispatch, transfer
+
+POINTS_SEED = 1  # what differs between the seeds of random cells and of the points in them
 
 
 @dataclass
@@ -128,35 +129,13 @@ def apply_decay(voxels: DensityVoxels) -> None:
         voxels.values.mul_(max(voxels.decay, MIN_DECAY))
 
 
-def sweep_cells(voxels: DensityVoxels, part: int, parts: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def sweep_cells(voxels: DensityVoxels, part: int, parts: int, seed: int) -> tuple[Tensor, Tensor]:
     """Every `parts`-th cell from the `part`-th on, and a random point in each."""
     cell = torch.arange(part % parts, voxels.side**3, parts, device=voxels.values.device)
-    return cell, _point_in(cell, voxels.side, generator)
+    return cell, dispatch.points_in_cells(cell, voxels.side, seed)
 
 
-def _point_in(cell: Tensor, side: int, generator: torch.Generator) -> Tensor:
-    corner = torch.stack([cell // (side * side), cell // side % side, cell % side], dim=1)
-    return (corner + to_device(torch.rand(len(cell), 3, generator=generator), cell.device)) / side
-
-
-def _chosen_on_device(valid: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count,) cells, half anywhere and half among the valid (D^3,) if there are any; their number stays on the device."""
-    chance = to_device(torch.rand(count, generator=generator, dtype=torch.float64), valid.device)
-    anywhere = (chance * len(valid)).long()
-    before = torch.cumsum(valid, dim=0)
-    among = torch.searchsorted(before, (chance * before[-1]).long(), right=True).clamp(max=len(valid) - 1)
-    first_half = torch.arange(count, device=valid.device) % 2 == 0
-    return torch.where(first_half | (before[-1] == 0), anywhere, among)
-
-
-def random_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Random cells (count,), half anywhere and half among the valid, and a random point in each (count, 3), grid coordinates."""
-    flat = voxels.values.view(-1)
-    if transfer.is_on_device(flat):
-        cell = _chosen_on_device(flat > voxels.threshold, count, generator)
-        return cell, _point_in(cell, voxels.side, generator)
-    anywhere = torch.randint(len(flat), (count - count // 2,), generator=generator).to(flat.device)
-    valid = torch.nonzero(flat > voxels.threshold).squeeze(1)
-    pick = torch.randint(max(len(valid), 1), (count // 2,), generator=generator).to(flat.device)
-    cell = torch.cat([anywhere, valid[pick]]) if len(valid) else anywhere
-    return cell, _point_in(cell, voxels.side, generator)
+def random_cells(voxels: DensityVoxels, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Random cells (N,), half anywhere and half among the valid, and a random point in each (N, 3), grid coordinates."""
+    cell = dispatch.random_cells(voxels.values, voxels.threshold, count, seed)
+    return cell, dispatch.points_in_cells(cell, voxels.side, seed ^ POINTS_SEED)

@@ -12,8 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import map_coordinates
 
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.surface.agreement import OPAQUE, AssetView
@@ -91,4 +92,5 @@ def _distance_inside(mask: np.ndarray) -> np.ndarray | None:
     """(H, W) float32 pixels from the edge of a silhouette, positive inside; None where it has no edge."""
     if mask.all() or not mask.any():
         return None
-    return np.where(mask, distance_transform_edt(mask) - 0.5, 0.5 - distance_transform_edt(~mask)).astype(np.float32)
+    inside, outside = (cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (mask, ~mask))
+    return np.asarray(np.where(mask, inside - 0.5, 0.5 - outside), np.float32)

@@ -37,14 +37,14 @@ def update_occupancy(m: Model, outputs: RayOutputs, number: int, rng: np.random.
 
 def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> None:
     """Decay the voxels, and query the coarse field at some of them: all in turn in the warm-up, then random ones."""
-    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    seed = int(rng.integers(2**62))
     apply_decay(m.voxels)
     if m.settings.occupancy_update_fraction == 0:
         return
     if number <= m.settings.occupancy_warmup_steps:
-        cell, point = sweep_cells(m.voxels, number // m.settings.occupancy_update_interval, SWEEP_PARTS, generator)
+        cell, point = sweep_cells(m.voxels, number // m.settings.occupancy_update_interval, SWEEP_PARTS, seed)
     else:
-        cell, point = random_cells(m.voxels, int(m.settings.occupancy_update_fraction * m.voxels.side**3), generator)
+        cell, point = random_cells(m.voxels, int(m.settings.occupancy_update_fraction * m.voxels.side**3), seed)
     for begin in range(0, len(cell), BLOCK):
         part = point[begin : begin + BLOCK]
         update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + BLOCK])
@@ -52,8 +52,8 @@ def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> N
 
 def update_at_points(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:
     """Update the density voxels with raw densities (N,) at points (N, 3) in grid coordinates; `cell` (N,), where it is known, and `count` as for `update`."""
-    if cell is None and count is None and m.voxels.rule == "maximum":
-        dispatch.update_occupancy_maximum(m.voxels.values, point, raw, m.coarse.activation)
+    if count is None and m.voxels.rule == "maximum":
+        dispatch.update_occupancy_maximum(m.voxels.values, point, raw, m.coarse.activation, cell)
         return
     cell = cell_of(point, m.voxels.side) if cell is None else cell
     update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.coarse.activation), count)

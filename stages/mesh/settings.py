@@ -59,7 +59,7 @@ def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
 
 STAGE = Stage(
     name="mesh",
-    version=15,
+    version=16,
     settings=MeshSettings,
     needs=needs_of(MeshInputs),
     run=ByName("stages.mesh.run:run"),

@@ -13,6 +13,7 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import RayBundle, SampleColumns
 from efficientnerf.backends.numba import adam as kernel
 from efficientnerf.backends.numba import compositing, hash_grid, mlp, occupancy, rays, sampling
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.sampling import Box
 from efficientnerf.backends.numba.tree import nearest
 from efficientnerf.backends.numba.tree.rendering import render_rays
@@ -52,8 +53,22 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 
-def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str) -> None:
-    occupancy.update_occupancy(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
+def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str, cell: Tensor | None = None) -> None:
+    if cell is None:
+        cell = torch.empty(len(point), dtype=torch.int32)
+        occupancy.cells_of_points(_array(point), values.shape[0], cell.numpy())
+    occupancy.update_cells(_array(cell.int()), _array(raw), activation == "exp", values.view(-1).numpy(), numba.get_num_threads())
+
+
+def random_cells(values: Tensor, threshold: float, count: int, seed: int) -> Tensor:
+    cell = np.empty(count, np.int32)
+    return torch.from_numpy(cell[: occupancy.random_cells(values.view(-1).numpy(), np.float32(threshold), np.uint64(seed), count - count // 2, cell)])
+
+
+def points_in_cells(cell: Tensor, side: int, seed: int) -> Tensor:
+    point = torch.empty(len(cell), 3)
+    occupancy.points_in_cells(_array(cell.int()), side, np.uint64(seed), point.numpy())
+    return point
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:

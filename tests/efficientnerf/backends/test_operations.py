@@ -21,6 +21,7 @@ from efficientnerf.backends.dispatch import OPERATIONS, Backend, backend_of, imp
 from efficientnerf.backends.torch.hash_grid import HashLevels
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import space_from
+from efficientnerf.sampling.occupancy import cell_of
 from efficientnerf.sampling.samples import Samples
 from tests import reference
 from tests.efficientnerf.bundles import bundle, in_float32
@@ -264,8 +265,8 @@ def pivotal_samples_case(contracted: bool, per_pivot: int) -> Case:
     return Case(call, loop, inputs, atol=2e-5)
 
 
-def update_occupancy_case(activation: str) -> Case:
-    """Points beyond the faces, too, and masked voxels."""
+def update_occupancy_case(activation: str, *, known: bool = False) -> Case:
+    """Points beyond the faces, too, and masked voxels; `known`: with the samples' voxels, their points anywhere."""
     rng, side = np.random.default_rng(0), 5
     values = torch.full((side, side, side), 0.4)
     values.view(-1)[::5] = -math.inf
@@ -274,7 +275,8 @@ def update_occupancy_case(activation: str) -> Case:
 
     def call(update: Operation, values: Tensor, point: Tensor, raw: Tensor) -> list[Tensor]:
         raised = values.clone()
-        update(raised, point, raw, activation)
+        cell = cell_of(point, side)
+        update(raised, *((point.flip(0), raw, activation, cell) if known else (point, raw, activation)))
         return [raised]
 
     def loop(values: np.ndarray, point: np.ndarray, raw: np.ndarray) -> list[np.ndarray]:
@@ -283,6 +285,44 @@ def update_occupancy_case(activation: str) -> Case:
         return [np.reshape(wanted, values.shape)]
 
     return Case(call, loop, inputs)
+
+
+def random_cells_case(valid: int) -> Case:
+    """So many valid voxels, some of them drawn twice. Each backend has random numbers of its own; that each cell lies in its part is the same."""
+    rng, side, count, threshold = np.random.default_rng(0), 5, 41, 0.5
+    values = np.full(side**3, 0.25, np.float32)
+    values[rng.permutation(side**3)[:valid]] = 1.0
+    half = count - count // 2
+
+    def call(draw: Operation, values: Tensor) -> list[Tensor]:
+        cells = draw(values, threshold, count, 7).cpu().long()
+        flat = values.view(-1).cpu()
+        assert cells.tolist() != draw(values, threshold, count, 8).tolist()
+        rank = torch.cumsum(flat > threshold, dim=0)[cells[half:]] - 1  # among the valid
+        off = [torch.arange(len(at)) - (at + 0.5) * len(at) / size for at, size in ((cells[:half], side**3), (rank, max(valid, 1)))]
+        return [off[0], flat[cells[half:]], off[1]]
+
+    def loop(values: np.ndarray) -> list[np.ndarray]:
+        return [np.zeros(half), np.ones(count - half if valid else 0), np.zeros(count - half if valid else 0)]
+
+    return Case(call, loop, {"values": torch.from_numpy(values.reshape(side, side, side))}, atol=1.0 + 0.5 * count / max(valid, 1), rtol=0)
+
+
+def points_in_cells_case() -> Case:
+    """Points of all cells lie in them, and are spread evenly over them."""
+    side = 7
+
+    def call(draw: Operation, cell: Tensor) -> list[Tensor]:
+        points = draw(cell.long(), side, 3)
+        assert not torch.equal(points, draw(cell.long(), side, 4))
+        within = points.double().cpu() * side % 1
+        deciles = torch.stack([torch.histc(within[:, axis], 10, 0, 1) for axis in range(3)]) / len(cell)
+        return [cell_of(points.cpu(), side).float() / side**3, deciles * 1e-5]
+
+    def loop(cell: np.ndarray) -> list[np.ndarray]:
+        return [cell / side**3, np.full((3, 10), 1e-6)]
+
+    return Case(call, loop, {"cell": torch.arange(side**3).repeat(20).float()}, atol=1e-7, rtol=1e-6)
 
 
 def ray_directions_case(stride: int) -> Case:
@@ -338,7 +378,10 @@ CASES: dict[str, dict[str, Callable[[], Case]]] = {
     "composite": {f"{a}-{d}": lambda a=a, d=d: composite_case(a, d) for a, d in (("exp", 0), ("softplus", 1), ("exp", 2))},  # type: ignore[misc]
     "encode": {"": encode_case},
     "hash_network": {f"{n}": lambda n=n: hash_network_case(n) for n in (1, 2)},  # type: ignore[misc]
-    "update_occupancy_maximum": {a: lambda a=a: update_occupancy_case(a) for a in ("exp", "softplus")},  # type: ignore[misc]
+    "update_occupancy_maximum": {a: lambda a=a: update_occupancy_case(a) for a in ("exp", "softplus")}  # type: ignore[misc]
+    | {"known": lambda: update_occupancy_case("exp", known=True)},
+    "random_cells": {f"{valid}": lambda valid=valid: random_cells_case(valid) for valid in (0, 1, 60)},  # type: ignore[misc]
+    "points_in_cells": {"": points_in_cells_case},
     "adam": {"dense": lambda: adam_case(False), "sparse": lambda: adam_case(True)},
     "ray_directions": {"each": lambda: ray_directions_case(1), "knots": lambda: ray_directions_case(4)},
     "tree_rays": {lookup: lambda lookup=lookup: tree_rays_case(lookup) for lookup in ("trilinear", "nearest")},  # type: ignore[misc]

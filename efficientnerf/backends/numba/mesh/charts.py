@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.tasks import interleaved
 
 INSIDE = 1e-3  # barycentric coordinate from which a sample is inside a face, not on an edge that two faces share
 
@@ -82,7 +83,7 @@ def best_turns(places, begin, turns):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def overlapping(corners, begin, sizes, out):  # type: ignore[no-untyped-def]
     """Marks faces of charts that lie over a face before them in the same chart, at the centres of a grid of unit squares.
 
@@ -91,7 +92,9 @@ def overlapping(corners, begin, sizes, out):  # type: ignore[no-untyped-def]
     sizes    (C, 2) int64 width and height of each chart
     out      (N,) bool
     """
-    for chart in range(len(begin) - 1):
+    charts = len(begin) - 1
+    for task in numba.prange(charts):
+        chart = interleaved(task, charts)
         width, height = sizes[chart]
         taken = np.zeros((height, width), np.bool_)
         for row in range(begin[chart], begin[chart + 1]):
@@ -99,12 +102,15 @@ def overlapping(corners, begin, sizes, out):  # type: ignore[no-untyped-def]
             area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
             if not area > 0.0:
                 continue
+            left, right = max(0, int(np.floor(x.min() - 0.5))), min(width, int(np.ceil(x.max())) + 1)
+            low, high = max(0, int(np.floor(y.min() - 0.5))), min(height, int(np.ceil(y.max())) + 1)
+            least = INSIDE * area
             for again in range(2):
-                for v in range(max(0, int(np.floor(y.min() - 0.5))), min(height, int(np.ceil(y.max())) + 1)):
-                    for u in range(max(0, int(np.floor(x.min() - 0.5))), min(width, int(np.ceil(x.max())) + 1)):
-                        a = ((x[1] - u - 0.5) * (y[2] - v - 0.5) - (x[2] - u - 0.5) * (y[1] - v - 0.5)) / area
-                        b = ((x[2] - u - 0.5) * (y[0] - v - 0.5) - (x[0] - u - 0.5) * (y[2] - v - 0.5)) / area
-                        if a > INSIDE and b > INSIDE and 1.0 - a - b > INSIDE:
+                for v in range(low, high):
+                    for u in range(left, right):
+                        a = (x[1] - u - 0.5) * (y[2] - v - 0.5) - (x[2] - u - 0.5) * (y[1] - v - 0.5)
+                        b = (x[2] - u - 0.5) * (y[0] - v - 0.5) - (x[0] - u - 0.5) * (y[2] - v - 0.5)
+                        if a > least and b > least and area - a - b > least:
                             if again:
                                 taken[v, u] = True
                             elif taken[v, u]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.tasks import interleaved
 
 W, A, B, LENGTH, CONFIDENCE, NEAREST = 0, 1, 2, 3, 4, 5  # channels of a pixel
 CHANNELS = 6
@@ -75,7 +76,8 @@ def fit_planes(depth, opacity, lens, begin, end, radius, band, out):  # type: ig
                     greatest inverse depth of the pixel and its neighbours, zero where all of them are seen through, infinite where one neither is nor is opaque
     """
     height, width = depth.shape
-    for y in numba.prange(begin, end):
+    for task in numba.prange(end - begin):
+        y = begin + interleaved(task, end - begin)
         for x in range(width):
             nearest = 0.0
             for v in range(max(0, y - 1), min(height, y + 2)):
@@ -107,40 +109,41 @@ def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distanc
     weight      (X, Y, Z) float32 sum of the views' confidences; zero where none sees it
     """
     height, width = planes.shape[1], planes.shape[2]
-    for i in numba.prange(wanted.shape[0]):
-        for j in range(wanted.shape[1]):
-            for k in range(wanted.shape[2]):
-                if wanted[i, j, k] == 0:
+    rows = wanted.shape[1]
+    for task in numba.prange(wanted.shape[0] * rows):
+        i, j = divmod(interleaved(task, wanted.shape[0] * rows), rows)
+        for k in range(wanted.shape[2]):
+            if wanted[i, j, k] == 0:
+                continue
+            px, py, pz = first[0] + (low[0] + i + 0.5) * voxel, first[1] + (low[1] + j + 0.5) * voxel, first[2] + (low[2] + k + 0.5) * voxel
+            total = sums = behind = 0.0
+            for c in range(len(cameras)):
+                m = cameras[c]
+                z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+                if not z > 1e-6:
                     continue
-                px, py, pz = first[0] + (low[0] + i + 0.5) * voxel, first[1] + (low[1] + j + 0.5) * voxel, first[2] + (low[2] + k + 0.5) * voxel
-                total = sums = behind = 0.0
-                for c in range(len(cameras)):
-                    m = cameras[c]
-                    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
-                    if not z > 1e-6:
-                        continue
-                    x, y = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3], m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
-                    u, v = lenses[c, 0] * x / z + lenses[c, 2], lenses[c, 1] * y / z + lenses[c, 3]
-                    if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
-                        continue
-                    column, row = int(u), int(v)
-                    pixel = planes[c, row, column]
-                    if pixel[NEAREST] == 0.0 or 1.0 / pixel[NEAREST] - z > truncation * voxel:
-                        total, sums = total + 1.0, sums + truncation
-                        continue
-                    if pixel[CONFIDENCE] <= 0.0:
-                        continue
-                    across = z * (pixel[W] + pixel[A] * (u - column - 0.5) + pixel[B] * (v - row - 0.5))
-                    cosine = across / (pixel[LENGTH] * np.sqrt(x * x + y * y + z * z))
-                    if cosine < STEEPEST:
-                        continue
-                    s = (1.0 - across) / (pixel[LENGTH] * voxel)
-                    if s <= -truncation:
-                        behind += pixel[CONFIDENCE] if s > -DEEPEST * truncation else 0.0
-                    elif s <= truncation:
-                        share = pixel[CONFIDENCE] * cosine * (1.0 if s >= 0.0 else 1.0 + s / truncation)
-                        total, sums = total + share, sums + share * s
-                if wanted[i, j, k] == FILLED and behind > ENOUGH and total < 0.1 * behind:
-                    total, sums = total + behind, sums - truncation * behind
-                if total > 0.0:
-                    distance[i, j, k], weight[i, j, k] = sums / total, total
+                x, y = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3], m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
+                u, v = lenses[c, 0] * x / z + lenses[c, 2], lenses[c, 1] * y / z + lenses[c, 3]
+                if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
+                    continue
+                column, row = int(u), int(v)
+                pixel = planes[c, row, column]
+                if pixel[NEAREST] == 0.0 or 1.0 / pixel[NEAREST] - z > truncation * voxel:
+                    total, sums = total + 1.0, sums + truncation
+                    continue
+                if pixel[CONFIDENCE] <= 0.0:
+                    continue
+                across = z * (pixel[W] + pixel[A] * (u - column - 0.5) + pixel[B] * (v - row - 0.5))
+                cosine = across / (pixel[LENGTH] * np.sqrt(x * x + y * y + z * z))
+                if cosine < STEEPEST:
+                    continue
+                s = (1.0 - across) / (pixel[LENGTH] * voxel)
+                if s <= -truncation:
+                    behind += pixel[CONFIDENCE] if s > -DEEPEST * truncation else 0.0
+                elif s <= truncation:
+                    share = pixel[CONFIDENCE] * cosine * (1.0 if s >= 0.0 else 1.0 + s / truncation)
+                    total, sums = total + share, sums + share * s
+            if wanted[i, j, k] == FILLED and behind > ENOUGH and total < 0.1 * behind:
+                total, sums = total + behind, sums - truncation * behind
+            if total > 0.0:
+                distance[i, j, k], weight[i, j, k] = sums / total, total
