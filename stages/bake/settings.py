@@ -122,7 +122,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=23,
+    version=24,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=ByName("stages.bake.run:run"),

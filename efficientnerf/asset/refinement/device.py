@@ -26,7 +26,7 @@ from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
 from efficientnerf.backends.triton.tree_steps import Neighbours, step
 from efficientnerf.training.device_pixels import DevicePixels
-from efficientnerf.training.patches import PatchGrid
+from efficientnerf.training.patches import Patches, PatchGrid
 from efficientnerf.training.readback import LAG
 
 
@@ -128,12 +128,13 @@ def values_of(tree: NerfTree, device: torch.device) -> tuple[DeviceGrid, Tensor,
     return device_grid(tree, device), torch.from_numpy(density).to(device), torch.from_numpy(sh).to(device)
 
 
-def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> float:
-    """Sum over the rays of the bundles."""
+def total_loss(tree: NerfTree, targets: Targets, patches: Iterable[Patches], angle: float) -> float:
+    """Sum of the losses of the rays of patches, which are rendered one by one, whatever the `angle`; objects over the background of the scene."""
     assert isinstance(targets.pixels, DevicePixels)
     grid, density, sh = values_of(tree, targets.pixels.device)
     total = torch.zeros((), dtype=torch.float64, device=density.device)
-    for origins, directions, wanted in bundles:
+    for part in patches:
+        origins, directions, wanted = targets.of(part.pixels, constant_background=True)
         loss, _, _ = tree_gradients.loss_and_gradients(*tree_gradients.forward(grid, rays_in_voxels(tree, origins, directions), density, sh), wanted)
         total += loss.double().sum()
     return float(total)

@@ -20,9 +20,11 @@ from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.dispatch import fitting
+from efficientnerf.training.patches import Patches, PatchGrid
 
 PATCH_SIDE = 4  # docs/experiments/tree-training-kernels.md
-WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measured the rays leave records
+WEIGHT_RAYS = 2**16  # of a bundle
+ERROR_PATCHES = 2**10  # of a bundle; the rays leave records
 
 
 def optimise(
@@ -47,10 +49,26 @@ def optimise(
 
 
 def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
-    """Mean squared error of a channel over `count` training pixels drawn by `seed`; objects over the background of the scene."""
+    """Mean squared error of a channel over patches of training pixels, about `count` in all, drawn by `seed`; objects over the background of the scene.
+
+    Rays of a patch meet the same voxels: in unbounded scenes they take a tenth of the time of as many single rays.
+    """
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
-    bundles = (targets.draw(min(ERROR_RAYS, count - begin), rng, constant_background=True) for begin in range(0, count, ERROR_RAYS))
-    return float(fitting(targets.backend).total_loss(tree, targets, bundles)) / (3 * count)
+    grid = PatchGrid(targets.host_pixels, PATCH_SIDE)
+    usable = np.arange(len(grid)) if grid.usable_tiles is None else np.flatnonzero(grid.usable_tiles)
+    number, drawn = max(1, round(count / grid.mean_pixels)), 0
+
+    def patches() -> Iterator[Patches]:
+        nonlocal drawn
+        while not drawn:  # where pixels are masked, patches may have none
+            for begin in range(0, number, ERROR_PATCHES):
+                part = grid.drawn_from(usable[rng.integers(len(usable), size=min(ERROR_PATCHES, number - begin))], rng)
+                drawn += len(part.pixels)
+                if len(part.pixels):
+                    yield part
+
+    total = fitting(targets.backend).total_loss(tree, targets, patches(), grid.angle)
+    return float(total) / (3 * drawn)
 
 
 def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progress: Callable[[int, int], None] | None = None) -> np.ndarray:

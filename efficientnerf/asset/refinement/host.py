@@ -22,7 +22,7 @@ from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, p
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from efficientnerf.backends.numba.tree_training.steps import step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
-from efficientnerf.training.patches import PatchGrid
+from efficientnerf.training.patches import Patches, PatchGrid
 
 MAX_PACKET_ANGLE = 0.02  # radians across patches whose rays share harmonics; docs/experiments/tree-training-kernels.md
 
@@ -69,13 +69,15 @@ def optimise(
         yield errors.record(drawn, loss) / 3
 
 
-def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> float:
-    """Sum of the losses of the rays of the bundles."""
+def total_loss(tree: NerfTree, targets: Targets, patches: Iterable[Patches], angle: float) -> float:
+    """Sum of the losses of the rays of patches, across which `angle` is that of `PatchGrid`; objects over the background of the scene."""
     cells, buffer, sh = cells_of(tree), RecordBuffer(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
     dense, total = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values), 0.0
-    for origins, directions, wanted in bundles:
+    for part in patches:
+        origins, directions, wanted = targets.of(part.pixels, constant_background=True)
         start, along, bases = in_voxels(tree, origins, directions)
-        loss, _ = gradients.forward_backward(cells, packets_of(len(start)), start, along, bases, dense, sh, wanted, buffer)
+        first = part.first if angle <= MAX_PACKET_ANGLE else packets_of(len(start))
+        loss, _ = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), dense, sh, wanted, buffer)
         total += float(loss.sum())
     return total
 

@@ -19,7 +19,7 @@ from efficientnerf.training.pixels import Pixels
 
 MEAN, VARIANCE = 0.5, 0.25  # of a random background: mean of a channel, and the three channels' variances summed; see `Targets`
 
-Bundle = tuple[Any, Any, RayTargets]  # see `Targets.draw`
+Bundle = tuple[Any, Any, RayTargets]  # see `Targets.of`
 
 
 @dataclass(frozen=True)
@@ -71,15 +71,11 @@ class Targets:
         sent = None if self.environment is None else torch.from_numpy(np.ascontiguousarray(self.environment)).to(device)
         return replace(self, pixels=DevicePixels(self.pixels, device), environment=sent)
 
-    def draw(self, count: int, rng: np.random.Generator, *, constant_background: bool = False) -> tuple[Any, Any, RayTargets]:
-        """Origins (R, 3) and unit directions (R, 3) of `count` random pixels, world frame, and their targets; arrays, or tensors of the device.
+    def of(self, index: np.ndarray, *, constant_background: bool = False) -> tuple[Any, Any, RayTargets]:
+        """Origins (R, 3) and unit directions (R, 3) of pixels `index`, world frame, and their targets; arrays, or tensors of the device.
 
         constant_background  objects are compared over the background of the scene, not over a random one
         """
-        return self.of(self.pixels.choose(count, rng), constant_background=constant_background)
-
-    def of(self, index: np.ndarray, *, constant_background: bool = False) -> tuple[Any, Any, RayTargets]:
-        """`draw` for pixels `index`."""
         bundle: tuple[Any, ...] = self.pixels.rays(index)
         origins, directions, colour = bundle
         ones = colour[:, 0] * 0 + 1

@@ -47,7 +47,6 @@ from stages.train.previews import Previews
 
 CHECKPOINT_SECONDS = 30.0
 ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
-TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
 MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, (6, 15)  # see `usual_steps`
 UNREFINED = 0.1  # of the steps that are usual: with fewer the asset is hardly refined
@@ -173,13 +172,12 @@ def refined(
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets)
-    began = clock()
     before = fit.error(tree, targets, sample, settings.seed)
-    measuring = clock() - began
-    began, timed = clock(), min(sample, TIMED_RAYS)
+    began = clock()
     if seconds is not None:
-        fit.error(tree, targets, timed, settings.seed)  # again: kernels were loaded meanwhile
-    per_ray = (clock() - began) / timed
+        fit.error(tree, targets, sample, settings.seed)  # again: kernels were loaded meanwhile
+    measuring = clock() - began
+    per_ray = measuring / sample
     finish = measuring + FINISH_SECONDS_PER_VOXEL * most
     if plan.layout == "packed":
         weighed = min(max(settings.visibility_rays, most), 4 * len(targets.pixels))

@@ -14,8 +14,8 @@ FINISH_SECONDS_PER_VOXEL = 3e-6  # that the palettes and the file take
 # of one core, and what comes before the first; the steps that tables are fitted in, and what a ray of a step takes, over one whose error is measured.
 PACKING_TRIES, PACKING_EXPECTED = 10, 3
 PACKING_SECONDS_PER_VOXEL, CLUSTERING_SECONDS_PER_VOXEL = 1e-5, 2e-6
-REFIT_STEPS, REFIT_ERRORS, STEP_SECONDS = 64, 8, 3.0
-WEIGHT_SECONDS = 0.5  # that a ray takes which is rendered for voxel weights, over one whose error is measured
+REFIT_STEPS, REFIT_ERRORS, STEP_SECONDS = 64, 8, 1.5
+WEIGHT_SECONDS = 0.8  # that a ray takes which is rendered for voxel weights, over one whose error is measured
 HOLD = WARMUP + TIMED
 
 

@@ -202,7 +202,8 @@ def test_targets_on_the_device_say_the_same(kind: str) -> None:
         if kind == "infinite":
             some.images = np.ascontiguousarray(some.images[:, :3])
         targets = Targets(some, (0.2, 0.5, 0.7), reaches_infinity=kind == "infinite")
-    same = [each.draw(100, np.random.default_rng(1), constant_background=kind == "declared") for each in (targets, targets.sent(DEVICE))]
+    index = some.choose(100, np.random.default_rng(1))
+    same = [each.of(index, constant_background=kind == "declared") for each in (targets, targets.sent(DEVICE))]
     for ours, theirs in zip((*same[1][:2], *same[1][2][:4]), (*same[0][:2], *same[0][2][:4]), strict=True):
         np.testing.assert_allclose(ours.cpu().numpy(), theirs, atol=1e-5 if kind == "photographs" else 2e-6)
         assert theirs.dtype == np.float32
