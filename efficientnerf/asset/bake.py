@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from efficientnerf.backends.numba.bricks import flat_indices, resample_weights, threshold_and_dilate
+from efficientnerf.backends.numba.bricks import coordinates_of, flat_indices, resample_weights, threshold_and_dilate
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
@@ -134,8 +134,7 @@ def chosen_voxels(visibility: Visibility, shape: tuple[int, int, int], brick: in
     flat_indices(into, cells, shape, brick, flat)
     flat.sort()
     index = np.empty((len(flat), 3), np.int32)
-    for axis in (2, 1, 0):
-        flat, index[:, axis] = np.divmod(flat, shape[axis] * brick)
+    coordinates_of(flat, shape[1] * brick, shape[2] * brick, index)
     return index
 
 

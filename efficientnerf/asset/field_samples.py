@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from efficientnerf.asset.bake import Visibility, spread_pixels
-from efficientnerf.backends.numba.bricks import greatest_around, weigh_voxels
+from efficientnerf.backends.numba.bricks import boxes_of_samples, greatest_around, weigh_voxels
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering import environment
@@ -60,6 +60,10 @@ class FieldSamples:
         """World points (n, 3) in the middle of some samples, of which the rays are given."""
         along = self.start[samples] + self.extent[samples] / 2
         return self.origin[self.view[ray]] + along[:, None] * self.direction[ray]
+
+    def rays(self, rays: slice, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of a block of `blocks` the origins and directions (n, 3) of its rays, and the first of their samples in `part` (n + 1,)."""
+        return self.origin[self.view[rays]], self.direction[rays], self.first[rays.start : rays.stop + 1] - part.start
 
     def blocks(self) -> Iterator[tuple[slice, slice]]:
         """Rays and their samples, some of them at a time."""
@@ -129,11 +133,8 @@ def _boxes_of(samples: FieldSamples, boxes: Sequence[np.ndarray]) -> Iterator[tu
     """Rays, and the number of the first box that holds the middle of each of their samples, with its weight, block by block."""
     every = np.stack([np.asarray(box, np.float64) for box in boxes])  # (L, 2, 3)
     for rays, part in samples.blocks():
-        ray = np.repeat(np.arange(rays.start, rays.stop), np.diff(samples.first[rays.start : rays.stop + 1]))
-        point = samples.points(np.arange(part.start, part.stop), ray)
-        box = np.full(len(point), len(boxes))
-        for n in range(len(boxes) - 1, -1, -1):
-            box[((point >= every[n, 0]) & (point < every[n, 1])).all(axis=1)] = n
+        box = np.empty(part.stop - part.start, np.int64)
+        boxes_of_samples(*samples.rays(rays, part), samples.start[part], samples.extent[part], every, box)
         yield rays, box, samples.weight[part]
 
 
@@ -153,8 +154,8 @@ def _grid_visibility(samples: FieldSamples, grid: Grid, hole: np.ndarray, brick:
     for _ in range(2):  # rows are counted, then filled
         for rays, part in samples.blocks():
             values = (samples.start[part], samples.extent[part], samples.weight[part], samples.thickness[part])
-            of_rays = (samples.origin[samples.view[rays]], samples.direction[rays], samples.first[rays.start : rays.stop + 1] - part.start)
-            rows = weigh_voxels(*of_rays, *values, float(threshold), shape, float(voxel), np.asarray(low, np.float64), hole, brick, row_of, greatest, rows)
+            place = shape, float(voxel), np.asarray(low, np.float64), hole, brick
+            rows = weigh_voxels(*samples.rays(rays, part), *values, float(threshold), *place, row_of, greatest, rows)
         if not len(greatest):
             greatest = np.zeros((rows, brick**3), np.float32)
     cells = np.flatnonzero(row_of >= 0)

@@ -45,6 +45,11 @@ class RayBundle(NamedTuple):
     far: Tensor
     warp: tuple[Tensor, Tensor, Tensor] | None
 
+    def last(self, count: int) -> RayBundle:
+        """The last of the rays."""
+        warp = None if self.warp is None else (self.warp[0][-count:], self.warp[1][-count:], self.warp[2][-count:])
+        return RayBundle(self.origins[-count:], self.directions[-count:], self.near[-count:], self.far[-count:], warp)
+
     def world_distance(self, along: Tensor, ray: Tensor) -> Tensor:
         """Distances (N,) in the frame along the rays `ray` (N,) to distances in the world."""
         return along if self.warp is None else world_distance(along, *(part[ray] for part in self.warp))

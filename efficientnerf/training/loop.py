@@ -7,7 +7,7 @@ On a CPU the same seed gives the same bytes with the same number of threads of t
 depend on the number; matrix products of the paper's networks (oneDNN, MKL) may sum in another order with another one. Either are in bfloat16 only where the
 processor supports it, so that another machine's result differs, at the same quality.
 
-R rays, C views.
+R rays, A rays to sparse points, C views.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from efficientnerf.training.optimiser import Adam, ParameterGroup, parameter_gro
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.readback import AsyncReadback, StepCounts
 from efficientnerf.training.schedule import Schedule, schedule_of
-from efficientnerf.training.sparse_depth import RAYS_PER_RAY, SparseDepthRays, sparse_depth_loss, sparse_depth_weight
+from efficientnerf.training.sparse_depth import RAYS_PER_RAY, SparseDepthRays, aimed_rays, sparse_depth_loss, sparse_depth_weight
 from efficientnerf.training.view_checks.checks import ViewChecks, follow_checks
 
 MAX_STEPS = 2**40  # of a run: beyond any practical one
@@ -180,10 +180,16 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
 
         count = ray_count(settings, t.samples_per_ray)
         batch = ray_batch(m, source, count, rng, crop=number <= settings.precrop_steps)
-        capacity = None if readback is None else readback.capacity(count)
-        outputs = render_rays(m, *batch[:6], prune=prune, rng=rng, capacity=capacity, samples_per_pivot=samples_per_pivot)
+        weight = sparse_depth_weight(settings.sparse_depth_loss_weight, fraction) if m.space.unbounded else 0.0
+        aimed = aimed_rays(m, sparse_depth, max(1, count // RAYS_PER_RAY), rng) if sparse_depth is not None and weight > 0 else None
+        bundle = batch[:6] if aimed is None else tuple(torch.cat(pair) for pair in zip(batch[:6], aimed.bundle, strict=True))
+        rays = len(bundle[0])
+        # Aimed rays begin closer to the camera, and end farther away.
+        capacity = None if readback is None else readback.capacity(count + 2 * (rays - count))
+        outputs = render_rays(m, *bundle, prune=prune, rng=rng, capacity=capacity, samples_per_pivot=samples_per_pivot)
 
-        complete = complete_rays(outputs.coarse, outputs.fine)
+        fitting = complete_rays(outputs.coarse, outputs.fine)
+        complete = None if fitting is None else fitting[:count]
         exposure = t.exposure if t.exposure is None or is_learned(fraction) else t.exposure.detached
         at = None if exposure is None else places(pixels, batch.pixel, m.device)
         fine_loss, coarse_loss = colour_losses(outputs, batch.colour, complete, at, exposure)
@@ -191,14 +197,11 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         if exposure is not None:
             loss = loss + exposure_loss(exposure)
         if m.space.unbounded:
-            loss = loss + distortion_loss(m, outputs, fraction, complete)
+            loss = loss + distortion_loss(m, outputs.distortion[:count], fraction, complete)
         if m.space.scales_near_gradients:
             scale_gradients_by_distance(m, batch.origins, outputs)
-        weight = sparse_depth_weight(settings.sparse_depth_loss_weight, fraction) if m.space.unbounded else 0.0
-        if sparse_depth is not None and weight > 0:
-            few = max(1, count // RAYS_PER_RAY)
-            capacity_of_few = None if readback is None else readback.capacity(2 * few)  # these rays begin closer to the camera, and end farther away
-            loss = loss + weight * sparse_depth_loss(m, sparse_depth, few, rng, prune=prune, capacity=capacity_of_few, samples_per_pivot=samples_per_pivot)
+        if aimed is not None:
+            loss = loss + weight * sparse_depth_loss(outputs, aimed.distance, samples_per_pivot, fitting)
         loss.backward()
         t.adam.step(number, t.schedule.learning_rate_at(number))
         update_occupancy(m, outputs, number, rng, padded=capacity is not None, may_wait=readback is None)
@@ -206,7 +209,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
             refine_cameras(m, pixels, source, t.cameras, rng, None if exposure is None else exposure.detached)
 
         t.step = number
-        yield _progress(t, count, fine_loss, outputs, readback)
+        yield _progress(t, rays, fine_loss, outputs, readback)
 
 
 def _progress(t: Trainer, rays: int, fine_loss: Tensor, outputs: RayOutputs, readback: AsyncReadback | None) -> Progress:

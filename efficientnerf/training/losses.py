@@ -10,6 +10,8 @@ from efficientnerf.model import Model, RayOutputs
 from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.training.exposure.model import Exposure, exposed, squared_error
 
+NEARBY = 1e-12  # a distance from which gradients are not scaled
+
 
 def mean_over(values: Tensor, rays: Tensor | None) -> Tensor:
     """Mean of values (R, ...) over some rays (R,) bool, or over all."""
@@ -25,11 +27,12 @@ def colour_losses(
 ) -> tuple[Tensor, Tensor | None]:
     """Mean squared error of the fine colours, and of the coarse ones (None where there is no coarse stage).
 
+    outputs   of these rays, and of others after them, which have no colour
     colour    (R, 3) of the photographs
     complete  (R,) bool, rays that count; None: all
     at        photograph (R,) int64 of each ray and r^2 (R,) in it, where exposure is learned, see `efficientnerf.training.exposure.model`
     """
-    fine, coarse = outputs.fine_colour, outputs.coarse_colour
+    fine, coarse = outputs.fine_colour[: len(colour)], None if outputs.coarse_colour is None else outputs.coarse_colour[: len(colour)]
 
     def error(seen: Tensor) -> Tensor:
         if exposure is None or at is None:
@@ -39,18 +42,20 @@ def colour_losses(
     return mean_over(error(fine), complete), None if coarse is None else mean_over(error(coarse), complete)
 
 
-def distortion_loss(m: Model, outputs: RayOutputs, fraction: float, complete: Tensor | None) -> Tensor:
-    """The distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15), weighted; fraction of the schedule, 0 to 1."""
-    return m.space.distortion_schedule(fraction) * m.distortion * mean_over(outputs.distortion, complete)
+def distortion_loss(m: Model, distortion: Tensor, fraction: float, complete: Tensor | None) -> Tensor:
+    """The distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15) of rays (R,), weighted; fraction of the schedule, 0 to 1."""
+    return m.space.distortion_schedule(fraction) * m.distortion * mean_over(distortion, complete)
 
 
 def scale_gradients_by_distance(m: Model, origins: Tensor, outputs: RayOutputs) -> None:
-    """Scale gradients by the square of the distance to the camera, up to the distance of the box's centre.
+    """Scale gradients by the square of the distance to the camera, up to the distance of the box's centre: those of the first rays of the outputs, with
+    `origins` (R, 3), and not those of rays after them.
 
     Rays are dense close to a camera: samples there get gradients far more often than those on the subject, and floaters grow before the camera.
     Philip and Deschaintre 2023, "Floaters no more: radiance field gradient scaling for improved near-camera training".
     """
     subject = (origins - to_device(torch.as_tensor(m.space.centre, dtype=origins.dtype), origins.device)).norm(dim=-1)
+    subject = torch.nn.functional.pad(subject, (0, len(outputs.fine_opacity) - len(origins)), value=NEARBY)
     for samples, raw in ((outputs.coarse, outputs.coarse_raw), (outputs.fine, outputs.fine_raw)):
         if not raw.requires_grad:  # uniform sampling has no coarse stage
             continue

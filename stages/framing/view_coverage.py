@@ -207,7 +207,7 @@ def close_to_path(
         radius.append(np.full(len(steps), clearance * min(plane[n], plane[to])))
     found = np.zeros(len(points), bool)
     places, reach = np.concatenate(way), np.concatenate(radius)
-    tree = cKDTree(points)
+    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)  # which takes a third of the time to build
     for at in tree.query_ball_point(places, reach):
         found[at] = True
     return found

@@ -9,8 +9,10 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 
+RAYS = 256  # per task
 
-@numba.njit(cache=True, error_model="numpy")
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def threshold_and_dilate(
     cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], brick: int, dilate: int, row_of: np.ndarray, into: np.ndarray
 ) -> None:
@@ -18,8 +20,10 @@ def threshold_and_dilate(
 
     cells     flat indices (x slowest) of the coarse cells that the rows of `greatest` (., brick^3) belong to
     row_of    (coarse cells,) int32: row of `into` (B, brick^3) bool, or -1; every cell that is reached must have one
+
+    Threads may set the same voxel.
     """
-    for row in range(len(cells)):
+    for row in numba.prange(len(cells)):
         cell = cells[row]
         a, b, c = cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2]
         for local in range(brick**3):
@@ -45,6 +49,14 @@ def flat_indices(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int
                 i, j, k = a * brick + local // (brick * brick), b * brick + local // brick % brick, c * brick + local % brick
                 flat[n] = (i * shape[1] * brick + j) * shape[2] * brick + k
                 n += 1
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def coordinates_of(flat, rows, columns, index):  # type: ignore[no-untyped-def]
+    """Coordinates (N, 3) int32 of flat indices (N,) in a grid (., rows, columns)."""
+    for n in numba.prange(len(flat)):
+        rest, column = divmod(flat[n], columns)
+        index[n, 0], index[n, 1], index[n, 2] = rest // rows, rest % rows, column
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -167,3 +179,21 @@ def greatest_around(indices: np.ndarray, greatest: np.ndarray, shape: tuple[int,
                         if x == indices[n, 0] and y == indices[n, 1] and z == indices[n, 2]:
                             own = weight
         out[n, 0], out[n, 1] = own, best
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def boxes_of_samples(origin, direction, first, start, extent, boxes, out):  # type: ignore[no-untyped-def]
+    """Number of the first of the boxes (L, 2, 3) float64 that holds the middle of each sample, L where none does, to out (M,) int64; the rest as for
+    `weigh_voxels`, in float32."""
+    rays = len(first) - 1
+    for block in numba.prange((rays + RAYS - 1) // RAYS):
+        for r in range(block * RAYS, min(rays, (block + 1) * RAYS)):
+            for n in range(first[r], first[r + 1]):
+                t = start[n] + extent[n] / np.float32(2)
+                x, y, z = origin[r, 0] + t * direction[r, 0], origin[r, 1] + t * direction[r, 1], origin[r, 2] + t * direction[r, 2]
+                found = len(boxes)
+                for k in range(len(boxes) - 1, -1, -1):
+                    low, high = boxes[k, 0], boxes[k, 1]
+                    if low[0] <= x < high[0] and low[1] <= y < high[1] and low[2] <= z < high[2]:
+                        found = k
+                out[n] = found

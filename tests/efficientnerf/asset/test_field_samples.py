@@ -18,6 +18,7 @@ from efficientnerf.asset.field_samples import (
     field_samples,
     seen_weights,
     surface_points,
+    weight_by_box,
 )
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -111,6 +112,16 @@ def baked(made: Made, count: int = 4, voxel: float = 0.05) -> NerfTree:
         assert ((weights[:, 0] <= weights[:, 1]) & (weights <= 1).all(axis=1)).all()
         trees.append(tree_from_voxels(shape, side, low, indices, density_as_seen(density, weights, side), sh, brick=BRICK))
     return nested(trees, environment_beyond(samples, boxes(count, voxel), 16, np.full(3, 0.5)))
+
+
+def test_a_sample_counts_in_the_first_box_that_holds_its_middle(made: Made) -> None:
+    samples, some = made[2], boxes(3)
+    ray = np.repeat(np.arange(len(samples.pixel)), np.diff(samples.first))
+    points = samples.points(np.arange(len(samples.start)), ray)
+    inside = np.stack([((points >= low) & (points < high)).all(axis=1) for low, high in some] + [np.ones(len(points), bool)])
+    wanted = np.bincount(inside.argmax(axis=0), weights=samples.weight, minlength=len(some) + 1)
+    assert (wanted > 0).all()
+    np.testing.assert_allclose(weight_by_box(samples, some), wanted, rtol=1e-6)
 
 
 def test_the_tree_shows_the_whole_scene_without_a_crack_at_its_borders(made: Made) -> None:

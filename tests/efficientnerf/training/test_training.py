@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from efficientnerf.backends import transfer
 from efficientnerf.model import Model, render_rays
 from efficientnerf.training.loop import Progress, restore, state_of, train, trainer
 from efficientnerf.training.optimiser import Adam, parameter_groups
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import Schedule, schedule_of
-from efficientnerf.training.sparse_depth import SparseDepthRays, sparse_depth_loss
+from efficientnerf.training.sparse_depth import AimedRays, SparseDepthRays, aimed_rays, sparse_depth_loss
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
 
 MLP = {"field": "mlp", "hidden_dim": 24, "num_layers": 2, "coarse_num_layers": 1, "learning_rate": 1e-2}
@@ -122,12 +123,39 @@ def test_sparse_depth_gathers_the_weight_at_its_points() -> None:
     adam = Adam(parameter_groups(m))
     losses = []
     for step in range(1, 41):
-        loss = sparse_depth_loss(m, rays, 16, np.random.default_rng(step), prune=False)
+        rng = np.random.default_rng(step)
+        aimed = aimed_rays(m, rays, 16, rng)
+        loss = sparse_depth_loss(render_rays(m, *aimed.bundle, prune=False, rng=rng), aimed.distance, m.settings.samples_per_pivot, None)
         loss.backward()
         adam.step(step, 3e-2)
         losses.append(float(loss.detach()))
     assert 1.5 < losses[0] <= 2
     assert losses[-1] < 1.2
+
+
+@pytest.mark.parametrize("complete", [False, True])
+def test_rays_to_sparse_points_count_alone_though_others_come_first(complete: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loss and gradient are those of a bundle of their own; also on a device, which looks at the samples of all rays."""
+    m = untrained(contracted=True)
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(30, 3)).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rays = SparseDepthRays(-3 * directions, directions, rng.uniform(2, 4, 30).astype(np.float32))
+    aimed, others = (aimed_rays(m, rays, count, np.random.default_rng(count)) for count in (9, 20))
+    counted = torch.tensor([True] * 20 + [complete, True, complete] * 3)
+
+    def found(parts: list[AimedRays]) -> tuple[float, torch.Tensor]:
+        outputs = render_rays(m, *(torch.cat(each) for each in zip(*(part.bundle for part in parts), strict=True)), prune=False)
+        loss = sparse_depth_loss(outputs, aimed.distance, m.settings.samples_per_pivot, counted[-len(outputs.fine_opacity) :])
+        (gradient,) = torch.autograd.grad(loss, m.fine.weights[-1])
+        return float(loss.detach()), gradient
+
+    alone, gradient = found([aimed])
+    for on_device in (False, True):
+        monkeypatch.setattr(transfer, "is_on_device", lambda values, on_device=on_device: on_device)
+        behind_others, same = found([others, aimed])
+        assert behind_others == pytest.approx(alone, rel=1e-5)
+        torch.testing.assert_close(same, gradient, rtol=1e-3, atol=1e-6)
 
 
 def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
