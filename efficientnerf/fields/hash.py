@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from efficientnerf.backends import dispatch
 from efficientnerf.backends.torch.hash_grid import HashLevels
-from efficientnerf.backends.torch.linear_chain import precision_of
+from efficientnerf.backends.torch.linear_chain import fused_precision_of
 from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.rendering.harmonics import harmonics_count
@@ -82,7 +82,7 @@ class HashField(BakeableField):
     def _network(self, points: Tensor, last: Tensor) -> Tensor:
         weights = [*list(self.weights)[:-1], last]
         training = torch.is_grad_enabled() and dispatch.backend_of(points, self.table) != "torch"
-        precision = precision_of(self.precision, points.device.type) if training else points.dtype
+        precision = fused_precision_of(self.precision, points.device.type) if training else points.dtype
         return dispatch.hash_network(points, self.table, self.hash_levels, weights, self.log_initial_density, precision, self.table_gradient)
 
 

@@ -32,14 +32,15 @@ def colour_losses(
     complete  (R,) bool, rays that count; None: all
     at        photograph (R,) int64 of each ray and r^2 (R,) in it, where exposure is learned, see `efficientnerf.training.exposure.model`
     """
-    fine, coarse = outputs.fine_colour[: len(colour)], None if outputs.coarse_colour is None else outputs.coarse_colour[: len(colour)]
-
-    def error(seen: Tensor) -> Tensor:
-        if exposure is None or at is None:
-            return (seen - colour) ** 2
-        return squared_error(exposed(seen, *at, exposure), colour)
-
-    return mean_over(error(fine), complete), None if coarse is None else mean_over(error(coarse), complete)
+    rays, seen = len(colour), [outputs.fine_colour] if outputs.coarse_colour is None else [outputs.fine_colour, outputs.coarse_colour]
+    shown = torch.cat([each[:rays] for each in seen])  # of both stages in one pass
+    colour = torch.cat([colour] * len(seen))
+    if exposure is None or at is None:
+        errors = (shown - colour) ** 2
+    else:
+        errors = squared_error(exposed(shown, *(torch.cat([each] * len(seen)) for each in at), exposure), colour)
+    losses = [mean_over(errors[rays * k : rays * (k + 1)], complete) for k in range(len(seen))]
+    return losses[0], losses[1] if len(losses) > 1 else None
 
 
 def distortion_loss(m: Model, distortion: Tensor, fraction: float, complete: Tensor | None) -> Tensor:

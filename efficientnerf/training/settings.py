@@ -31,7 +31,7 @@ class TrainSettings:
         "hash", "Kind of field: a multiresolution hash grid (hash), the paper's networks (mlp), or those of the original NeRF, which cannot be baked (nerf)."
     )
     precision: Literal["auto", "float32", "bfloat16"] = setting(
-        "auto", "Precision of matrix products in training; auto: bfloat16 where the device supports it.", advanced=True
+        "auto", "Precision of matrix products in training; auto: bfloat16 where it is faster.", advanced=True
     )
     sampling: Literal["efficient", "valid", "hierarchical", "uniform"] = setting(
         "efficient",

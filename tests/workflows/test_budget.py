@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from efficientnerf.backends import kernel_cache
 from pipeline.errors import UsageError
 from pipeline.executors.memory import parse_size
 from workflows.asset import WORKFLOW
-from workflows.budget import MIN_BAKE, MIN_TRAIN, PHOTOGRAPHS_TRAIN_SHARE, TRAIN_SHARE, share_budget
+from workflows.budget import FEW_PIXELS_TRAIN_SHARE, MIN_BAKE, MIN_TRAIN, TRAIN_SHARE, has_few_pixels, share_budget
 from workflows.cli.request import Options, plan_run
 from workflows.fleet.program import WorkflowProgram
 
@@ -24,21 +25,18 @@ def source(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-SHARES = {"blender": TRAIN_SHARE, "llff": TRAIN_SHARE, "photographs": PHOTOGRAPHS_TRAIN_SHARE, "colmap": PHOTOGRAPHS_TRAIN_SHARE, None: PHOTOGRAPHS_TRAIN_SHARE}
-
-
-@pytest.mark.parametrize("source_format", SHARES)
-def test_both_parts_make_up_the_budget(source_format: str | None) -> None:
+@pytest.mark.parametrize("few_pixels", [False, True])
+def test_both_parts_make_up_the_budget(few_pixels: bool) -> None:
     former = {"train": 0.0, "bake": 0.0}
     for seconds in (0.5, 10.0, MIN_TRAIN + MIN_BAKE, 36.0, 60.0, 240.0, 600.0, 1e5):
-        parts = share_budget(seconds, source_format)
+        parts = share_budget(seconds, few_pixels=few_pixels)
         assert sum(parts.values()) == pytest.approx(seconds)
         assert all(parts[stage] >= former[stage] > -1 for stage in former), "a longer budget shortens no part"
         if seconds >= MIN_TRAIN + MIN_BAKE:
             assert parts["train"] >= MIN_TRAIN - 1e-9
             assert parts["bake"] >= MIN_BAKE - 1e-9
         if seconds >= 240:
-            assert parts["train"] == pytest.approx(SHARES[source_format] * seconds)
+            assert parts["train"] == pytest.approx((FEW_PIXELS_TRAIN_SHARE if few_pixels else TRAIN_SHARE) * seconds)
         former = parts
 
 
@@ -53,8 +51,8 @@ def test_options_become_settings_of_both_stages(source: Path, tmp_path: Path) ->
             plan_run(tmp_path / "run", WORKFLOW, nothing)
 
 
-def test_the_share_follows_the_format_of_the_source(source: Path, tmp_path: Path) -> None:
-    """Detected or stated; a source that is no data set is refused where it is read, not here."""
+def test_the_share_follows_the_pixels_of_the_source(source: Path, tmp_path: Path) -> None:
+    """A source that is no data set is refused where it is read, not here. Objects and forward-facing captures have one share."""
     posed = tmp_path / "posed"
     (posed / "train").mkdir(parents=True)
     frame = {"file_path": "./train/r_0", "transform_matrix": np.eye(4).tolist()}
@@ -66,8 +64,24 @@ def test_the_share_follows_the_format_of_the_source(source: Path, tmp_path: Path
         planned = plan_run(tmp_path / "run", WORKFLOW, Options(source=folder, preset="tiny", budget="10m", **more))  # type: ignore[arg-type]
         return float(planned.run.settings["train"]["time_budget"]) / 600
 
-    assert share(source) == share(empty) == PHOTOGRAPHS_TRAIN_SHARE
+    assert share(source) == share(empty) == FEW_PIXELS_TRAIN_SHARE
     assert share(posed) == share(source, format="llff") == TRAIN_SHARE
+
+
+def test_few_pixels_are_counted_at_working_size(tmp_path: Path) -> None:
+    """In the folder that has most pictures; videos have many pixels, and what cannot be read has none."""
+    photos = tmp_path / "set" / "images"
+    photos.mkdir(parents=True)
+    for number in range(20):
+        (photos / f"{number}.png").write_bytes(b"")
+    few = [has_few_pixels([photos.parent], "photographs", 1000)]
+    Image.new("L", (4000, 2000)).save(photos / "0.png")
+    few += [has_few_pixels([photos.parent], "photographs", longest) for longest in (1000, 1260, 1270, 4000)]
+    assert few == [True, True, True, False, False]
+    assert not has_few_pixels([photos.parent], "blender", 1000)
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / "a.mp4").write_bytes(b"")
+    assert not any(has_few_pixels([path], "photographs", 1000) for path in (tmp_path / "clips", tmp_path / "clips" / "a.mp4"))
 
 
 def test_steps_that_a_budget_takes_the_place_of_are_told(source: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from pipeline.run import MOST_SOURCES, NAME, Run
 from pipeline.stage import Stage
 from stages.formats.importers import detect
 from stages.video import KNOWN, SUFFIXES
-from workflows.budget import share_budget
+from workflows.budget import has_few_pixels, share_budget
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, Table, read_config, read_preset, seconds_of, table_of
 from workflows.cli.target import open_run, resume_command
@@ -128,7 +128,8 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
             settings.put("poses", name, [value], origin)
     sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
     if options.budget is not None:
-        parts = share_budget(seconds_of(options.budget), _format(settings, sources))
+        few_pixels = has_few_pixels(sources, _format(settings, sources), settings.resolved()["poses"].max_image_size)
+        parts = share_budget(seconds_of(options.budget), few_pixels=few_pixels)
         for stage, seconds in parts.items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:

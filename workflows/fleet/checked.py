@@ -14,7 +14,8 @@ from pipeline.run import NAME as RUN_NAME
 from pipeline.stage import Stage, settings_from
 from pipeline.text import printable
 from stages.formats.importers import detect
-from workflows.budget import share_budget
+from stages.poses.settings import PosesSettings
+from workflows.budget import has_few_pixels, share_budget
 from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, seconds_of
 from workflows.workflow import Workflow
 
@@ -54,7 +55,9 @@ class Choice:
         """The settings, with what the budget makes of them."""
         if self.budget is None:
             return self.settings
-        parts = share_budget(self.budget, _format(self.settings.get("poses", {}), sources))
+        poses = self.settings.get("poses", {})
+        few_pixels = has_few_pixels(sources, _format(poses, sources), int(poses.get("max_image_size", PosesSettings.max_image_size)))
+        parts = share_budget(self.budget, few_pixels=few_pixels)
         return {**self.settings, **{stage: {**self.settings.get(stage, {}), "time_budget": seconds} for stage, seconds in parts.items()}}
 
 

@@ -26,19 +26,22 @@ COLUMN_STEP = 8  # to a multiple of which widths are padded, so that rows of bfl
 
 
 @cache
+def cpu_facts() -> dict[str, str]:
+    """Of Linux' first processor, by name; none elsewhere."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
+    except OSError:
+        return {}
+    return {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+
+
+@cache
 def has_bfloat16(device: str) -> bool:
     """Whether the device multiplies bfloat16 matrices in hardware: elsewhere they are slower than float32."""
     if device == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    capability = torch.backends.cpu.get_cpu_capability()
-    if not capability.startswith("AVX512"):
-        return False
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        flags = next(line for line in lines if line.startswith("flags")).split()
-    except (OSError, StopIteration):
-        return False
-    return "avx512_bf16" in flags or "amx_bf16" in flags
+    flags = cpu_facts().get("flags", "").split()
+    return torch.backends.cpu.get_cpu_capability().startswith("AVX512") and ("avx512_bf16" in flags or "amx_bf16" in flags)
 
 
 def precision_of(setting: str, device: str) -> torch.dtype:
@@ -46,6 +49,14 @@ def precision_of(setting: str, device: str) -> torch.dtype:
     if setting == "auto":
         return torch.bfloat16 if has_bfloat16(torch.device(device).type) else torch.float32
     return {"float32": torch.float32, "bfloat16": torch.bfloat16}[setting]
+
+
+def fused_precision_of(setting: str, device: str) -> torch.dtype:
+    """The same of fused networks. On the CPU these use AVX-512's dot products, without AMX: on Intel's processors they take longer than sums in float32, on
+    AMD's less. docs/experiments/training-kernels.md"""
+    if setting == "auto" and torch.device(device).type == "cpu" and cpu_facts().get("vendor_id") != "AuthenticAMD":
+        return torch.float32
+    return precision_of(setting, device)
 
 
 def chain_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], skip: int | None) -> Tensor:
