@@ -38,7 +38,8 @@ def colour_losses(
     if exposure is None or at is None:
         errors = (shown - colour) ** 2
     else:
-        errors = squared_error(exposed(shown, *(torch.cat([each] * len(seen)) for each in at), exposure), colour)
+        view, radius = (torch.cat([each] * len(seen)) for each in at)
+        errors = squared_error(exposed(shown, view, radius, exposure), colour)
     losses = [mean_over(errors[rays * k : rays * (k + 1)], complete) for k in range(len(seen))]
     return losses[0], losses[1] if len(losses) > 1 else None
 

@@ -212,7 +212,7 @@ def test_a_found_pose_is_trained_on_once_the_field_agrees(field: Model) -> None:
         if check(c, field, pixels, None, 500):
             trained_on += 1
             assert not c.left_out.any()
-            assert angle(c.cameras[view], CAMERAS[view]) < 2
+            assert angle(c.cameras[view], CAMERAS[view]) < 3
     assert trained_on
 
 
