@@ -128,7 +128,8 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
             settings.put("poses", name, [value], origin)
     sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
     if options.budget is not None:
-        few_pixels = has_few_pixels(sources, _format(settings, sources), settings.resolved()["poses"].max_image_size)
+        longest = getattr(settings.resolved()["poses"], "max_image_size", 0)  # none where what is stated cannot be, which is reported later
+        few_pixels = has_few_pixels(sources, _format(settings, sources), longest)
         parts = share_budget(seconds_of(options.budget), few_pixels=few_pixels)
         for stage, seconds in parts.items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")

@@ -56,7 +56,7 @@ class Choice:
         if self.budget is None:
             return self.settings
         poses = self.settings.get("poses", {})
-        few_pixels = has_few_pixels(sources, _format(poses, sources), int(poses.get("max_image_size", PosesSettings.max_image_size)))
+        few_pixels = has_few_pixels(sources, _format(poses, sources), poses.get("max_image_size", PosesSettings.max_image_size))
         parts = share_budget(self.budget, few_pixels=few_pixels)
         return {**self.settings, **{stage: {**self.settings.get(stage, {}), "time_budget": seconds} for stage, seconds in parts.items()}}
 
