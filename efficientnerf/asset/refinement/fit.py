@@ -12,6 +12,7 @@ PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -55,14 +56,15 @@ def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
     """
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
     grid = PatchGrid(targets.host_pixels, PATCH_SIDE)
-    usable = np.arange(len(grid)) if grid.usable_tiles is None else np.flatnonzero(grid.usable_tiles)
-    number, drawn = max(1, round(count / grid.mean_pixels)), 0
+    few = 1.0 if grid.usable_tiles is None else len(grid) / int(grid.usable_tiles.sum())  # tiles to one that has pixels
+    number, at_once, drawn = math.ceil(few * count / grid.mean_pixels), math.ceil(few * ERROR_PATCHES), 0
 
     def patches() -> Iterator[Patches]:
         nonlocal drawn
         while not drawn:  # where pixels are masked, patches may have none
-            for begin in range(0, number, ERROR_PATCHES):
-                part = grid.drawn_from(usable[rng.integers(len(usable), size=min(ERROR_PATCHES, number - begin))], rng)
+            for begin in range(0, number, at_once):
+                tile = rng.integers(len(grid), size=min(at_once, number - begin))
+                part = grid.drawn_from(tile if grid.usable_tiles is None else tile[grid.usable_tiles[tile]], rng)
                 drawn += len(part.pixels)
                 if len(part.pixels):
                     yield part
