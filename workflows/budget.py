@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
-from stages.formats.importers.photographs import is_video
-from stages.formats.importers.source import pictures_in
+from efficientnerf.settings import Auto
+from pipeline.errors import PipelineError
+from stages.formats.importers import detect
+from stages.formats.importers.photographs import is_video, photographs
+from stages.formats.importers.source import Source
+from stages.io.photo import working_size
 from stages.io.pictures import UnreadableImage, read_header
 
 # Of the budget, for the stage train; the rest is bake's. docs/experiments/tree-training.md
@@ -17,9 +22,21 @@ WITHOUT_SURROUNDINGS = ("blender", "llff")  # formats of objects before a consta
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
 
 
-def share_budget(seconds: float, *, few_pixels: bool = False) -> dict[str, float]:
-    """Stage -> its time_budget; they sum to `seconds`. few_pixels: see `has_few_pixels`."""
-    share = FEW_PIXELS_TRAIN_SHARE if few_pixels else TRAIN_SHARE
+class PosesSettings(Protocol):
+    """Settings of the stage poses that the share follows."""
+
+    @property
+    def format(self) -> str: ...
+    @property
+    def allow_outside(self) -> bool: ...
+    @property
+    def llff_factor(self) -> int | Auto: ...
+    @property
+    def max_image_size(self) -> int: ...
+
+
+def share_budget(seconds: float, share: float) -> dict[str, float]:
+    """Stage -> its time_budget; they sum to `seconds`. share: of train, see `train_share`."""
     if seconds <= MIN_TRAIN + MIN_BAKE:
         train = seconds * MIN_TRAIN / (MIN_TRAIN + MIN_BAKE)
     else:
@@ -27,28 +44,29 @@ def share_budget(seconds: float, *, few_pixels: bool = False) -> dict[str, float
     return {"train": train, "bake": seconds - train}
 
 
-def has_few_pixels(sources: Sequence[Path], source_format: str | None, max_image_size: int) -> bool:
-    """Whether sources, read as this format, are of a scene with surroundings and have few pixels at working size. Photographs are counted in the folder that
-    has most of them, and taken to be as large as the first; videos have many."""
-    if source_format in WITHOUT_SURROUNDINGS:
-        return False
+def train_share(sources: Sequence[Path], poses: PosesSettings) -> float:
+    """The share of the stage train, by what the sources are and how many pixels their photographs have at working size.
+
+    Photographs of a source are taken to be as large as its first; videos have many pixels; a source that cannot be read has none (the stage poses reports it).
+    """
     try:
-        return not any(map(_has_videos, sources)) and sum(_pixels(source, max_image_size) for source in sources) < FEW_PIXELS
-    except OSError:  # which the stage poses reports
-        return False
+        if _format(sources, poses) in WITHOUT_SURROUNDINGS:
+            return TRAIN_SHARE
+        pixels = sum(_pixels(source, poses) for source in sources)
+    except (PipelineError, OSError, UnreadableImage):
+        pixels = 0.0
+    return FEW_PIXELS_TRAIN_SHARE if pixels < FEW_PIXELS else TRAIN_SHARE
 
 
-def _has_videos(source: Path) -> bool:
-    return is_video(source) or (source.is_dir() and not pictures_in(source) and any(map(is_video, source.iterdir())))
+def _format(sources: Sequence[Path], poses: PosesSettings) -> str:
+    if poses.format != "auto":
+        return poses.format
+    return detect(sources[0], poses.allow_outside, poses.llff_factor) if len(sources) == 1 else "photographs"
 
 
-def _pixels(source: Path, longest: int) -> float:
-    folders = [source, *(sorted(path for path in source.iterdir() if path.is_dir()) if source.is_dir() else ())]
-    pictures = max(map(pictures_in, folders), key=len)
-    if not pictures:
-        return 0.0
-    try:
-        width, height = read_header(pictures[0]).size
-    except UnreadableImage:
-        return 0.0
-    return len(pictures) * width * height * min(1.0, longest / max(width, height)) ** 2
+def _pixels(source: Path, poses: PosesSettings) -> float:
+    pictures = [source] if is_video(source) else photographs(Source(source, poses.allow_outside))
+    if any(map(is_video, pictures)):
+        return float("inf")
+    width, height = working_size(*read_header(pictures[0]).size, poses.max_image_size)
+    return float(len(pictures) * width * height)

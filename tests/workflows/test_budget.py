@@ -13,8 +13,9 @@ from efficientnerf.backends import kernel_cache
 from pipeline.errors import UsageError
 from pipeline.executors.memory import parse_size
 from workflows.asset import WORKFLOW
-from workflows.budget import FEW_PIXELS_TRAIN_SHARE, MIN_BAKE, MIN_TRAIN, TRAIN_SHARE, has_few_pixels, share_budget
+from workflows.budget import FEW_PIXELS_TRAIN_SHARE, MIN_BAKE, MIN_TRAIN, TRAIN_SHARE, share_budget
 from workflows.cli.request import Options, plan_run
+from workflows.fleet.manifest import read_manifest
 from workflows.fleet.program import WorkflowProgram
 
 
@@ -25,18 +26,18 @@ def source(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-@pytest.mark.parametrize("few_pixels", [False, True])
-def test_both_parts_make_up_the_budget(few_pixels: bool) -> None:
+@pytest.mark.parametrize("share", [FEW_PIXELS_TRAIN_SHARE, TRAIN_SHARE])
+def test_both_parts_make_up_the_budget(share: float) -> None:
     former = {"train": 0.0, "bake": 0.0}
     for seconds in (0.5, 10.0, MIN_TRAIN + MIN_BAKE, 36.0, 60.0, 240.0, 600.0, 1e5):
-        parts = share_budget(seconds, few_pixels=few_pixels)
+        parts = share_budget(seconds, share)
         assert sum(parts.values()) == pytest.approx(seconds)
         assert all(parts[stage] >= former[stage] > -1 for stage in former), "a longer budget shortens no part"
         if seconds >= MIN_TRAIN + MIN_BAKE:
             assert parts["train"] >= MIN_TRAIN - 1e-9
             assert parts["bake"] >= MIN_BAKE - 1e-9
         if seconds >= 240:
-            assert parts["train"] == pytest.approx((FEW_PIXELS_TRAIN_SHARE if few_pixels else TRAIN_SHARE) * seconds)
+            assert parts["train"] == pytest.approx(share * seconds)
         former = parts
 
 
@@ -52,36 +53,52 @@ def test_options_become_settings_of_both_stages(source: Path, tmp_path: Path) ->
 
 
 def test_the_share_follows_the_pixels_of_the_source(source: Path, tmp_path: Path) -> None:
-    """A source that is no data set is refused where it is read, not here. Objects and forward-facing captures have one share."""
+    """Objects and forward-facing captures have one share. A source that is no data set is refused where it is read, not here."""
     posed = tmp_path / "posed"
     (posed / "train").mkdir(parents=True)
     frame = {"file_path": "./train/r_0", "transform_matrix": np.eye(4).tolist()}
     (posed / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": [frame]}), encoding="utf-8")
-    empty = tmp_path / "empty"
-    (empty / "nothing").mkdir(parents=True)
+    (tmp_path / "empty" / "nothing").mkdir(parents=True)
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    (clips / "a.mp4").write_bytes(b"")
+    many = _photographs(tmp_path / "many" / "images", 20, (4000, 2000))
 
-    def share(folder: Path, **more: object) -> float:
-        planned = plan_run(tmp_path / "run", WORKFLOW, Options(source=folder, preset="tiny", budget="10m", **more))  # type: ignore[arg-type]
+    def share(folder: Path, *sets: str, **more: object) -> float:
+        planned = plan_run(tmp_path / "run", WORKFLOW, Options(source=folder, preset="tiny", budget="10m", sets=sets, **more))  # type: ignore[arg-type]
         return float(planned.run.settings["train"]["time_budget"]) / 600
 
-    assert share(source) == share(empty) == FEW_PIXELS_TRAIN_SHARE
-    assert share(posed) == share(source, format="llff") == TRAIN_SHARE
+    assert share(source) == share(tmp_path / "empty") == FEW_PIXELS_TRAIN_SHARE
+    assert share(posed) == share(source, format="llff") == share(many, format="llff") == TRAIN_SHARE
+    assert share(clips) == share(clips / "a.mp4") == TRAIN_SHARE
+    few, enough = (share(many.parent, f"poses.max_image_size={longest}") for longest in (1260, 1270))  # 20 photographs of 2 : 1
+    assert (few, enough) == (FEW_PIXELS_TRAIN_SHARE, TRAIN_SHARE)
+    assert share(many, "poses.max_image_size=9000") == TRAIN_SHARE, "photographs are not enlarged"
+    assert share(many, also=(_photographs(tmp_path / "more", 5, (4000, 2000)),)) == FEW_PIXELS_TRAIN_SHARE
+    assert share(many, "poses.max_image_size=1200", also=(tmp_path / "more",)) == TRAIN_SHARE, "those of all sources count"
 
 
-def test_few_pixels_are_counted_at_working_size(tmp_path: Path) -> None:
-    """In the folder that has most pictures; videos have many pixels, and what cannot be read has none."""
-    photos = tmp_path / "set" / "images"
-    photos.mkdir(parents=True)
-    for number in range(20):
-        (photos / f"{number}.png").write_bytes(b"")
-    few = [has_few_pixels([photos.parent], "photographs", 1000)]
-    Image.new("L", (4000, 2000)).save(photos / "0.png")
-    few += [has_few_pixels([photos.parent], "photographs", longest) for longest in (1000, 1260, 1270, 4000)]
-    assert few == [True, True, True, False, False]
-    assert not has_few_pixels([photos.parent], "blender", 1000)
-    (tmp_path / "clips").mkdir()
-    (tmp_path / "clips" / "a.mp4").write_bytes(b"")
-    assert not any(has_few_pixels([path], "photographs", 1000) for path in (tmp_path / "clips", tmp_path / "clips" / "a.mp4"))
+def _photographs(folder: Path, number: int, size: tuple[int, int]) -> Path:
+    folder.mkdir(parents=True)
+    for index in range(number):
+        Image.new("L", size).save(folder / f"{index:02}.png")
+    return folder
+
+
+def test_a_fleet_shares_a_budget_as_a_run_does(tmp_path: Path) -> None:
+    _photographs(tmp_path / "scene", 20, (1400, 700))
+    manifest = tmp_path / "scenes.toml"
+    found = []
+    for preset, sets, line in (("tiny", (), ""), ("high", (), ""), ("tiny", ("poses.max_image_size=1400",), "poses.max_image_size = 1400\n")):
+        manifest.write_text(f'[scenes.a]\nsource = "scene"\npreset = "{preset}"\nbudget = "10m"\n{line}')
+        (scene,) = read_manifest([str(manifest)], WORKFLOW, tmp_path / "fleet")
+        run = plan_run(tmp_path / "run", WORKFLOW, Options(source=tmp_path / "scene", preset=preset, budget="10m", sets=sets)).run
+        found.append(scene.settings["train"]["time_budget"] / 600)
+        assert scene.settings["train"]["time_budget"] == run.settings["train"]["time_budget"]
+    assert found == [FEW_PIXELS_TRAIN_SHARE, TRAIN_SHARE, TRAIN_SHARE], "tiny reads small photographs"
+    manifest.write_text('[scenes.a]\nsource = "scene"\nbudget = "10m"\nposes.max_image_size = "big"\n')
+    with pytest.raises(UsageError, match=r"poses\.max_image_size"):
+        read_manifest([str(manifest)], WORKFLOW, tmp_path / "fleet")
 
 
 def test_steps_that_a_budget_takes_the_place_of_are_told(source: Path, tmp_path: Path) -> None:

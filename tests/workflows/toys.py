@@ -25,6 +25,7 @@ class PosesSettings:
     strict: bool = setting(False, "Whether to refuse.")
     allow_outside: bool = setting(False, "Whether to allow.")
     llff_factor: PositiveInt | Auto = setting("auto", "Which images.", advanced=True)
+    max_image_size: PositiveInt = setting(1000, "Longest side.")
     repeat: Annotated[int, Meta(ge=1, le=9)] = setting(1, "How often the text is repeated.")
 
 

@@ -14,9 +14,8 @@ from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit, limit_for, parse_size, size_text
 from pipeline.run import MOST_SOURCES, NAME, Run
 from pipeline.stage import Stage
-from stages.formats.importers import detect
 from stages.video import KNOWN, SUFFIXES
-from workflows.budget import has_few_pixels, share_budget
+from workflows.budget import share_budget, train_share
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, Table, read_config, read_preset, seconds_of, table_of
 from workflows.cli.target import open_run, resume_command
@@ -128,9 +127,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
             settings.put("poses", name, [value], origin)
     sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
     if options.budget is not None:
-        longest = getattr(settings.resolved()["poses"], "max_image_size", 0)  # none where what is stated cannot be, which is reported later
-        few_pixels = has_few_pixels(sources, _format(settings, sources), longest)
-        parts = share_budget(seconds_of(options.budget), few_pixels=few_pixels)
+        parts = share_budget(seconds_of(options.budget), train_share(sources, settings.resolved()["poses"]))
         for stage, seconds in parts.items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:
@@ -180,19 +177,6 @@ def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:
         ("lens", options.lens, f"--lens {options.lens}"),
         ("allow_outside", options.allow_outside or None, "--allow-outside"),
     )
-
-
-def _format(settings: Settings, sources: Sequence[Path]) -> str | None:
-    """The format that sources will be read as; None where they cannot be, which the stage poses reports."""
-    stated = settings.resolved()["poses"]
-    if stated.format != "auto":
-        return str(stated.format)
-    if len(sources) != 1:
-        return "photographs" if sources else None
-    try:
-        return detect(sources[0], stated.allow_outside, stated.llff_factor)
-    except (BadInput, OSError):
-        return None
 
 
 def _memory(given: str | None, standing: Run | None, warnings: list[str]) -> tuple[int | None, Limit | None]:

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import Mistakes, PipelineError, UsageError
+from pipeline.errors import Mistakes, UsageError
 from pipeline.files import canonical_json
 from pipeline.fleet.state import Scene
 from pipeline.run import NAME as RUN_NAME
 from pipeline.stage import Stage, settings_from
 from pipeline.text import printable
-from stages.formats.importers import detect
-from stages.poses.settings import PosesSettings
-from workflows.budget import has_few_pixels, share_budget
+from workflows.budget import share_budget, train_share
 from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, seconds_of
 from workflows.workflow import Workflow
 
@@ -51,27 +49,15 @@ class Choice:
             other.budget if self.budget is None else self.budget,
         )
 
-    def with_budget(self, sources: Sequence[Path]) -> Table:
+    def with_budget(self, sources: Sequence[Path], workflow: Workflow) -> Table:
         """The settings, with what the budget makes of them."""
         if self.budget is None:
             return self.settings
-        poses = self.settings.get("poses", {})
-        few_pixels = has_few_pixels(sources, _format(poses, sources), poses.get("max_image_size", PosesSettings.max_image_size))
-        parts = share_budget(self.budget, few_pixels=few_pixels)
+        preset = read_preset(self.preset or DEFAULT_PRESET, workflow.presets).table
+        (poses,) = (stage.settings for stage in workflow.stages if stage.name == "poses")
+        stated: Any = settings_from(poses, {**preset.get("poses", {}), **self.settings.get("poses", {})}, where="poses")
+        parts = share_budget(self.budget, train_share(sources, stated))
         return {**self.settings, **{stage: {**self.settings.get(stage, {}), "time_budget": seconds} for stage, seconds in parts.items()}}
-
-
-def _format(poses: Mapping[str, Any], sources: Sequence[Path]) -> str | None:
-    """The format that sources are read as; None where that is not known yet."""
-    stated = poses.get("format", "auto")
-    if stated != "auto":
-        return str(stated)
-    if len(sources) != 1:
-        return "photographs"
-    try:
-        return detect(sources[0], bool(poses.get("allow_outside", False)), poses.get("llff_factor", "auto"))
-    except (PipelineError, OSError):
-        return None
 
 
 class Checker:

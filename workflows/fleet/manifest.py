@@ -241,7 +241,7 @@ class _Reader:
         sources = tuple(self._sources(entry))
         own = _choice(entry.values, entry.where, self.checker, entry.name)
         choice = self.over.over(own.over(self.common))
-        settings = choice.with_budget(sources)
+        settings = choice.with_budget(sources, self.checker.workflow)
         return Scene(entry.name, tuple(map(str, sources)), settings, choice.preset, choice.seed)
 
     def _sources(self, entry: Entry) -> Iterator[Path]:
