@@ -68,7 +68,7 @@ def _moves(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, camera:
     cosine = (towards * normals).sum(1) / np.linalg.norm(towards, axis=1)
     inside = ((pixels >= 1) & (pixels <= [camera.width - 1, camera.height - 1])).all(1)
     at = np.flatnonzero((np.abs(cosine) < GRAZING) & (depth > 0) & inside)
-    own = _distance_inside(mesh_image(vertices, faces, _finer(camera)).covered)
+    own = distance_inside(mesh_image(vertices, faces, _finer(camera)).covered)
     if own is None or not len(at):
         return at[:0], np.zeros(0)
     places = (FINER * pixels[at, ::-1] - 0.5).T
@@ -83,12 +83,12 @@ def _finer(camera: Camera) -> Camera:
 
 
 def _asset_edge(view: AssetView) -> np.ndarray | None:
-    """`_distance_inside` of the asset's silhouette, FINER times as many pixels along a side: its opacity is interpolated between pixels."""
+    """`distance_inside` of the asset's silhouette, FINER times as many pixels along a side: its opacity is interpolated between pixels."""
     rows, columns = ((np.arange(FINER * side) + 0.5) / FINER - 0.5 for side in view.opacity.shape)
-    return _distance_inside(map_coordinates(view.opacity, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest") >= OPAQUE)
+    return distance_inside(map_coordinates(view.opacity, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest") >= OPAQUE)
 
 
-def _distance_inside(mask: np.ndarray) -> np.ndarray | None:
+def distance_inside(mask: np.ndarray) -> np.ndarray | None:
     """(H, W) float32 pixels from the edge of a silhouette, positive inside; None where it has no edge."""
     if mask.all() or not mask.any():
         return None

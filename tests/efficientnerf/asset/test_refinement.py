@@ -22,7 +22,8 @@ from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, v
 from efficientnerf.backends.numba.tree.contributions import max_contributions
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
-from tests.efficientnerf.balls import BOUNDS, pixels
+from efficientnerf.training.pixels import Pixels
+from tests.efficientnerf.balls import BOUNDS, cameras, picture, pixels
 from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random, sum_gradients
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
@@ -82,6 +83,19 @@ def test_fog_becomes_the_ball_of_the_pictures() -> None:
     assert density_at(tree, np.array([[0.6, -0.05, 0.0]]))[0] > 5
     assert density_at(tree, np.array([[0.85, 0.8, 0.8]]))[0] < 0.3
     assert (tree.density_values >= 0).all()
+
+
+@pytest.mark.parametrize("share", [None, 0.5, 0.003])
+def test_the_error_is_that_of_all_usable_pixels(share: float | None) -> None:
+    """Estimated from patches, some of which have few usable pixels or none."""
+    rng, seen_by = np.random.default_rng(0), cameras(6, 32)
+    masks = [None if share is None else rng.random((32, 32)) < share for _ in seen_by]
+    some = Pixels(seen_by, [picture(each) for each in seen_by], masks, np.full(6, 1.0), np.full(6, 5.0))
+    tree, targets = ball_tree(), Targets(some, (1.0, 1.0, 1.0))
+    usable = some.usable_pixels(np.arange(some.usable_count))
+    origins, directions, seen = targets.of(usable, constant_background=True)
+    exact = gradients(tree, origins, directions, seen, np.float32)[0].sum() / (3 * len(usable))
+    assert error(tree, targets, 20 * len(some), 0) == pytest.approx(exact, rel=0.05)
 
 
 def test_photographs_are_compared_over_the_environment() -> None:

@@ -9,7 +9,7 @@ import trimesh
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.surface.agreement import AssetView, agreement
 from efficientnerf.surface.rasteriser import mesh_image
-from efficientnerf.surface.silhouettes import fitted_to_silhouettes
+from efficientnerf.surface.silhouettes import distance_inside, fitted_to_silhouettes
 
 PIXEL = 3.0 / 140  # at the origin
 
@@ -87,3 +87,20 @@ def test_what_ends_in_no_view_stays() -> None:
     np.testing.assert_array_equal(fitted_to_silhouettes(vertices, faces, whole), vertices)
     np.testing.assert_array_equal(fitted_to_silhouettes(vertices, faces, views_of(trimesh.creation.icosphere(4, radius=0.3))), vertices)
     np.testing.assert_array_equal(fitted_to_silhouettes(vertices, faces, []), vertices)
+
+
+def test_distances_are_exact_and_repeat() -> None:
+    """To the nearest pixel of the other kind; OpenCV's own differ in the last bit from call to call."""
+    mask = np.random.default_rng(0).random((24, 30)) > 0.3
+    mask[4:16, 5:20] = True
+    rows, columns = np.indices(mask.shape)
+    wanted = np.empty(mask.shape)
+    for row, column in np.ndindex(mask.shape):
+        squared = (rows - row) ** 2 + (columns - column) ** 2
+        other = np.sqrt(squared[mask != mask[row, column]].min())
+        wanted[row, column] = other - 0.5 if mask[row, column] else 0.5 - other
+    found = distance_inside(mask)
+    np.testing.assert_array_equal(found, wanted.astype(np.float32))
+    for _ in range(20):
+        np.testing.assert_array_equal(distance_inside(mask), found)
+    assert distance_inside(np.ones((3, 3), bool)) is distance_inside(np.zeros((3, 3), bool)) is None

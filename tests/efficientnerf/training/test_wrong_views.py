@@ -200,19 +200,20 @@ def test_the_field_takes_back_what_it_left_out_wrongly(field: Model) -> None:
     assert np.array_equal(c.pose, np.stack([each.world_from_camera for each in CAMERAS]))
 
 
-def test_a_found_pose_is_trained_on_once_the_field_agrees(field: Model) -> None:
+def test_a_found_pose_is_trained_on_once_the_field_agrees() -> None:
     """It agrees with some of them, and these are right."""
+    field = trained(CAMERAS, PICTURES, 600)[0].model
     trained_on = 0
-    for view in (3, 5, 7, 14):
+    for view in (5, 7, 11, 14):
         cameras = [*CAMERAS[:view], rotated(view, 20), *CAMERAS[view + 1 :]]
         c, pixels = ViewChecks.none(cameras), pixels_of(cameras, PICTURES)
-        assert check(c, field, pixels, None, 300)
+        assert check(c, field, pixels, None, 600)
         assert np.flatnonzero(c.left_out).tolist() == [view]
         assert np.array_equal(c.cameras[view].world_from_camera, cameras[view].world_from_camera)  # not before
-        if check(c, field, pixels, None, 500):
+        if check(c, field, pixels, None, 800):
             trained_on += 1
             assert not c.left_out.any()
-            assert angle(c.cameras[view], CAMERAS[view]) < 3
+            assert angle(c.cameras[view], CAMERAS[view]) < 2
     assert trained_on
 
 
