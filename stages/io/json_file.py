@@ -23,11 +23,28 @@ def read_json(path: Path, remedy: str, *, limit: int = LARGEST) -> Any:
         raise BadInput(f"{printable(path)}: {error}. {remedy}".strip()) from error
 
 
+def read_object(path: Path, where: str, remedy: str, *, limit: int = LARGEST) -> dict[str, Any]:
+    """The object in a JSON file, which messages call `where`; BadInput where it holds another value."""
+    found = read_json(path, remedy, limit=limit)
+    if not isinstance(found, dict):
+        raise BadInput(f"{where}: {shown(found)}; expected an object. {remedy}")
+    return found
+
+
 def finite(value: Any, largest: float = LARGEST_NUMBER) -> float | None:
     """A number of a JSON file as a float; None for what is no number, not finite, or of an absolute value above `largest`."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= largest:  # integers of any size compare exactly
         return None
     return float(value)
+
+
+def number(document: dict[str, Any], key: str, where: str, remedy: str, default: Any = None) -> float:
+    """A finite number of an object; BadInput says where it is none, then the remedy."""
+    value = document.get(key, default)
+    found = finite(value)
+    if found is None:
+        raise BadInput(f"{where}: {key} is {shown(value)}, expected a finite number. {remedy}")
+    return found
 
 
 def numbers(value: Any, count: int, where: str, remedy: str) -> list[float]:

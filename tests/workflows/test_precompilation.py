@@ -52,7 +52,7 @@ def test_kernels_of_other_choices_are_other_ones(tmp_path: Path, monkeypatch: py
 
 def test_the_made_scene_is_read_as_it_was_made(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene")
-    capture = colmap.read(tmp_path / "scene", PosesSettings())
+    capture = colmap.FORMAT.read(tmp_path / "scene", PosesSettings())
     assert len(capture.photos) == VIEWS
     assert capture.points is not None
     assert len(capture.points.xyz) == POINTS

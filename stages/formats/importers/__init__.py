@@ -25,33 +25,29 @@ from stages.video import KNOWN, SUFFIXES
 class Importer:
     """How one format is read.
 
-    module   of this package or one below it, with recognises(folder), files(folder, settings) and, where the format states cameras, read(folder, settings)
-    posed    whether the format states cameras; else they are found from the photographs
+    module   of this package or one below it
+    entry    the name of its `ListFormat`; None: it states no cameras, and the module itself has recognises(folder) and files(folder, settings)
     renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
-    dialect  passed on to `recognises` and `read` where one module reads several formats
-    entry    the `ListFormat` of the module, where it has one in place of these functions
     """
 
     module: str
-    posed: bool = True
+    entry: str | None = "FORMAT"
     renders: bool = False
-    dialect: str | None = None
-    entry: str | None = None
+
+    @property
+    def posed(self) -> bool:
+        """Whether the format states cameras; else they are found from the photographs."""
+        return self.entry is not None
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         """Whether a folder holds files of this format; BadInput where they cannot be read."""
         with one_line_errors(folder):
-            return bool(self._function("recognises")(folder, allow_outside, *self._dialect))
-
-    def holds_less_than_colmap(self, folder: Path, allow_outside: bool) -> bool:
-        """Whether a COLMAP model of the same images in the folder says more of them; of LLFF alone."""
-        with one_line_errors(folder):
-            return bool(self._function("holds_less_than_colmap")(folder, allow_outside))
+            return bool(self._function("recognises")(folder, allow_outside))
 
     def read(self, folder: Path, settings: ImportSettings) -> Capture:
         """The capture, whose names and sentences may be shown; raises BadInput."""
         with one_line_errors(folder):
-            capture: Capture = self._function("read")(folder, settings, *self._dialect)
+            capture: Capture = self._function("read")(folder, settings)
         return replace(capture, warnings=tuple(map(printable, capture.warnings)))
 
     def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
@@ -63,10 +59,6 @@ class Importer:
     def _function(self, name: str) -> Callable[..., Any]:
         module = import_module(f"{__name__}.{self.module}")
         return getattr(module if self.entry is None else getattr(module, self.entry), name)
-
-    @property
-    def _dialect(self) -> tuple[str, ...]:
-        return () if self.dialect is None else (self.dialect,)
 
 
 @contextmanager
@@ -86,24 +78,24 @@ LONGEST = 2000  # characters of a message: a path of the longest kind may be in 
 
 # In order of preference: a folder may hold several formats.
 IMPORTERS: dict[str, Importer] = {
-    "blender": Importer("transforms", renders=True, dialect="blender"),
-    "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
-    "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
-    "scannetpp": Importer("datasets.published", entry="SCANNETPP"),
-    "polycam": Importer("apps.polycam", entry="FORMAT"),
-    "record3d": Importer("apps.record3d", entry="FORMAT"),
-    "3d-scanner-app": Importer("apps.scanner_app", entry="FORMAT"),
-    "metashape": Importer("photogrammetry.metashape", entry="FORMAT"),
-    "realitycapture": Importer("photogrammetry.realitycapture", entry="FORMAT"),
-    "opensfm": Importer("photogrammetry.opensfm", entry="FORMAT"),
-    "kapture": Importer("datasets.published", entry="KAPTURE"),
+    "blender": Importer("transforms", "BLENDER", renders=True),
+    "nerfstudio": Importer("transforms", "NERFSTUDIO", renders=True),
+    "instant-ngp": Importer("transforms", "INSTANT_NGP", renders=True),
+    "scannetpp": Importer("datasets.published", "SCANNETPP"),
+    "polycam": Importer("apps.polycam"),
+    "record3d": Importer("apps.record3d"),
+    "3d-scanner-app": Importer("apps.scanner_app"),
+    "metashape": Importer("photogrammetry.metashape"),
+    "realitycapture": Importer("photogrammetry.realitycapture"),
+    "opensfm": Importer("photogrammetry.opensfm"),
+    "kapture": Importer("datasets.published", "KAPTURE"),
     "llff": Importer("llff"),
     "colmap": Importer("colmap"),
-    "mvsnet": Importer("datasets.published", entry="MVSNET"),
-    "idr": Importer("datasets.published", entry="IDR"),
-    "nsvf": Importer("datasets.published", renders=True, entry="NSVF"),
-    "tanks-and-temples": Importer("datasets.published", entry="TANKS"),
-    "photographs": Importer("photographs", posed=False),
+    "mvsnet": Importer("datasets.published", "MVSNET"),
+    "idr": Importer("datasets.published", "IDR"),
+    "nsvf": Importer("datasets.published", "NSVF", renders=True),
+    "tanks-and-temples": Importer("datasets.published", "TANKS"),
+    "photographs": Importer("photographs", entry=None),
 }
 FORMATS = ("auto", *IMPORTERS)
 
@@ -129,9 +121,12 @@ def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str
         with one_line_errors(folder):
             photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
         found.append("photographs")
-    if {"llff", "colmap"} <= set(found) and llff_factor == "auto" and IMPORTERS["llff"].holds_less_than_colmap(folder, allow_outside):
-        found.remove("colmap")
-        found.insert(found.index("llff"), "colmap")
+    if {"llff", "colmap"} <= set(found) and llff_factor == "auto":
+        with one_line_errors(folder):
+            richer = import_module(f"{__name__}.llff").holds_less_than_colmap(folder, allow_outside)
+        if richer:
+            found.remove("colmap")
+            found.insert(found.index("llff"), "colmap")
     return found
 
 

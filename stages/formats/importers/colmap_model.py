@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,8 @@ import numpy as np
 from efficientnerf.geometry.cameras import MODELS
 from pipeline.errors import BadInput
 from pipeline.text import printable
+from stages.formats.importers.lenses import image_size
+from stages.io.capture import SparsePoints
 
 # Number of each camera model in binary files: (name, how many parameters).
 MODEL_NUMBERS = {
@@ -65,21 +67,10 @@ class PosedImage:
 
 
 @dataclass(frozen=True)
-class Points:
-    """points3D.bin|txt. tracks: of each point the ids of the images that observe it, sorted, each once."""
-
-    xyz: np.ndarray
-    rgb: np.ndarray
-    error: np.ndarray
-    tracks: tuple[tuple[int, ...], ...]
-
-
-@dataclass(frozen=True)
 class Model:
     folder: Path
     cameras: dict[int, Lens]
     images: dict[int, PosedImage]
-    points: Points | None
 
 
 def model_files(folder: Path) -> list[Path] | None:
@@ -92,7 +83,7 @@ def model_files(folder: Path) -> list[Path] | None:
     return None
 
 
-def count_images(found: list[Path]) -> int:
+def count_images(found: Sequence[Path]) -> int:
     """The number of images that a model of these files states, from its header; 0 where it cannot be read."""
     path = found[1]
     if path.suffix == ".bin":
@@ -102,14 +93,8 @@ def count_images(found: list[Path]) -> int:
     return sum(1 for _ in _image_lines(path))
 
 
-def read_model(folder: Path, found: list[Path] | None = None, *, points: bool = True) -> Model:
-    """The model in a folder, with or without its points. Raises BadInput.
-
-    found  its files as they are opened, in the order of `model_files`, where they are known
-    """
-    found = model_files(folder) if found is None else found
-    if found is None:
-        raise BadInput(f"{folder}: no COLMAP model: expected cameras and images as .bin or .txt.")
+def read_model(folder: Path, found: Sequence[Path]) -> Model:
+    """The model in a folder, whose files are opened as they are `found`, in the order of `model_files`. Raises BadInput."""
     for path in found:
         if path.stat().st_size > MAX_FILE:
             raise BadInput(f"{path}: {path.stat().st_size >> 30} GiB; at most {MAX_FILE >> 30} GiB are read.")
@@ -121,8 +106,14 @@ def read_model(folder: Path, found: list[Path] | None = None, *, points: bool = 
             raise BadInput(
                 f"{found[1]}: image {printable(image.name, MAX_NAME)} refers to camera {image.camera}, which {found[0].name} does not hold. {_AGAIN}"
             )
-    cloud = (_points_bin if binary else _points_txt)(found[2]) if points and len(found) == 3 else None
-    return Model(folder, cameras, images, cloud)
+    return Model(folder, cameras, images)
+
+
+def read_points(found: Sequence[Path]) -> SparsePoints | None:
+    """The points of a model that was read from these files; tracks hold the numbers of the images that observe each, sorted, each once. Raises BadInput."""
+    if len(found) < 3:
+        return None
+    return (_points_bin if found[2].suffix == ".bin" else _points_txt)(found[2])
 
 
 class _Bytes:
@@ -184,8 +175,7 @@ def _lens(path: Path, number: int, model: str, width: int, height: int, params: 
         raise BadInput(f"{path}: camera {number} is a {printable(model, 40)}; supported are {supported}. Undistort with `colmap image_undistorter` first.")
     if len(params) != expected:
         raise BadInput(f"{path}: camera {number}: {model} has {expected} parameters, found {len(params)}. {_AGAIN}")
-    if not (0 < width <= 65535 and 0 < height <= 65535):
-        raise BadInput(f"{path}: camera {number}: size {width}x{height}. {_AGAIN}")
+    width, height = image_size(width, height, f"{path}: camera {number}", _AGAIN)
     model, params = as_traced(model, params)
     return Lens(model, width, height, params)
 
@@ -222,7 +212,7 @@ def _images_bin(path: Path) -> dict[int, PosedImage]:
     return images
 
 
-def _points_bin(path: Path) -> Points:
+def _points_bin(path: Path) -> SparsePoints:
     file = _Bytes(path)
     count = file.count(51, "points")
     xyz, rgb, error = np.empty((count, 3)), np.empty((count, 3), np.uint8), np.empty(count)
@@ -235,10 +225,10 @@ def _points_bin(path: Path) -> Points:
         file.skip(8 * length)
         tracks.append(tuple(sorted(set(track[::2]))))
     file.finish()
-    return _finite(path, Points(xyz, rgb, error, tuple(tracks)))
+    return _finite(path, SparsePoints(xyz, rgb, error, tuple(tracks)))
 
 
-def _finite(path: Path, points: Points) -> Points:
+def _finite(path: Path, points: SparsePoints) -> SparsePoints:
     unusable = ~(np.abs(points.xyz) <= MAX_COORDINATE).all(1)  # nan, too
     if unusable.any():
         raise BadInput(f"{path}: {int(unusable.sum())} points are not finite. {_AGAIN}")
@@ -321,7 +311,7 @@ def _images_txt(path: Path) -> dict[int, PosedImage]:
     return images
 
 
-def _points_txt(path: Path) -> Points:
+def _points_txt(path: Path) -> SparsePoints:
     xyz, rgb, error, tracks = [], [], [], []
     for line, text in _lines(path):
         words = text.split()
@@ -339,5 +329,5 @@ def _points_txt(path: Path) -> Points:
         error.append(numbers[6])
         tracks.append(tuple(sorted({_integer(path, line, word) for word in words[8::2]})))
     _check_count(path, "points", len(xyz))
-    points = Points(np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3), np.array(error, np.float64), tuple(tracks))
+    points = SparsePoints(np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3), np.array(error, np.float64), tuple(tracks))
     return _finite(path, points)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -64,12 +64,10 @@ def depth_file(source: Source, path: Path, unit: float, confidence: Path | None 
     return DepthFile(source.real(path), unit, sure, trusted, farthest)
 
 
-def with_depth(capture: Capture, depth_of: Callable[[Photo], DepthFile | None]) -> Capture:
-    """The capture with the points that its depth maps agree on, and what became of them among its facts and warnings. A capture that has points keeps them."""
-    if capture.points is not None:
-        return capture
-    known = [(index, found) for index, photo in enumerate(capture.photos) if (found := depth_of(photo)) is not None]
-    if not known:
+def with_depth(capture: Capture, depths: Sequence[DepthFile | None]) -> Capture:
+    """The capture with the points that the maps of its photos agree on, and what became of them among its facts and warnings; its own points stay."""
+    known = [(index, found) for index, found in enumerate(depths) if found is not None]
+    if capture.points is not None or not known:
         return capture
     every = -(-len(known) // MAX_MAPS)
     maps: dict[int, np.ndarray] = {}

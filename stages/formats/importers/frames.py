@@ -1,44 +1,25 @@
-"""From a list of frames to a capture, for all importers of lists.
+"""Frames, and the images that they name.
 
-Frames name images. Missing images are looked for, one listed folder at a time: where nothing of a listed folder is found, the one folder of the source
-with most of its names stands in for it (images/ listed, rgb/ there). A tie between two folders is not decided.
+Missing images are looked for, one listed folder at a time: where nothing of a listed folder is found, the one folder of the source with most of its names
+stands in for it (images/ listed, rgb/ there). A tie between two folders is not decided.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Generic, TypeVar
-
-import numpy as np
+from typing import Any
 
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from pipeline.text import printable
-from stages.formats.importers import lenses
-from stages.formats.importers.masks import masks_of
 from stages.formats.importers.photographs import NOT_PHOTOGRAPHS
-from stages.formats.importers.source import (
-    IMAGE_SUFFIXES,
-    MAX_FRAMES,
-    MIN_IMAGES,
-    ImportSettings,
-    Source,
-    abbreviated,
-    missing_images_warning,
-    moved_images_warnings,
-    name_key,
-)
-from stages.io.capture import Capture, Photo, SparsePoints
-from stages.io.pictures import Header, UnreadableImage, read_header
+from stages.formats.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, Source, name_key
 
 MAX_NAME = 200  # characters of a listed name that are shown
 USUAL_FOLDERS = ("images", "image", "rgb", "input", "photos", "color")  # which of several that hold a bare name is meant
 _BESIDE_IMAGES = NOT_PHOTOGRAPHS | {"confidence"}  # folders with files of the names of images
-REMEDY = "Copy them into the source folder, or export again without them."
-SPLIT_ORDER = {"train": 0, "val": 1, "test": 2, None: 3}
 
 
 @dataclass(frozen=True)
@@ -50,6 +31,8 @@ class Frame:
     camera  (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
     bare    the format states no folder: the name alone is looked for, and its place is not reported
     mask    where the format names masks; else one next to the image is looked for
+    near, far  along the view axis, where the format states them
+    own     what the format keeps of it for itself
     """
 
     name: str
@@ -59,6 +42,9 @@ class Frame:
     bare: bool = False
     mask: Path | None = None
     split: str | None = None
+    near: float | None = None
+    far: float | None = None
+    own: Any = None
 
 
 def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
@@ -66,11 +52,8 @@ def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
     return lambda name, size: replace(camera, name=name)
 
 
-F = TypeVar("F", bound=Frame)
-
-
 @dataclass
-class Listing(Generic[F]):
+class Listing:
     """Frames with the images that they led to.
 
     found       (frame, its image)
@@ -80,7 +63,7 @@ class Listing(Generic[F]):
     extensions  (listed, found) of those with another extension
     """
 
-    found: list[tuple[F, Path]] = field(default_factory=list)
+    found: list[tuple[Frame, Path]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     repeated: list[tuple[str, str]] = field(default_factory=list)
     places: list[tuple[str, str]] = field(default_factory=list)
@@ -152,9 +135,9 @@ def _best_folder(source: Source, names: Sequence[str], parts: tuple[str, ...], t
     return {name: source.check_inside(path) for name, path in by_folder[ranked[0]].items()}
 
 
-def located(source: Source, frames: Sequence[F]) -> Listing[F]:
+def located(source: Source, frames: Sequence[Frame]) -> Listing:
     """The frames with their images, in the order of the frames. Raises BadInput for an image outside of the source."""
-    listing: Listing[F] = Listing()
+    listing = Listing()
     results = [source.find(frame.name, frame.beside) for frame in frames]
     taken = {result.path for result in results if result.path is not None}
     present = [frame.name for frame, result in zip(frames, results, strict=True) if result.path is not None]
@@ -178,96 +161,3 @@ def located(source: Source, frames: Sequence[F]) -> Listing[F]:
         elif not frame.bare and how == "extension":
             listing.extensions.append((name, source.name_of(path)))
     return listing
-
-
-def files_of(source: Source, frames: Sequence[Frame]) -> list[Path]:
-    """The images of the frames and their masks."""
-    listing = located(source, frames)
-    beside = masks_of(source, [path for frame, path in listing.found if frame.mask is None])
-    masks = [frame.mask for frame, _ in listing.found if frame.mask is not None]
-    return [*(path for _, path in listing.found), *masks, *beside.values()]
-
-
-def capture_of(
-    source: Source,
-    frames: Sequence[Frame],
-    settings: ImportSettings,
-    *,
-    kind: str,
-    where: str,
-    rejected: Sequence[tuple[str, str]] = (),
-    warnings: Sequence[str] = (),
-    points: Callable[[dict[str, int]], SparsePoints | None] | None = None,
-    **more: Any,
-) -> Capture:
-    """The capture of the frames.
-
-    rejected  (name, reason) of images that the source names without a camera, e.g. not aligned
-    points    from the place of each photo by its listed name
-    more      further fields of Capture
-    Raises BadInput where too few images remain.
-    """
-    check_count(len(frames), where)
-    listing = located(source, frames)
-    photos, names, unreadable, remarks = _photos(source, listing)
-    said = [*warnings, *missing_images_warning(where, len(frames), len(photos), listing.missing, settings.strict, REMEDY)]
-    if len(photos) < MIN_IMAGES:
-        raise BadInput(f"{where}: {len(photos)} usable images of {len(frames)} cameras; at least {MIN_IMAGES} are needed.")
-    said += moved_images_warnings(where, listing.places, listing.extensions) + lenses.fit_warnings(where, remarks)
-    said += [f"{name}: {why}; left out." for name, why, _ in unreadable]
-    if rejected:
-        reasons = Counter(why for _, why in rejected).most_common()
-        said += [f"{where}: {count} images are left out, {why}: {abbreviated([name for name, one in rejected if one == why])}." for why, count in reasons]
-    if listing.repeated:
-        said.append(f"{where}: {len(listing.repeated)} cameras name an image that an earlier one has, e.g. {listing.repeated[0][0]}; they were left out.")
-    order = sorted(range(len(photos)), key=lambda index: (SPLIT_ORDER[photos[index].split], photos[index].camera.name))
-    return Capture(
-        kind=kind,
-        photos=tuple(photos[index] for index in order),
-        background=None,
-        points=points({names[index]: place for place, index in enumerate(order)}) if points is not None else None,
-        rejected=(
-            *((name, "listed but missing on disk") for name in listing.missing),
-            *listing.repeated,
-            *((name, why) for name, why, _ in unreadable),
-            *rejected,
-        ),
-        warnings=tuple(said),
-        rejected_files={name: path for name, _, path in unreadable},
-        **more,
-    )
-
-
-def _photos(source: Source, listing: Listing[Frame]) -> tuple[list[Photo], list[str], list[tuple[str, str, Path]], dict[str, list[str]]]:
-    """Photos, their listed names, the unreadable as (name, reason, file), and what `lenses.fit_to_images` remarks."""
-    photos: list[Photo] = []
-    names: list[str] = []
-    unreadable: list[tuple[str, str, Path]] = []
-    remarks: dict[str, list[str]] = {}
-    beside = masks_of(source, [path for frame, path in listing.found if frame.mask is None])
-    readable: list[tuple[Frame, Path]] = []
-    stated: list[tuple[Camera, Header, str]] = []
-    for frame, path in listing.found:
-        name = source.name_of(path)
-        try:
-            header = read_header(source.real(path))
-        except UnreadableImage as error:
-            unreadable.append((name, str(error), source.real(path)))
-            continue
-        stated.append((lenses.validated(frame.camera(name, header.size), frame.where), header, frame.where))
-        readable.append((frame, path))
-    for (frame, path), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
-        if remark is not None:
-            remarks.setdefault(remark, []).append(camera.name)
-        mask = frame.mask or beside.get(path)
-        photos.append(Photo(camera, source.real(path), None if mask is None else source.real(mask), split=frame.split))
-        names.append(frame.name)
-    return photos, names, unreadable, remarks
-
-
-def sparse_points(xyz: np.ndarray, rgb: np.ndarray | None, tracks: Sequence[tuple[int, ...]] | None = None) -> SparsePoints | None:
-    """Points of unknown error; None: there are none."""
-    if not len(xyz):
-        return None
-    colours = np.full((len(xyz), 3), 128, np.uint8) if rgb is None else np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
-    return SparsePoints(xyz, colours, np.full(len(xyz), np.nan), tuple(tracks) if tracks is not None else ((),) * len(xyz))

@@ -60,6 +60,13 @@ def rotation(columns: np.ndarray, where: str) -> np.ndarray:
     return np.asarray(left @ right)
 
 
+def image_size(width: float, height: float, where: str, remedy: str) -> tuple[int, int]:
+    """A size that a file states; BadInput for anything but whole pixels."""
+    if not 0 < min(width, height) <= max(width, height) <= 65535 or width != int(width) or height != int(height):
+        raise BadInput(f"{where}: image size {width:g}x{height:g}; expected whole pixels. {remedy}")
+    return int(width), int(height)
+
+
 def validated(camera: Camera, where: str) -> Camera:
     """The camera itself; BadInput for a lens or a place that cannot be: a focal length that is not positive, numbers that are not finite."""
     named = camera.intrinsics

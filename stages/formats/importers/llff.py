@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,17 +18,12 @@ from efficientnerf.geometry.cameras import Camera, pose_from_llff
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import colmap, lenses
-from stages.formats.importers.masks import masks_of
-from stages.formats.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, name_key
-from stages.io.capture import Capture, Photo
+from stages.formats.importers.frames import Frame
+from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.source import MAX_FRAMES, Source, images_in, name_key
 from stages.io.json_file import LARGEST_NUMBER
-from stages.io.pictures import Header, UnreadableImage, read_header
 
 POSES = "poses_bounds.npy"
-
-
-def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return (folder / POSES).is_file()
 
 
 def holds_less_than_colmap(folder: Path, allow_outside: bool) -> bool:
@@ -50,6 +46,21 @@ def holds_less_than_colmap(folder: Path, allow_outside: bool) -> bool:
     return bool((axes @ mean).min() < np.cos(np.radians(MAX_AXIS_ANGLE)))
 
 
+def _listed(source: Source, signs: Sequence[Path]) -> Listed:
+    rows = _rows(source)
+    images, factor, warnings = _images(source, len(rows))
+    frames = []
+    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
+        where = f"{POSES}: row {index} ({source.name_of(image)})"
+        frames.append(Frame(image.name, image.parent, where, _camera(row, where), near=float(row[15]), far=float(row[16])))
+    facts: dict[str, object] = {"image_folder": printable(images[0].parent.name), "factor": factor}
+    return Listed(POSES, frames, signs, warnings=warnings, facts=facts, unsaid=("resized",))  # for that the folders are there
+
+
+def _signs(source: Source) -> list[Path]:
+    return [path for path in [source.root / POSES] if path.is_file()]
+
+
 def image_folders(folder: Path) -> dict[int, Path]:
     """Reduction factor -> folder of images: images/ is 1, images_4/ is 4."""
     folders = {1: folder / "images"} if images_in(folder / "images") else {}
@@ -60,70 +71,22 @@ def image_folders(folder: Path) -> dict[int, Path]:
     return dict(sorted(folders.items()))
 
 
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The matrix of poses, the images of the folder that is used, and their masks."""
-    source = Source(folder, settings.allow_outside)
-    images = _images(source, settings, len(_rows(source)))[0]
-    return [folder / POSES, *images, *masks_of(source, images).values()]
-
-
-def read(folder: Path, settings: ImportSettings) -> Capture:
-    """The capture that poses_bounds.npy describes. Raises BadInput."""
-    source = Source(folder, settings.allow_outside)
-    rows = _rows(source)
-    images, factor, warnings = _images(source, settings, len(rows))
-    masks = masks_of(source, images)
-    photos: list[Photo] = []
-    rejected: list[tuple[str, str]] = []
-    rejected_files: dict[str, Path] = {}
-    remarks: dict[str, list[str]] = {}
-    readable: list[tuple[Path, float, float]] = []
-    stated: list[tuple[Camera, Header, str]] = []
-    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
-        name, where = source.name_of(image), f"{POSES}: row {index} ({source.name_of(image)})"
-        try:
-            header = read_header(source.real(image))
-        except UnreadableImage as error:
-            rejected.append((name, str(error)))
-            rejected_files[name] = source.real(image)
-            warnings.append(f"{name}: {error}; left out.")
-            continue
-        stated.append((_camera(row, name, where), header, where))
-        near, far = float(row[15]), float(row[16])
-        if not 0 < near < far:
-            raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
-        readable.append((image, near, far))
-    for (image, near, far), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
-        if remark in ("turned", "upright?"):  # another size than stated is what the folders are for
-            remarks.setdefault(str(remark), []).append(camera.name)
-        mask = source.real(masks[image]) if image in masks else None
-        photos.append(Photo(camera, source.real(image), mask, near=near, far=far))
-    if len(photos) < MIN_IMAGES:
-        raise BadInput(f"{folder}: {len(photos)} usable images; at least {MIN_IMAGES} are needed.")
-    return Capture(
-        kind="llff",
-        photos=tuple(photos),
-        background=None,
-        rejected=tuple(rejected),
-        warnings=tuple(warnings + lenses.fit_warnings(POSES, remarks)),
-        facts={"image_folder": printable(images[0].parent.name), "factor": factor},
-        rejected_files=rejected_files,
-    )
-
-
 def _rows(source: Source) -> np.ndarray:
     return read_rows(source.real(source.root / POSES))
 
 
-def _camera(row: np.ndarray, name: str, where: str) -> Camera:
-    matrix = row[:15].reshape(3, 5)
-    pose = pose_from_llff(matrix[:, :4])
-    pose[:3, :3] = lenses.rotation(pose[:3, :3], where)
-    height, width, focal = matrix[:, 4]
-    if width != round(width) or height != round(height) or not (0 < width <= 65535 and 0 < height <= 65535):
-        raise BadInput(f"{where}: h, w are {height:g}, {width:g}; expected the image size in whole pixels.")
-    width, height = int(width), int(height)
-    return lenses.validated(Camera(name, width, height, "SIMPLE_PINHOLE", (float(focal), width / 2, height / 2), pose), where)
+def _camera(row: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
+    def camera(name: str, size: tuple[int, int]) -> Camera:
+        matrix, (near, far) = row[:15].reshape(3, 5), row[15:]
+        pose = pose_from_llff(matrix[:, :4])
+        pose[:3, :3] = lenses.rotation(pose[:3, :3], where)
+        height, width, focal = matrix[:, 4]
+        size_stated = lenses.image_size(width, height, where, "Write poses_bounds.npy again.")
+        if not 0 < near < far:
+            raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
+        return Camera(name, *size_stated, "SIMPLE_PINHOLE", (float(focal), width / 2, height / 2), pose)
+
+    return camera
 
 
 def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
@@ -162,19 +125,17 @@ def npy_header(path: Path, data: bytes) -> tuple[tuple[int, ...], bool, np.dtype
     return tuple(map(int, shape)), fortran, kind, file.tell()  # True is an integer to the parser
 
 
-def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[Path], int, list[str]]:
+def _images(source: Source, count: int) -> tuple[list[Path], int, list[str]]:
     """The images in the order of the rows, the reduction factor of their folder, and warnings."""
     folders = image_folders(source.root)
     if not folders:
         raise BadInput(f"{source.root}: {POSES} without images: expected a folder images, images_4, images_8 ... next to it.")
     counts = {factor: len(images_in(folder)) for factor, folder in folders.items()}
-    if settings.llff_factor != "auto":
-        if settings.llff_factor not in folders:
-            there = ", ".join(folder.name for folder in folders.values())
-            raise BadInput(f"{source.root}: no images reduced by {settings.llff_factor} (poses.llff_factor); there are {there}.")
-        usable = [settings.llff_factor]
-    else:
-        usable = list(folders)
+    wanted = source.llff_factor
+    if wanted != "auto" and wanted not in folders:
+        there = ", ".join(folder.name for folder in folders.values())
+        raise BadInput(f"{source.root}: no images reduced by {wanted} (poses.llff_factor); there are {there}.")
+    usable = list(folders) if wanted == "auto" else [wanted]
     fitting = [factor for factor in usable if counts[factor] == count]
     if not fitting:
         found = ", ".join(f"{folders[factor].name} holds {counts[factor]}" for factor in usable)
@@ -183,3 +144,6 @@ def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[
     if fitting[0] != usable[0]:
         warnings.append(f"{folders[usable[0]].name} holds {counts[usable[0]]} images for {count} poses; {folders[fitting[0]].name} is used instead.")
     return [source.check_inside(image) for image in images_in(folders[fitting[0]])], fitting[0], warnings
+
+
+FORMAT = ListFormat("llff", f"{POSES} next to a folder images, images_4 or the like", _signs, _listed)

@@ -74,6 +74,7 @@ class Source:
 
     root           the folder
     allow_outside  whether files outside it may be read
+    llff_factor    of the settings
     runs           run folders below it that a look-up met: they were made from the source, and are no part of it
     links          linked folders that a look-up met and did not follow, for they lead out of it
     remarks        sentences about files that are left aside, each once
@@ -81,6 +82,7 @@ class Source:
 
     root: Path
     allow_outside: bool = False
+    llff_factor: int | Auto = "auto"
     runs: set[Path] = field(default_factory=set)
     links: set[Path] = field(default_factory=set)
     remarks: dict[str, None] = field(default_factory=dict)
@@ -304,25 +306,3 @@ def one_of_each(images: Sequence[Path]) -> list[Path]:
         return any(key.endswith(ending) and (path.parent, key.removesuffix(ending)) in named for ending in MASK_ENDINGS)
 
     return [path for path in images if (path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in developed) and not is_mask(path)]
-
-
-def missing_images_warning(where: str, total: int, kept: int, missing: Sequence[str], strict: bool, remedy: str) -> list[str]:
-    """The warning about images that are listed but absent, if any; BadInput where too few remain or `strict` forbids it."""
-    if not missing:
-        return []
-    sentence = f"{where}: {len(missing)} of {total} listed images are missing: {abbreviated(missing)}."
-    if kept < MIN_IMAGES:
-        raise BadInput(f"{sentence} {kept} remain; at least {MIN_IMAGES} are needed. {remedy}")
-    if strict:
-        raise BadInput(f"{sentence} Refused by --strict. {remedy}")
-    return [sentence]
-
-
-def moved_images_warnings(where: str, places: Sequence[tuple[str, str]], extensions: Sequence[tuple[str, str]]) -> list[str]:
-    """Warnings about images found elsewhere than listed, as (listed, found)."""
-    sentences = []
-    if places:
-        sentences.append(f"{where}: {len(places)} images are not where they are listed and were found by name, e.g. {places[0][0]} as {places[0][1]}.")
-    if extensions:
-        sentences.append(f"{where}: {len(extensions)} images have another extension than listed, e.g. {extensions[0][0]} is {extensions[0][1]}.")
-    return sentences

@@ -13,31 +13,28 @@ becomes sparse points where images agree on it. The capture's frame is that of t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from pipeline.text import printable
-from stages.formats.importers import lenses
-from stages.formats.importers.depth import DepthFile, depth_file, with_depth
-from stages.formats.importers.frames import SPLIT_ORDER, Frame, Listing, located
+from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.frames import MAX_NAME, Frame
+from stages.formats.importers.listed import Z_UP, Listed, ListFormat, Masks, sparse_points
 from stages.formats.importers.masks import masks_of
-from stages.formats.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, missing_images_warning, moved_images_warnings
-from stages.formats.importers.transforms_camera import lens_of, pose_of
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.formats.importers.source import MAX_FRAMES, MIN_IMAGES, Source
+from stages.formats.importers.transforms_camera import camera_of
+from stages.io.capture import Capture, SparsePoints
 from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
 from stages.io.meshes.ply import read_ply
-from stages.io.pictures import Header, UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 MAX_PLY = 1 << 30  # bytes
-MAX_NAME = 200  # characters of a listed name that are shown
-_REMEDY = "Copy them into the source folder, or take their frames out of the JSON."
 _NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path")
 _NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
 _NGP_FACTS = ("aabb_scale", "scale", "offset")
@@ -46,97 +43,69 @@ _MILLIMETRE = 0.001  # metres
 _NGP_SCALE = 0.33  # of instant-ngp, where the file states none
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Frame(Frame):
-    """A frame of a file, which holds `document`, of which `entry` is the frame's part."""
-
-    file: Path
-    document: dict[str, Any]
-    entry: dict[str, Any]
+Documents = list[tuple[Path, dict[str, Any]]]  # the files of a data set, and what they hold
 
 
-def json_files(folder: Path) -> list[Path]:
+def _json_files(source: Source) -> list[Path]:
     """The JSON files that make up the data set: those of the splits, or transforms.json."""
-    splits = [folder / name for name in SPLIT_FILES if (folder / name).is_file()]
-    whole = folder / "transforms.json"
+    splits = [source.root / name for name in SPLIT_FILES if (source.root / name).is_file()]
+    whole = source.root / "transforms.json"
     return splits or ([whole] if whole.is_file() else [])
 
 
-def dialect(source: Source) -> str:
-    """ "blender", "nerfstudio" or "instant-ngp", by the keys that only one of them has."""
-    document = _documents(source)[0][1]
+def _is_of(kind: str, source: Source, signs: Sequence[Path]) -> bool:
+    """Whether a transforms.json is of this dialect, by the keys that only one of them has. Raises BadInput where it cannot be read."""
+    document = _documents(source, signs)[0][1]
     frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
     if any(key in document for key in _NERFSTUDIO_KEYS) or any("mask_path" in frame or "depth_file_path" in frame for frame in frames):
-        return "nerfstudio"
+        return kind == "nerfstudio"
     if any(key in document for key in _NGP_KEYS) or any("transform_matrix_start" in frame for frame in frames):
-        return "instant-ngp"
-    return "blender" if "camera_angle_x" in document and "fl_x" not in document else "nerfstudio"
+        return kind == "instant-ngp"
+    return kind == ("blender" if "camera_angle_x" in document and "fl_x" not in document else "nerfstudio")
 
 
-def recognises(folder: Path, allow_outside: bool, kind: str) -> bool:
-    """Whether a folder holds a transforms.json of this dialect. Raises BadInput where it cannot be read."""
-    return bool(json_files(folder)) and dialect(Source(folder, allow_outside)) == kind
+def _documents(source: Source, signs: Sequence[Path]) -> Documents:
+    return [(file, read_document(source.real(file))) for file in signs]
 
 
-def _documents(source: Source) -> list[tuple[Path, dict[str, Any]]]:
-    """The files of the data set and what they hold."""
-    return [(file, read_document(source.real(file))) for file in json_files(source.root)]
+def _listed(kind: str, source: Source, signs: Sequence[Path]) -> Listed:
+    documents = _documents(source, signs)
+    first, where = documents[0][1], ", ".join(file.name for file in signs)
+    frames = _frames(documents)
 
+    def finish(capture: Capture, kept: Sequence[Frame]) -> Capture:
+        warnings = _remarks(capture, kept)
+        if signs[0].name in SPLIT_FILES and (source.root / "transforms.json").is_file():
+            warnings.append(f"transforms.json is not read: {where} have the same frames, with splits.")
+        points, more = _points(source, first)
+        return replace(capture, points=points, warnings=(*capture.warnings, *warnings, *more))
 
-def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The JSON files, the images and masks that they name, and the points."""
-    source = Source(folder, settings.allow_outside)
-    paths: dict[Path, None] = dict.fromkeys(json_files(folder))
-    for _, document in _documents(source):
-        ply = _ply(source, document)
-        if ply is not None:
-            paths[ply] = None
-    found = located(source, _frames(source)).found
-    paths |= dict.fromkeys(mask for mask, _ in _masks(source, found).values())
-    for frame, image in found:
-        paths[image] = None
-        depth = _depth(source, frame, image)
-        if depth is not None:
-            paths[depth.file] = None
-    return list(paths)
-
-
-def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Capture:
-    """The capture that a folder's transforms*.json describes; `kind` overrides the dialect. Raises BadInput."""
-    if not json_files(folder):
-        raise BadInput(f"{folder}: no transforms.json or transforms_train.json. Name the folder that holds it, or choose another format with --as.")
-    source = Source(folder, settings.allow_outside)
-    kind = kind or dialect(source)
-    where = ", ".join(file.name for file in json_files(folder))
-    frames = _frames(source)
-    listing = located(source, frames)
-    photos, unreadable, remarks, lens_warnings = _photos(source, listing)
-    rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *((name, why) for name, why, _ in unreadable)]
-    warnings = missing_images_warning(where, len(frames), len(photos), listing.missing, settings.strict, _REMEDY)
-    if len(photos) < MIN_IMAGES:
-        raise BadInput(f"{folder / where}: {len(photos)} usable images of {len(frames)} frames; at least {MIN_IMAGES} are needed.")
-    warnings += moved_images_warnings(where, listing.places, listing.extensions) + lenses.fit_warnings(where, remarks) + lens_warnings
-    if listing.repeated:
-        warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
-    document = _documents(source)[0][1]
-    if len({file.name for file in json_files(folder)} & set(SPLIT_FILES)) and (folder / "transforms.json").is_file():
-        warnings.append(f"transforms.json is not read: {where} have the same frames, with splits.")
-    points, point_warnings = _points(source, document)
-    capture = Capture(
-        kind=kind,
-        photos=tuple(sorted(photos, key=lambda photo: (SPLIT_ORDER[photo.split], photo.camera.name))),
-        background=None,
-        up=np.array([0.0, 0.0, 1.0]) if kind == "blender" else None,
-        points=points,
-        bounds=_bounds(document, json_files(folder)[0]) if kind == "instant-ngp" else None,
-        rejected=tuple(rejected),
-        warnings=tuple(warnings + point_warnings),
-        metric=any("depth_file_path" in frame.entry for frame, _ in listing.found) and "applied_scale" not in document,
-        facts={key: _fact(document[key]) for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
-        rejected_files={name: file for name, _, file in unreadable},
+    return Listed(
+        where,
+        frames,
+        [*signs, *(ply for _, document in documents if (ply := _ply(source, document)) is not None)],
+        up=Z_UP if kind == "blender" else None,
+        bounds=_bounds(first, signs[0]) if kind == "instant-ngp" else None,
+        metric=any("depth_file_path" in frame.own[1] for frame in frames) and "applied_scale" not in first,
+        facts={key: _fact(first[key]) for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in first},
+        masks=_masks,
+        depth=partial(_depth, source),
+        finish=finish,
+        remedy="Copy them into the source folder, or take their frames out of the JSON.",
     )
-    maps = {source.real(image): _depth(source, frame, image) for frame, image in listing.found}
-    return with_depth(capture, lambda photo: maps.get(photo.image))
+
+
+def _remarks(capture: Capture, kept: Sequence[Frame]) -> list[str]:
+    """Warnings about frames whose images are used."""
+    warnings = []
+    if rolling := sum("transform_matrix" not in frame.own[1] for frame in kept):
+        warnings.append(f"{rolling} frames have a rolling shutter (transform_matrix_start, _end); the middle pose is used.")
+    if lost := sum("mask_path" in frame.own[1] and photo.mask is None for frame, photo in zip(kept, capture.photos, strict=True)):
+        warnings.append(f"{lost} listed masks (mask_path) are missing; those images are used without one.")
+    cameras = [photo.camera for photo in capture.photos]
+    if off := sum(not (0 < camera.intrinsics["cx"] < camera.width and 0 < camera.intrinsics["cy"] < camera.height) for camera in cameras):
+        warnings.append(f"{off} cameras have their principal point outside the image: cx, cy may belong to another size.")
+    return warnings
 
 
 def _fact(value: Any, depth: int = 2) -> Any:
@@ -160,8 +129,8 @@ def read_document(file: Path, max_frames: int = MAX_FRAMES) -> dict[str, Any]:
     return document
 
 
-def _frames(source: Source) -> list[_Frame]:
-    documents = _documents(source)
+def _frames(documents: Documents) -> list[Frame]:
+    """Each keeps its document, and its own part of it."""
     listed = []
     for file, document in documents:
         split_of_file = SPLIT_FILES.get(file.name) if len(documents) > 1 else None
@@ -171,12 +140,8 @@ def _frames(source: Source) -> list[_Frame]:
                 raise BadInput(f"{file}: frame {index} has no `file_path`. Write the data set again, or take it out.")
             name = entry["file_path"]
             where, split = f"{file.name}: frame {index} ({printable(name, MAX_NAME)})", split_of_file or split_of_name.get(_plain(name))
-            listed.append(_Frame(name, file.parent, where, _camera(document, entry, where), split=split, file=file, document=document, entry=entry))
+            listed.append(Frame(name, file.parent, where, camera_of(document, entry, where), split=split, own=(document, entry)))
     return listed
-
-
-def _camera(document: dict[str, Any], entry: dict[str, Any], where: str) -> Callable[[str, tuple[int, int]], Camera]:
-    return lambda name, size: lens_of(document | entry, name, size, pose_of(entry, where), where)
 
 
 def _listed_splits(document: dict[str, Any], file: Path) -> Iterator[tuple[str, str]]:
@@ -191,72 +156,35 @@ def _plain(name: str) -> str:
     return name.removeprefix("./").replace("\\", "/")
 
 
-def _photos(source: Source, listing: Listing[_Frame]) -> tuple[list[Photo], list[tuple[str, str, Path]], dict[str, list[str]], list[str]]:
-    """Photos, the unreadable as (name, reason, file), what `lenses.fit_to_images` remarks, and warnings."""
-    photos: list[Photo] = []
-    rejected: list[tuple[str, str, Path]] = []
-    remarks: dict[str, list[str]] = {}
-    warnings: list[str] = []
-    rolling = lost_masks = 0
-    readable: list[tuple[_Frame, Path]] = []
-    stated: list[tuple[Camera, Header, str]] = []
-    for frame, image in listing.found:
-        name = source.name_of(image)
-        try:
-            header = read_header(source.real(image))
-        except UnreadableImage as error:
-            rejected.append((name, str(error), source.real(image)))
-            warnings.append(f"{name}: {error}; left out.")
-            continue
-        rolling += "transform_matrix" not in frame.entry
-        stated.append((frame.camera(name, header.size), header, frame.where))
-        readable.append((frame, image))
-    masks = _masks(source, listing.found)
-    for (frame, image), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
-        if remark is not None:
-            remarks.setdefault(remark, []).append(camera.name)
-        mask, ignore = masks.get(image, (None, "black"))
-        lost_masks += mask is None and "mask_path" in frame.entry
-        photos.append(Photo(camera, source.real(image), None if mask is None else source.real(mask), ignore, frame.split))
-    if rolling:
-        warnings.append(f"{rolling} frames have a rolling shutter (transform_matrix_start, _end); the middle pose is used.")
-    if lost_masks:
-        warnings.append(f"{lost_masks} listed masks (mask_path) are missing; those images are used without one.")
-    centred = [photo for photo in photos if 0 < photo.camera.intrinsics["cx"] < photo.camera.width and 0 < photo.camera.intrinsics["cy"] < photo.camera.height]
-    if len(centred) < len(photos):
-        warnings.append(f"{len(photos) - len(centred)} cameras have their principal point outside the image: cx, cy may belong to another size.")
-    return photos, rejected, remarks, warnings
-
-
-def _masks(source: Source, found: Sequence[tuple[_Frame, Path]]) -> dict[Path, tuple[Path, str]]:
-    """Image -> its mask and which of the mask's pixels are left out: the mask that its frame names; of frames that name none, that next to the image."""
-    masks: dict[Path, tuple[Path, str]] = {}
+def _masks(source: Source, found: Sequence[tuple[Frame, Path]]) -> Masks:
+    """The masks that frames name; of frames that name none, those next to their images."""
+    masks: Masks = {}
     unnamed = []
     for frame, image in found:
-        listed = frame.entry.get("mask_path")
-        mask: Path | None
+        listed = frame.own[1].get("mask_path")
         if isinstance(listed, str) and listed:
-            mask, ignore = source.find(listed, frame.file.parent).path, "black"
+            if (mask := source.find(listed, frame.beside).path) is not None:
+                masks[image] = mask, "black"
+            continue
+        beside = (image.with_name(f"dynamic_mask_{name}.png") for name in (image.stem, image.name))
+        dynamic = next((source.check_inside(path) for path in beside if os.path.isfile(path)), None)
+        if dynamic is not None:
+            masks[image] = dynamic, "white"
         else:
-            names = (f"dynamic_mask_{image.stem}.png", f"dynamic_mask_{image.name}.png")
-            beside = (image.with_name(name) for name in names)
-            mask, ignore = next((source.check_inside(path) for path in beside if os.path.isfile(path)), None), "white"
-            if mask is None:
-                unnamed.append(image)
-        if mask is not None:
-            masks[image] = mask, ignore
+            unnamed.append(image)
     return masks | {image: (mask, "black") for image, mask in masks_of(source, unnamed).items()}
 
 
-def _depth(source: Source, frame: _Frame, image: Path) -> DepthFile | None:
+def _depth(source: Source, frame: Frame, image: Path) -> DepthFile | None:
     """The depth of a frame: nerfstudio's in millimetres, instant-ngp's in units that the file states. Of poses that were scaled afterwards it is not used."""
-    if isinstance(frame.entry.get("depth_file_path"), str) and "applied_scale" not in frame.document:
-        listed, unit = frame.entry["depth_file_path"], _MILLIMETRE
-    elif isinstance(frame.entry.get("depth_path"), str):
-        listed, unit = frame.entry["depth_path"], finite(frame.document.get("integer_depth_scale")) or 0.0
+    document, entry = frame.own
+    if isinstance(entry.get("depth_file_path"), str) and "applied_scale" not in document:
+        listed, unit = entry["depth_file_path"], _MILLIMETRE
+    elif isinstance(entry.get("depth_path"), str):
+        listed, unit = entry["depth_path"], finite(document.get("integer_depth_scale")) or 0.0
     else:
         return None
-    path = source.find(listed, frame.file.parent, (".png",)).path if unit > 0 else None
+    path = source.find(listed, frame.beside, (".png",)).path if unit > 0 else None
     return None if path is None or path == image or path.suffix.lower() != ".png" else depth_file(source, path, unit)
 
 
@@ -292,10 +220,14 @@ def _points(source: Source, document: dict[str, Any]) -> tuple[SparsePoints | No
             cloud = read_ply(file, os.fstat(file.fileno()).st_size)
     except (OSError, ValueError, OverflowError) as error:
         return None, [f"{path.name}: not readable as a PLY of points ({printable(error, 80)}); the points are not used."]
-    xyz = cloud.vertices
-    rgb = np.full((len(xyz), 3), 128, np.uint8) if cloud.colours is None else cloud.colours
-    usable = (np.abs(xyz) <= LARGEST_NUMBER).all(-1)  # not nan either
+    usable = (np.abs(cloud.vertices) <= LARGEST_NUMBER).all(-1)  # not nan either
     if not usable.any():
         return None, [f"{path.name}: holds no points; not used."]
-    xyz, rgb = xyz[usable], rgb[usable]
-    return SparsePoints(xyz, rgb, np.full(len(xyz), np.nan), ((),) * len(xyz)), []
+    return sparse_points(cloud.vertices[usable], None if cloud.colours is None else cloud.colours[usable]), []
+
+
+def _format(kind: str) -> ListFormat:
+    return ListFormat(kind, "transforms.json or transforms_train.json", _json_files, partial(_listed, kind), partial(_is_of, kind))
+
+
+BLENDER, NERFSTUDIO, INSTANT_NGP = map(_format, ("blender", "nerfstudio", "instant-ngp"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from efficientnerf.geometry.cameras import MODELS, Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.formats.importers import lenses
-from stages.io.json_file import finite, shown
+from stages.io import json_file
+from stages.io.json_file import shown
 
 MIN_ANGLE = 1e-9  # radians; its tangent is a number yet
 _UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")
@@ -29,6 +31,11 @@ def pose_of(entry: dict[str, Any], where: str) -> np.ndarray:
     raise BadInput(f"{where}: no `transform_matrix`. Write the data set again, or take that frame out.")
 
 
+def camera_of(document: dict[str, Any], entry: dict[str, Any], where: str) -> Callable[[str, tuple[int, int]], Camera]:
+    """For a frame: the camera of an entry of the document. Raises BadInput when it is called."""
+    return lambda name, size: lens_of(document | entry, name, size, pose_of(entry, where), where)
+
+
 def lens_of(given: dict[str, Any], name: str, actual: tuple[int, int], pose: np.ndarray, where: str) -> Camera:
     """The camera at the size that the file states, or at the image's own where it states none.
 
@@ -36,22 +43,18 @@ def lens_of(given: dict[str, Any], name: str, actual: tuple[int, int], pose: np.
     """
 
     def number(key: str, default: float = 0.0) -> float:
-        value = finite(given.get(key, default))
-        if value is None:
-            raise BadInput(f"{where}: {key} is {shown(given[key])}, expected a finite number. Write the data set again.")
-        return value
+        return json_file.number(given, key, where, "Write the data set again.", default)
 
     for key in _UNSUPPORTED:
         if given.get(key):
             raise BadInput(f"{where}: lens model {key} is not supported. Undistort the images first, e.g. to a pinhole or OPENCV_FISHEYE camera.")
     width, height = (number("w", actual[0]), number("h", actual[1])) if "w" in given and "h" in given else actual
-    if width != int(width) or height != int(height) or not (0 < width <= 65535 and 0 < height <= 65535):
-        raise BadInput(f"{where}: w, h are {width:g}x{height:g}; expected the image size in whole pixels.")
+    stated = lenses.image_size(width, height, where, "Correct w and h.")
     fx, fy = _focal(given, number, width, height, where)
     named = {"f": fx, "fx": fx, "fy": fy, "cx": number("cx", width / 2), "cy": number("cy", height / 2)}
     named |= {key: number(key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
     model = _model(given, named, where)
-    camera = Camera(name, int(width), int(height), model, tuple(named[parameter] for parameter in MODELS[model]), pose)
+    camera = Camera(name, *stated, model, tuple(named[parameter] for parameter in MODELS[model]), pose)
     return lenses.validated(camera, where)
 
 

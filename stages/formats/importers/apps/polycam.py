@@ -12,16 +12,15 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from efficientnerf.geometry.cameras import Camera, pose_from_opengl
 from pipeline.errors import BadInput
-from stages.formats.importers import frames, lenses
+from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera
 from stages.formats.importers.depth import DepthFile, depth_file
-from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.frames import Frame, check_count, stated
+from stages.formats.importers.listed import Y_UP, Listed, ListFormat
 from stages.formats.importers.source import Source, images_in
-from stages.io.json_file import finite, read_json, shown
+from stages.io.json_file import number, read_object
 
 KEYFRAMES = "keyframes"
 EXPECTED = f"{KEYFRAMES}/images with {KEYFRAMES}/cameras, or their corrected versions"
@@ -42,21 +41,23 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     where, found = f"{KEYFRAMES}/{cameras}", _cameras(source, cameras)
     raw = "keyframes/corrected_cameras is not there: the phone's own poses and images with some distortion are used. Process with loop closure."
     posed, place = {path.stem for path in found}, source.root / KEYFRAMES / images
-    frames.check_count(len(found), where)
-    more = {
-        "rejected": [(source.name_of(path), "without a camera file") for path in images_in(place) if path.stem not in posed],
-        "warnings": [raw] if cameras == "cameras" else [],
-        "up": np.array([0.0, 1.0, 0.0]),
-        "metric": True,
-        "facts": {"cameras": cameras},
-    }
-    listed = [frames.Frame(path.stem, place, source.name_of(path), frames.stated(_camera(source, path)), bare=True) for path in found]
-    return Listed(where, listed, found, partial(_depth, source), more)
+    check_count(len(found), where)
+    return Listed(
+        where,
+        [Frame(path.stem, place, source.name_of(path), stated(_camera(source, path)), bare=True) for path in found],
+        found,
+        rejected=[(source.name_of(path), "without a camera file") for path in images_in(place) if path.stem not in posed],
+        warnings=[raw] if cameras == "cameras" else [],
+        up=Y_UP,
+        metric=True,
+        facts={"cameras": cameras},
+        depth=partial(_depth, source),
+    )
 
 
-def _depth(source: Source, stem: str) -> DepthFile | None:
+def _depth(source: Source, frame: Frame, image: Path) -> DepthFile | None:
     place = source.root / KEYFRAMES
-    return depth_file(source, place / f"depth/{stem}.png", MILLIMETRE, place / f"confidence/{stem}.png", HIGH, FARTHEST)
+    return depth_file(source, place / f"depth/{image.stem}.png", MILLIMETRE, place / f"confidence/{image.stem}.png", HIGH, FARTHEST)
 
 
 def _cameras(source: Source, name: str) -> list[Path]:
@@ -74,22 +75,12 @@ def _kind(source: Source) -> tuple[str, str]:
 
 def _camera(source: Source, path: Path) -> Camera:
     where = source.name_of(path)
-    document = read_json(source.real(path), _AGAIN, limit=LARGEST_CAMERA)
-    if not isinstance(document, dict):
-        raise BadInput(f"{where}: {shown(document)}; expected an object. {_AGAIN}")
-
-    def value(key: str) -> float:
-        found = finite(document.get(key))
-        if found is None:
-            raise BadInput(f"{where}: {key} is {shown(document.get(key))}, expected a finite number. {_AGAIN}")
-        return found
-
-    width, height = value("width"), value("height")
-    if width != int(width) or height != int(height) or not (0 < min(width, height) <= max(width, height) <= 65535):
-        raise BadInput(f"{where}: image size {width:g}x{height:g}; expected whole pixels. {_AGAIN}")
+    document = read_object(source.real(path), where, _AGAIN, limit=LARGEST_CAMERA)
+    value = partial(number, document, where=where, remedy=_AGAIN)
+    size = lenses.image_size(value("width"), value("height"), where, _AGAIN)
     rows = [[value(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     pose = pose_from_opengl(lenses.rigid([*rows, [0, 0, 0, 1]], where))
-    lens = brown_camera("", (int(width), int(height)), (value("fx"), value("fy")), (value("cx"), value("cy")), (), (0, 0), where)
+    lens = brown_camera("", size, (value("fx"), value("fy")), (value("cx"), value("cy")), (), (0, 0), where)
     return replace(lens, world_from_camera=pose)
 
 

@@ -16,10 +16,11 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import pose_from_colmap, pose_from_opengl
 from pipeline.errors import BadInput
-from stages.formats.importers import frames
+from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera
 from stages.formats.importers.depth import DepthFile, depth_file
-from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.frames import Frame, check_count, stated
+from stages.formats.importers.listed import Y_UP, Listed, ListFormat
 from stages.formats.importers.source import Source, images_in
 from stages.io.json_file import numbers, read_json, shown
 
@@ -29,8 +30,8 @@ METADATA, IMAGES = "metadata.json", "rgb"
 _AGAIN = "Export from Record3D again, as EXR + JPG."
 
 
-def _depth(source: Source, place: Path, stem: str) -> DepthFile | None:
-    return depth_file(source, place / f"depth/{stem}.exr", 1.0, farthest=FARTHEST)
+def _depth(source: Source, place: Path, frame: Frame, image: Path) -> DepthFile | None:
+    return depth_file(source, place / f"depth/{image.stem}.exr", 1.0, farthest=FARTHEST)
 
 
 def _signs(source: Source) -> Sequence[Path]:
@@ -50,15 +51,14 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     if not isinstance(poses, list) or not isinstance(coefficients, list) or (coefficients and len(coefficients) != len(poses)):
         raise BadInput(f"{where}: poses are {shown(poses)} and perFrameIntrinsicCoeffs {shown(coefficients)}; expected lists of one length. {_AGAIN}")
     width, height = numbers([document.get("w"), document.get("h")], 2, f"{where}: w, h", _AGAIN)
-    if width != int(width) or height != int(height) or not 0 < min(width, height) <= max(width, height) <= 65535:
-        raise BadInput(f"{where}: image size {width:g}x{height:g}; expected whole pixels. {_AGAIN}")
+    size = lenses.image_size(width, height, where, _AGAIN)
     common: list[float] = []
     if not coefficients:
         k = numbers(document.get("K"), 9, f"{where}: K", _AGAIN)  # column by column
         common = [k[0], k[4], k[6], k[7]]
     listed, unposed = [], []
     images = images_in(place / IMAGES)
-    frames.check_count(len(images), where)
+    check_count(len(images), where)
     for image in sorted(images, key=lambda path: (len(path.stem), path.stem)):
         index = int(image.stem) if image.stem.isascii() and image.stem.isdecimal() and len(image.stem) < 10 else len(poses)
         if index >= len(poses):
@@ -66,11 +66,10 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
             continue
         what = f"{where}: frame {index}"
         fx, fy, cx, cy = common or numbers(coefficients[index], 4, f"{what}: perFrameIntrinsicCoeffs", _AGAIN)
-        lens = brown_camera("", (int(width), int(height)), (fx, fy), (cx, cy), (), (0, 0), what)
+        lens = brown_camera("", size, (fx, fy), (cx, cy), (), (0, 0), what)
         camera = replace(lens, world_from_camera=_pose(numbers(poses[index], 7, f"{what}: pose", _AGAIN), what))
-        listed.append(frames.Frame(image.name, image.parent, what, frames.stated(camera)))
-    more = {"rejected": unposed, "up": np.array([0.0, 1.0, 0.0]), "metric": True}
-    return Listed(where, listed, signs, partial(_depth, source, place), more)
+        listed.append(Frame(image.name, image.parent, what, stated(camera)))
+    return Listed(where, listed, signs, rejected=unposed, up=Y_UP, metric=True, depth=partial(_depth, source, place))
 
 
 def _pose(values: list[float], where: str) -> np.ndarray:

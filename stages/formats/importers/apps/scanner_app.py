@@ -14,18 +14,18 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, pose_from_opengl
 from pipeline.errors import BadInput
-from stages.formats.importers import frames, lenses
+from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera
 from stages.formats.importers.depth import DepthFile, depth_file
-from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.frames import Frame, check_count
+from stages.formats.importers.listed import Y_UP, Listed, ListFormat
 from stages.formats.importers.source import Source, images_in
-from stages.io.json_file import numbers, read_json, shown
+from stages.io.json_file import numbers, read_json, read_object
 
 POSE, INTRINSICS = "cameraPoseARFrame", "intrinsics"
 LARGEST_FRAME = 1 << 20  # bytes
@@ -56,20 +56,22 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     place = _place(source)
     pictures, where = _pictures(place), source.name_of(place / "frame_*.json")
     posed = [path for path in pictures if _is_posed(path)]
-    frames.check_count(len(posed), where)
+    check_count(len(posed), where)
     poses = sum(1 for path in place.glob("frame_*.json") if _FRAME.fullmatch(path.stem))
-    more = {
-        "rejected": [(source.name_of(path), "without a pose") for path in pictures if path not in posed],
-        "up": np.array([0.0, 1.0, 0.0]),
-        "metric": True,
-        "facts": {"poses_without_picture": poses - len(posed)},
-    }
-    listed = [frames.Frame(path.name, place, source.name_of(path.with_suffix(".json")), _camera(source, path.with_suffix(".json"))) for path in posed]
-    return Listed(where, listed, signs, partial(_depth, source, place), more)
+    return Listed(
+        where,
+        [Frame(path.name, place, source.name_of(path.with_suffix(".json")), _camera(source, path.with_suffix(".json"))) for path in posed],
+        signs,
+        rejected=[(source.name_of(path), "without a pose") for path in pictures if path not in posed],
+        up=Y_UP,
+        metric=True,
+        facts={"poses_without_picture": poses - len(posed)},
+        depth=partial(_depth, source, place),
+    )
 
 
-def _depth(source: Source, place: Path, stem: str) -> DepthFile | None:
-    number = stem.removeprefix("frame_")
+def _depth(source: Source, place: Path, frame: Frame, image: Path) -> DepthFile | None:
+    number = image.stem.removeprefix("frame_")
     return depth_file(source, place / f"depth_{number}.png", MILLIMETRE, place / f"conf_{number}.png", HIGH, FARTHEST)
 
 
@@ -90,9 +92,7 @@ def _is_posed(picture: Path) -> bool:
 def _camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Camera]:
     """The camera of a frame for a picture of a size, which the frame does not state. Raises BadInput, as does what is returned."""
     where = source.name_of(path)
-    document: Any = read_json(source.real(path), _AGAIN, limit=LARGEST_FRAME)
-    if not isinstance(document, dict):
-        raise BadInput(f"{where}: {shown(document)}; expected an object. {_AGAIN}")
+    document = read_object(source.real(path), where, _AGAIN, limit=LARGEST_FRAME)
     matrix = numbers(document.get(POSE), 16, f"{where}: {POSE}", _AGAIN)
     pose = pose_from_opengl(lenses.rigid(np.reshape(matrix, (4, 4)), where))
     k = numbers(document.get(INTRINSICS), 9, f"{where}: {INTRINSICS}", _AGAIN)

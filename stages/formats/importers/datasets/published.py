@@ -17,10 +17,9 @@ from __future__ import annotations
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,12 +30,12 @@ from stages.formats.importers import frames, lenses
 from stages.formats.importers.colmap_model import FISHEYE, as_traced, count_parameters
 from stages.formats.importers.datasets.matrices import decomposed, from_world, pinhole_frame
 from stages.formats.importers.frames import Frame
-from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.listed import Z_UP, Listed, ListFormat, places_of, sparse_points
 from stages.formats.importers.llff import npy_header
 from stages.formats.importers.source import MAX_FRAMES, Source, images_in
 from stages.formats.importers.texts import head, number, numbers, read_text
 from stages.formats.importers.transforms import read_document
-from stages.formats.importers.transforms_camera import lens_of, pose_of
+from stages.formats.importers.transforms_camera import camera_of
 from stages.io.capture import SparsePoints
 from stages.io.json_file import LARGEST_NUMBER, finite, read_json
 
@@ -95,13 +94,9 @@ def _scannetpp(source: Source, signs: Sequence[Path]) -> Listed:
             continue
         mask = source.find(entry["mask_path"], masks).path if isinstance(entry.get("mask_path"), str) else None
         place = f"{where}: frame {index} ({printable(image, frames.MAX_NAME)})"
-        listed.append(Frame(image, images, place, _with_lens(document | entry, pose_of(entry, place), place), mask=mask, split=splits.get(image, split)))
+        listed.append(Frame(image, images, place, camera_of(document, entry, place), mask=mask, split=splits.get(image, split)))
     texts = [file, lists] if lists.is_file() else [file]
-    return Listed(where, listed, texts, more={"rejected": bad, "up": np.array([0.0, 0.0, 1.0]), "metric": True})
-
-
-def _with_lens(stated: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
-    return lambda name, size: lens_of(stated, name, size, pose, where)
+    return Listed(where, listed, texts, bad, up=Z_UP, metric=True)
 
 
 def _scannetpp_splits(source: Source, path: Path) -> dict[str, str]:
@@ -169,7 +164,7 @@ def _kapture(source: Source, signs: Sequence[Path]) -> Listed:
         place = f"{where} ({printable(name, frames.MAX_NAME)})"
         listed.append(Frame(name, source.root / "sensors/records_data", place, frames.stated(camera)))
         frames.check_count(len(listed), RECORDS)
-    return Listed(RECORDS, listed, signs, more={"rejected": unposed, "points": lambda places: _kapture_points(source, places)})
+    return Listed(RECORDS, listed, signs, unposed, finish=lambda capture, kept: replace(capture, points=_kapture_points(source, places_of(kept))))
 
 
 def _rows(source: Source, name: str, least: int) -> Iterator[tuple[str, list[str]]]:
@@ -205,9 +200,7 @@ def _kapture_devices(source: Source) -> _Devices:
             supported = ", ".join([*MODELS, *FISHEYE])
             raise BadInput(f"{where}: camera model {printable(model, 40) or 'missing'}; supported are {supported}. Undistort the images first.")
         lens = numbers(params, 2 + count, where)
-        if (lens[:2] != np.rint(lens[:2])).any() or not 0 < lens[:2].min() <= lens[:2].max() <= 65535:
-            raise BadInput(f"{where}: image size {lens[0]:g}x{lens[1]:g}; expected whole pixels. {_AGAIN}")
-        devices.lenses[values[0]] = Camera("", int(lens[0]), int(lens[1]), *as_traced(model, tuple(lens[2:].tolist())), np.eye(4))
+        devices.lenses[values[0]] = Camera("", *lenses.image_size(lens[0], lens[1], where, _AGAIN), *as_traced(model, tuple(lens[2:].tolist())), np.eye(4))
     for where, values in _rows(source, RIGS, 9):
         devices.mounts.setdefault(values[1], []).append((values[0], _transform(values[2:9], where)))
     for where, values in _rows(source, TRAJECTORIES, 9):
@@ -232,7 +225,7 @@ def _kapture_points(source: Source, places: dict[str, int]) -> SparsePoints | No
             raise BadInput(f"{where}: point {index:g} of {len(rows)}. {_AGAIN}")
         tracks[int(index)].update(places[name] for name in values[first::2] if name in places)
     array = np.array(rows)
-    return frames.sparse_points(array[:, :3], array[:, 3:], [tuple(sorted(track)) for track in tracks])
+    return sparse_points(array[:, :3], array[:, 3:], [tuple(sorted(track)) for track in tracks])
 
 
 # MVSNet
@@ -272,7 +265,7 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
         folders = [source.root / name for name in ("images", "blended_images", "image", "rgb", ".")]
         beside = next((folder for folder in folders if source.find(stem, folder).how == "listed"), source.root)
         listed.append(Frame(stem, beside, where, camera, bare=True))
-    return Listed(source.name_of(place), listed, signs, more={"facts": {"cameras": source.name_of(place)}})
+    return Listed(source.name_of(place), listed, signs, facts={"cameras": source.name_of(place)})
 
 
 # IDR
@@ -299,7 +292,7 @@ def _idr(source: Source, signs: Sequence[Path]) -> Listed:
         k = k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         mask = source.check_inside(masks[index]) if masks else None
         listed.append(Frame(image.name, image.parent, place, pinhole_frame(k, pose, place), mask=mask))
-    return Listed(where, listed, signs, more={"bounds": _idr_bounds(matrices, where), "facts": {"cameras": where}})
+    return Listed(where, listed, signs, bounds=_idr_bounds(matrices, where), facts={"cameras": where})
 
 
 def _idr_bounds(matrices: dict[str, np.ndarray], where: str) -> np.ndarray | None:
@@ -375,7 +368,7 @@ def _nsvf(source: Source, signs: Sequence[Path]) -> Listed:
     corners = numbers(read_text(source.real(box), MAX_CAMERA_BYTES).split()[:6], 6, box.name).reshape(2, 3)
     if not (corners[0] < corners[1]).all():
         raise BadInput(f"{box.name}: {corners.tolist()}; expected the lower corner, then the upper one. {_AGAIN}")
-    return Listed("pose", listed, [*signs, box], more={"bounds": corners})
+    return Listed("pose", listed, [*signs, box], bounds=corners)
 
 
 def _intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
@@ -393,9 +386,7 @@ def _intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
         raise BadInput(f"{where}: {len(found)} numbers; expected a matrix of 3x3 or 4x4, fx fy cx cy, or f cx cy first and height, width last. {_AGAIN}")
     focal, cx, cy = numbers(found[:3], 3, where)
     height, width = numbers(found[-2:], 2, where)
-    if not (0 < min(height, width) <= max(height, width) <= 65535 and height == int(height) and width == int(width)):
-        raise BadInput(f"{where}: height and width {height:g}, {width:g}; expected the image size in whole pixels. {_AGAIN}")
-    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), (int(width), int(height))
+    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), lenses.image_size(width, height, where, _AGAIN)
 
 
 def _open3d_intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int]]:
@@ -452,7 +443,7 @@ def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
         pose = lenses.rigid(numbers(words[19 * row + 3 : 19 * row + 19], 16, place).reshape(4, 4), place)
         image = images[int(index)]
         listed.append(Frame(image.name, image.parent, place, pinhole_frame(k, pose, source.name_of(lens), stated)))
-    return Listed(where, listed, [signs[0], lens], more={"facts": {"intrinsics": source.name_of(lens)}})
+    return Listed(where, listed, [signs[0], lens], facts={"intrinsics": source.name_of(lens)})
 
 
 SCANNETPP = ListFormat("scannetpp", f"{' or '.join(SCANNETPP_LISTS)}, here or in dslr/", _scannetpp_files, _scannetpp)

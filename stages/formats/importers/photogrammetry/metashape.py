@@ -92,9 +92,8 @@ def _project(source: Source, file: Path, where: str, chunk: Element, warnings: l
             camera = replace(sensors.camera(one.get("sensor_id")), world_from_camera=world.pose(pose))
             listed.append(frames.Frame(label, source.root, place, frames.stated(camera), bare=True))
     warnings += sensors.remarks
-    facts = {"label": printable(chunk.get("label") or "", frames.MAX_NAME), "sensors": len(sensors.elements)}
-    more = {"rejected": rejected, "warnings": warnings, "metric": metric, "up": up, "facts": facts}
-    return Listed(where, listed, [file], more=more)
+    facts: dict[str, object] = {"label": printable(chunk.get("label") or "", frames.MAX_NAME), "sensors": len(sensors.elements)}
+    return Listed(where, listed, [file], rejected, warnings, up, metric=metric, facts=facts)
 
 
 class _Sensors:
@@ -130,9 +129,7 @@ class _Sensors:
         if resolution is None:
             raise BadInput(f"{where}: no resolution. {_ALIGN}")
         sides = numbers([resolution.get("width") or "", resolution.get("height") or ""], 2, f"{where}: resolution")
-        if (sides != np.rint(sides)).any() or not (0 < sides.min() <= sides.max() <= 65535):
-            raise BadInput(f"{where}: resolution {sides[0]:g}x{sides[1]:g}; expected the image size in whole pixels.")
-        size = int(sides[0]), int(sides[1])
+        size = lenses.image_size(sides[0], sides[1], where, _ALIGN)
         k = {key: number(calibration.findtext(key) or "0", f"{where}: {key}") for key in PARAMETERS}
         if not k["f"] > 0:
             raise BadInput(f"{where}: focal length {k['f']:g}; expected more than zero pixels. {_ALIGN}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,13 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from pipeline.text import printable
-from stages.formats.importers import frames
+from stages.formats.importers import frames, lenses
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.listed import Z_UP, Listed, ListFormat, places_of, sparse_points
 from stages.formats.importers.source import Source
 from stages.formats.importers.texts import read_text
 from stages.io.capture import SparsePoints
-from stages.io.json_file import finite, read_json, shown
+from stages.io.json_file import finite, number, read_json, shown
 
 PLACES = ("opensfm/reconstruction.json", "reconstruction.json")
 MAX_POINTS = 2_000_000
@@ -54,14 +55,16 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     counts = ", ".join(str(len(one["shots"])) for one in others[:5])
     warning = f"{where}: the reconstruction with {len(best['shots'])} images is used; there are others with {counts}, which share no frame with it."
     origin = best.get("reference_lla")
-    more = {
-        "warnings": [warning] if others else [],
-        "points": lambda places: _points(source, file, best, places),
-        "up": np.array([0.0, 0.0, 1.0]),
-        "metric": isinstance(origin, dict) and any(finite(value) for value in origin.values()),
-        "facts": {"reconstruction": where, "registered": len(best["shots"]), "cameras": len(best["cameras"])},
-    }
-    return Listed(where, _frames(source, file, best), [file, *([tracks] if tracks.is_file() else [])], more=more)
+    return Listed(
+        where,
+        _frames(source, file, best),
+        [file, *([tracks] if tracks.is_file() else [])],
+        warnings=[warning] if others else [],
+        up=Z_UP,
+        metric=isinstance(origin, dict) and any(finite(value) for value in origin.values()),
+        facts={"reconstruction": where, "registered": len(best["shots"]), "cameras": len(best["cameras"])},
+        finish=lambda capture, kept: replace(capture, points=_points(source, file, best, places_of(kept))),
+    )
 
 
 def _vector(value: Any, where: str) -> np.ndarray:
@@ -102,25 +105,18 @@ def rotation_of(vector: np.ndarray) -> np.ndarray:
 
 
 def _camera(lens: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
-    def value(key: str, default: Any = 0.0) -> float:
-        found = finite(lens.get(key, default))
-        if found is None:
-            raise BadInput(f"{where}: {key} of its camera is {shown(lens.get(key))}, expected a finite number. {_AGAIN}")
-        return found
-
+    value = partial(number, lens, where=f"{where}: its camera", remedy=_AGAIN)
     kind = lens.get("projection_type")
     if not isinstance(kind, str) or kind not in _BROWN | _FISHEYE:
         raise BadInput(f"{where}: a {shown(kind)} camera; {', '.join(_BROWN | _FISHEYE)} are read. Undistort the images first (opensfm undistort).")
     used = (_BROWN | _FISHEYE)[kind]
-    k = {key: value(key) if key in used else 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    focal = value("focal_x", lens.get("focal")), value("focal_y", lens.get("focal", lens.get("focal_x")))
-    shift = value("c_x"), value("c_y")
-    stated = (value("width", 0), value("height", 0)) if "width" in lens and "height" in lens else None
-    if stated is not None and not (stated[0] == int(stated[0]) and stated[1] == int(stated[1]) and 0 < min(stated) <= max(stated) <= 65535):
-        raise BadInput(f"{where}: image size {stated[0]:g}x{stated[1]:g}; expected whole pixels. {_AGAIN}")
+    k = {key: value(key, default=0.0) if key in used else 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    focal = value("focal_x", default=lens.get("focal")), value("focal_y", default=lens.get("focal", lens.get("focal_x")))
+    shift = value("c_x", default=0.0), value("c_y", default=0.0)
+    stated = lenses.image_size(value("width"), value("height"), where, _AGAIN) if "width" in lens and "height" in lens else None
 
     def camera(name: str, size: tuple[int, int]) -> Camera:
-        width, height = (int(stated[0]), int(stated[1])) if stated else size
+        width, height = stated or size
         longer = max(width, height)
         fx, fy = focal[0] * longer, focal[1] * longer
         centre = width / 2 + shift[0] * longer, height / 2 + shift[1] * longer
@@ -148,7 +144,7 @@ def _points(source: Source, file: Path, reconstruction: dict[str, Any], places: 
         xyz.append(_vector(point.get("coordinates"), f"{where}: point {printable(name, 40)}"))
         rgb.append(_vector(point.get("color", [128, 128, 128]), f"{where}: colour of point {printable(name, 40)}"))
     tracks = _tracks(source, file.with_name("tracks.csv"), {name: index for index, name in enumerate(points)}, places)
-    return frames.sparse_points(np.array(xyz), np.array(rgb), tracks)
+    return sparse_points(np.array(xyz), np.array(rgb), tracks)
 
 
 def _tracks(source: Source, file: Path, points: dict[str, int], places: dict[str, int]) -> list[tuple[int, ...]] | None:

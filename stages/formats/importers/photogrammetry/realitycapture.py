@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -27,7 +26,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.listed import Listed, ListFormat
+from stages.formats.importers.listed import Z_UP, Listed, ListFormat
 from stages.formats.importers.photogrammetry.xml import read_xml
 from stages.formats.importers.source import Source
 from stages.formats.importers.texts import head, number, numbers, read_text
@@ -97,7 +96,7 @@ def _from_table(source: Source, file: Path, warnings: list[str]) -> Listed:
             frames.check_count(len(listed), where)
     except csv.Error as error:
         raise BadInput(f"{where}: {printable(error, 100)}. {_AGAIN}") from None
-    return Listed(where, listed, [file], more=_more(where, warnings))
+    return Listed(where, listed, [file], warnings=warnings, up=Z_UP, facts={"registration": where})
 
 
 def _row(source: Source, where: str, cells: dict[str, str]) -> frames.Frame:
@@ -168,11 +167,7 @@ def _from_sidecars(source: Source, found: list[Path]) -> Listed:
             continue  # that of another program
         listed.append(frames.Frame(path.stem, path.parent, where, _sidecar(partial(_stated, described[0]), where), bare=True))
     where = f"{len(listed)} XMP files"
-    return Listed(where, listed, found, more=_more(where, []))
-
-
-def _more(where: str, warnings: list[str]) -> dict[str, Any]:
-    return {"warnings": warnings, "up": np.array([0.0, 0.0, 1.0]), "facts": {"registration": where}}
+    return Listed(where, listed, found, up=Z_UP, facts={"registration": where})
 
 
 def _stated(description: Element, key: str) -> str | None:
