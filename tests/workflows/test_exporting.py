@@ -122,7 +122,7 @@ def test_a_normal_map_wants_a_texture_to_lie_beside(run: Path, monkeypatch: pyte
             export(run, *names, normal_map=True, **more)
     (entry,) = export(run, "a.ply", chosen=settings(normal_map=True))
     assert entry["faces"] == 12, "a file without a place for it takes the mesh as it is"
-    monkeypatch.setattr("stages.formats.exporters.usd.find_spec", lambda name: None)
+    monkeypatch.setattr("stages.formats.exporters.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[usd\]'"):
         export(run, "b.glb", "b.usdz")
     assert not (run.parent / "b.glb").exists()

@@ -9,8 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+from pipeline.errors import UsageError
+
+_PACKAGES = {"usd": {"pxr": "usd-core"}, "las": {"laspy": "laspy", "lazrs": "lazrs"}}  # extra -> modules that it installs -> their packages
 
 
 @dataclass(frozen=True)
@@ -24,7 +29,7 @@ class Format:
     module     of this package, and its function: write
     textures   whether it keeps textures, and takes `picture`
     coloured   whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
-    extra      of the package efficientnerf, that has to be installed for it: `refuse_without_package` of its module
+    extra      of the package efficientnerf, that has to be installed for it
     beside     whether a texture lies in files next to it: `companions` of its module
     """
 
@@ -39,12 +44,10 @@ class Format:
     extra: str | None = None
     beside: bool = False
 
-    def write(self, what: Any, path: Path, frame: Any, **options: Any) -> None:
-        """`options`: picture, of formats that keep textures. The module is imported now."""
-        getattr(import_module(f"{__name__}.{self.module}"), self.function)(what, path, frame, **options)
-
     def __call__(self, what: Any, path: Path, frame: Any, **options: Any) -> None:
-        self.write(what, path, frame, **options)
+        """Write it. `options`: picture, of formats that keep textures. The module is imported now. Raises BadInput and UsageError."""
+        self.refuse_without_package(path)
+        getattr(import_module(f"{__name__}.{self.module}"), self.function)(what, path, frame, **options)
 
     def companions(self, path: Path, picture: str = "png", normal_map: bool = False) -> list[Path]:
         """The files that it writes next to `path` where the mesh has a texture."""
@@ -53,8 +56,10 @@ class Format:
 
     def refuse_without_package(self, path: Path) -> None:
         """UsageError where a package is missing that writes it."""
-        if self.extra is not None:
-            import_module(f"{__name__}.{self.module}").refuse_without_package(path)
+        for module, package in _PACKAGES.get(self.extra or "", {}).items():
+            if find_spec(module) is None:
+                kind, how = str(self.extra).upper(), f"pip install 'efficientnerf[{self.extra}]'"
+                raise UsageError(f"{path}: {kind} is written by the package {package}, which is not installed. Install it: {how}")
 
 
 _MESHES = (

@@ -27,7 +27,7 @@ from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
 from efficientnerf.surface.texturing.corners import split_at_seams
 from efficientnerf.surface.texturing.tangents import tangents
-from stages.formats.exporters.textures import MIME, Picture, encoded, open_faces
+from stages.formats.exporters.textures import MIME, Picture, open_faces, pictures_of
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _KINDS = {"<f4": 5126, "<u2": 5123, "<u4": 5125}
@@ -54,7 +54,7 @@ def source_extras(frame: SourceFrame) -> dict[str, Any]:
         "source_frame": {
             "gltf_from_capture": (rotation + 0.0).tolist(),  # rows
             "capture_up": (frame.up + 0.0).tolist(),
-            "unit": "metre" if frame.metric else "unknown",
+            "unit": frame.unit,
             "world_from_capture": {"scale": recorded.scale, "rotation": recorded.rotation.tolist(), "translation": recorded.translation.tolist()},
         }
     }
@@ -91,10 +91,7 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
     rotation = gltf_from_capture(frame.up)
     buffer = Buffer()
     primitive = {**_geometry(mesh, rotation, buffer), "material": 0, "mode": 4}
-    pictures = [] if mesh.texture is None else [(mesh.texture.colours, picture)]
-    if mesh.texture is not None and mesh.texture.normals is not None:
-        pictures.append((mesh.texture.normals, "png"))
-    write_document(_document(buffer, primitive, pictures, frame, open_faces(mesh.faces)), buffer, path)
+    write_document(_document(buffer, primitive, pictures_of(mesh, picture), picture, frame, open_faces(mesh.faces)), buffer, path)
 
 
 def write_document(document: dict[str, Any], buffer: Buffer, path: Path) -> None:
@@ -131,14 +128,14 @@ def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: Buffer) -> dict[str, Any
 
 
 def _document(
-    buffer: Buffer, primitive: dict[str, Any], pictures: Sequence[tuple[np.ndarray, Picture]], frame: SourceFrame, both_sides: bool
+    buffer: Buffer, primitive: dict[str, Any], pictures: Sequence[bytes], first: Picture, frame: SourceFrame, both_sides: bool
 ) -> dict[str, Any]:
     """The JSON part; pictures go into the buffer."""
     lit = len(pictures) > 1
     material: dict[str, Any] = {"name": "captured light", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}}
     images = [
-        {"bufferView": buffer.view(encoded(pixels, kind)), "mimeType": MIME[kind], "name": name}
-        for (pixels, kind), name in zip(pictures, ("colours", "normals"))
+        {"bufferView": buffer.view(data), "mimeType": MIME[kind], "name": name}
+        for data, kind, name in zip(pictures, (first, "png"), ("colours", "normals"))
     ]
     if images:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}

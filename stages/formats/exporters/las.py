@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import io
 import math
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from efficientnerf.surface.mesh import PointCloud
-from pipeline.errors import UsageError
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_points, write_parts
 
 POINT_FORMAT = 7  # with colours
@@ -22,17 +20,9 @@ NORMALS = ("NormalX", "NormalY", "NormalZ")
 FINENESS = 1e-6  # of the points' reach
 
 
-def refuse_without_package(path: Path) -> None:
-    """UsageError where a package is missing that writes it."""
-    for package in ("laspy", "lazrs"):
-        if find_spec(package) is None:
-            raise UsageError(f"{path}: LAS is written by the package {package}, which is not installed. Install it: pip install 'efficientnerf[las]'")
-
-
 def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
-    """Write a point cloud in the capture's frame; compressed where the file's name ends in .laz. Raises BadInput and UsageError."""
+    """Write a point cloud in the capture's frame; compressed where the file's name ends in .laz. Raises BadInput."""
     check_points(points, path)
-    refuse_without_package(path)
     import laspy  # an extra
 
     low, high = points.positions.min(axis=0), points.positions.max(axis=0)

@@ -37,9 +37,7 @@ def mesh_header(vertices: int, faces: int, frame: SourceFrame) -> str:
 
 def _header(count: int, frame: SourceFrame) -> str:
     properties = "".join(f"property {_NAMES[VERTEX[name].str]} {name}\n" for name in VERTEX.names or ())
-    up = " ".join(f"{value:.9g}" for value in frame.up + 0.0)
-    unit = "metre" if frame.metric else "unknown"
-    return f"ply\nformat binary_little_endian 1.0\ncomment frame of the capture; up {up}; unit {unit}\nelement vertex {count}\n{properties}"
+    return f"ply\nformat binary_little_endian 1.0\ncomment {frame.comment}\nelement vertex {count}\n{properties}"
 
 
 def _vertices(positions: np.ndarray, normals: np.ndarray, colours: np.ndarray) -> bytes:

@@ -11,6 +11,8 @@ from typing import Literal
 import numpy as np
 from PIL import Image
 
+from efficientnerf.surface.mesh import Mesh, Texture
+
 Picture = Literal["png", "jpeg"]  # how textures are stored
 EXTENSIONS: dict[Picture, str] = {"png": ".png", "jpeg": ".jpg"}
 MIME: dict[Picture, str] = {"png": "image/png", "jpeg": "image/jpeg"}
@@ -34,6 +36,26 @@ def plain_stem(path: Path) -> str:
     stem = path.stem
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).lstrip(".-")[:100]
     return plain if plain == stem else f"{plain or '_'}-{hashlib.sha256(stem.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
+
+
+def companions(path: Path, picture: Picture, normal_map: bool) -> list[Path]:
+    """The files of a mesh's pictures that are written next to it: colours, and the normal map where there is one."""
+    return [path.with_name(plain_stem(path) + suffix) for suffix in (EXTENSIONS[picture], *(("_normal.png",) if normal_map else ()))]
+
+
+def pictures_of(mesh: Mesh, picture: Picture) -> list[bytes]:
+    """The same as bytes; none of a mesh without a texture."""
+    if mesh.texture is None:
+        return []
+    normals = mesh.texture.normals
+    return [encoded(mesh.texture.colours, picture), *([] if normals is None else [encoded(normals, "png")])]
+
+
+def distinct_places(texture: Texture) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 2) float32 the different texture coordinates, and (F, 3) which of them each corner has."""
+    places = np.ascontiguousarray(texture.coordinates.reshape(-1, 2), np.float32) + np.float32(0)
+    _, first, number = np.unique(places.view(np.uint64).ravel(), return_index=True, return_inverse=True)
+    return places[first], number.reshape(-1, 3)
 
 
 def open_faces(faces: np.ndarray) -> bool:

@@ -16,7 +16,6 @@ import io
 import os
 import zipfile
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,9 +24,8 @@ import numpy as np
 
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
-from pipeline.errors import UsageError
 from stages.formats.exporters.glb import gltf_from_capture
-from stages.formats.exporters.textures import EXTENSIONS, Picture, encoded, open_faces, plain_stem
+from stages.formats.exporters.textures import Picture, companions, distinct_places, open_faces, pictures_of
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_files, write_parts
 
 ALIGNMENT = 64  # bytes, of the beginnings of a package's files
@@ -35,32 +33,19 @@ LAYER = "surface.usdc"  # in a package
 _PADDING = 0x1986  # the identifier of an extra field of a zip that holds nothing, as USD's own writer uses it
 
 
-def refuse_without_package(path: Path) -> None:
-    """UsageError where the package is missing that writes USD."""
-    if find_spec("pxr") is None:
-        raise UsageError(f"{path}: USD is written by the package usd-core, which is not installed. Install it: pip install 'efficientnerf[usd]'")
-
-
-def companions(path: Path, picture: Picture = "png", normal_map: bool = False) -> list[Path]:
-    """The files that are written next to a USDC with a texture: colours, and the normal map where there is one."""
-    return [path.with_name(plain_stem(path) + suffix) for suffix in (EXTENSIONS[picture], *(("_normal.png",) if normal_map else ()))]
-
-
 def write_usdc(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
-    """Write a mesh given in the capture's frame, and its pictures next to it. Raises BadInput and UsageError."""
+    """Write a mesh given in the capture's frame, and its pictures next to it. Raises BadInput."""
     check_mesh(mesh, path)
-    refuse_without_package(path)
-    pictures = _pictures(mesh, picture)
+    pictures = pictures_of(mesh, picture)
     names = companions(path, picture, len(pictures) > 1)[: len(pictures)]
     layer = _layer(mesh, frame, [name.name for name in names])
     write_files({**{name: [data] for name, data in zip(names, pictures, strict=True)}, path: [layer]})
 
 
 def write_usdz(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
-    """Write a mesh given in the capture's frame as one package. Raises BadInput and UsageError."""
+    """Write a mesh given in the capture's frame as one package. Raises BadInput."""
     check_mesh(mesh, path)
-    refuse_without_package(path)
-    pictures = _pictures(mesh, picture)
+    pictures = pictures_of(mesh, picture)
     names = [name.name for name in companions(Path(LAYER), picture, len(pictures) > 1)][: len(pictures)]
     write_parts(path, [package({LAYER: _layer(mesh, frame, names), **dict(zip(names, pictures, strict=True))})])
 
@@ -79,14 +64,6 @@ def package(files: Mapping[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def _pictures(mesh: Mesh, picture: Picture) -> list[bytes]:
-    """The texture's files: colours, and the normal map where there is one."""
-    if mesh.texture is None:
-        return []
-    normals = mesh.texture.normals
-    return [encoded(mesh.texture.colours, picture), *([] if normals is None else [encoded(normals, "png")])]
-
-
 def _layer(mesh: Mesh, frame: SourceFrame, pictures: list[str]) -> bytes:
     """The layer as a binary file; `pictures` are the files next to it that it refers to."""
     from pxr import Tf, Usd, UsdGeom, Vt  # an extra
@@ -97,7 +74,7 @@ def _layer(mesh: Mesh, frame: SourceFrame, pictures: list[str]) -> bytes:
     rotation = gltf_from_capture(frame.up)
     layer = stage.GetRootLayer()
     layer.customLayerData = {
-        "creator": "efficientnerf", "unit": "metre" if frame.metric else "unknown", "captureUp": Vt.DoubleArray((frame.up + 0.0).tolist()),
+        "creator": "efficientnerf", "unit": frame.unit, "captureUp": Vt.DoubleArray((frame.up + 0.0).tolist()),
         "usdFromCapture": Vt.DoubleArray((rotation + 0.0).reshape(-1).tolist()),
     }  # fmt: skip
     root = UsdGeom.Xform.Define(stage, "/surface")
@@ -136,10 +113,9 @@ def _put_geometry(shape: Any, mesh: Mesh, rotation: np.ndarray) -> None:
         linear = np.ascontiguousarray(linear_from_srgb(np.clip(mesh.colours.astype(np.float32), 0, 1)))
         primvars.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(linear))
         return
-    places = np.ascontiguousarray(mesh.texture.coordinates.reshape(-1, 2), np.float32) + np.float32(0)
-    _, first, number = np.unique(places.view(np.uint64).ravel(), return_index=True, return_inverse=True)
+    places, number = distinct_places(mesh.texture)
     st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(places[first])))
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(places)))
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(number.ravel(), np.int32)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from pipeline.errors import BadInput
 from pipeline.files import atomic, atomic_together
 
 MOST_TEXELS = 16384  # along a side of a texture: what graphics cards show
+_ROWS = 50_000  # lines of text made at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +34,24 @@ class SourceFrame:
         """(3,) unit, the direction in the capture's frame that is up."""
         return self.world_from_capture.rotation.T @ np.array([0.0, 0.0, 1.0])
 
+    @property
+    def unit(self) -> str:
+        return "metre" if self.metric else "unknown"
+
+    @property
+    def comment(self) -> str:
+        """For files that have a place for one."""
+        return f"frame of the capture; up {' '.join(f'{value:.9g}' for value in self.up + 0.0)}; unit {self.unit}"
+
 
 CAPTURE_IS_Z_UP = SourceFrame(Similarity.identity())
 
 
 def source_frame(metadata: Mapping[str, Any]) -> SourceFrame:
     """The capture's frame as an asset's metadata records it."""
-    recorded = metadata.get("world_from_capture")
-    if recorded is None:
-        return SourceFrame(Similarity.identity(), bool(metadata.get("metric", False)))
-    similarity = Similarity(float(recorded["scale"]), np.asarray(recorded["rotation"], np.float64), np.asarray(recorded["translation"], np.float64))
+    recorded, similarity = metadata.get("world_from_capture"), Similarity.identity()
+    if recorded is not None:
+        similarity = Similarity(float(recorded["scale"]), np.asarray(recorded["rotation"], np.float64), np.asarray(recorded["translation"], np.float64))
     return SourceFrame(similarity, bool(metadata.get("metric", False)))
 
 
@@ -93,6 +102,13 @@ def _check_finite(arrays: dict[str, np.ndarray], path: Path) -> None:
 def bytes_from_srgb(colours: np.ndarray) -> np.ndarray:
     """sRGB 0-1 -> uint8, rounded."""
     return np.round(np.clip(colours, 0, 1) * 255).astype(np.uint8)
+
+
+def text_rows(form: str, rows: np.ndarray) -> Iterator[bytes]:
+    """A line of text for each row."""
+    for start in range(0, len(rows), _ROWS):
+        part = rows[start : start + _ROWS]
+        yield (form * len(part) % tuple(part.ravel().tolist())).encode("ascii")
 
 
 def write_parts(path: Path, parts: Iterable[bytes | memoryview]) -> None:

@@ -5,25 +5,17 @@ No header: readers that know only `x y z` take the first three numbers, and thos
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from efficientnerf.surface.mesh import PointCloud
-from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_points, write_parts
+from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_points, text_rows, write_parts
 
-_ROWS = 50_000  # lines made at a time
 _LINE = "%.9g %.9g %.9g %d %d %d %.5f %.5f %.5f\n"
 
 
 def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write a point cloud in the capture's frame. Raises BadInput."""
     check_points(points, path)
-    write_parts(path, _text(np.hstack([points.positions, bytes_from_srgb(points.colours), points.normals])))
-
-
-def _text(rows: np.ndarray) -> Iterator[bytes]:
-    for start in range(0, len(rows), _ROWS):
-        part = rows[start : start + _ROWS]
-        yield (_LINE * len(part) % tuple(part.ravel().tolist())).encode("ascii")
+    write_parts(path, text_rows(_LINE, np.hstack([points.positions, bytes_from_srgb(points.colours), points.normals])))

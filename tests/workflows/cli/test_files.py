@@ -238,10 +238,10 @@ def test_a_camera_path(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
 def test_describing_gaussians(enerf: Enerf, tmp_path: Path) -> None:
     """And a file of another kind by that name, and a damaged one."""
     for extension, kind in SPLAT_EXPORTERS.items():
-        kind.write(scattered(20), tmp_path / f"a{extension}", Z_UP)
+        kind(scattered(20), tmp_path / f"a{extension}", Z_UP)
         found = enerf("inspect", tmp_path / f"a{extension}", "--json").object
         assert (found["what"], found["gaussians"], found["sh_degree"]) == ("splats", 20, 2)
-    MESH_EXPORTERS[".glb"].write(block(), tmp_path / "mesh.glb", Z_UP)
+    MESH_EXPORTERS[".glb"](block(), tmp_path / "mesh.glb", Z_UP)
     assert enerf("inspect", tmp_path / "mesh.glb", "--json").object["what"] == "mesh"
     (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-30])
     result = enerf("inspect", tmp_path / "a.spz")

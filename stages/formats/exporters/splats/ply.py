@@ -31,10 +31,8 @@ def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_
     """Write Gaussians given in the capture's frame. Raises BadInput."""
     check_gaussians(gaussians, path)
     count, harmonics = gaussians.harmonics.shape[:2]
-    up = " ".join(f"{value:.9g}" for value in frame.up + 0.0)
-    unit = "metre" if frame.metric else "unknown"
     properties = "".join(f"property float {name}\n" for name in property_names(harmonics))
-    header = f"ply\nformat binary_little_endian 1.0\ncomment frame of the capture; up {up}; unit {unit}\nelement vertex {count}\n{properties}end_header\n"
+    header = f"ply\nformat binary_little_endian 1.0\ncomment {frame.comment}\nelement vertex {count}\n{properties}end_header\n"
     opacity = gaussians.opacities.astype(np.float64)
     rows = np.concatenate([
         gaussians.means, np.zeros((count, 3)), gaussians.harmonics[:, 0], gaussians.harmonics[:, 1:].transpose(0, 2, 1).reshape(count, -1),
