@@ -5,7 +5,7 @@ Nothing heavy is imported until something is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -41,24 +41,22 @@ class Importer:
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         """Whether a folder holds files of this format; BadInput where they cannot be read."""
-        with one_line_errors(folder):
-            return bool(self._function("recognises")(folder, allow_outside))
+        return bool(self._called("recognises", folder, allow_outside))
 
     def read(self, folder: Path, settings: ImportSettings) -> Capture:
         """The capture, whose names and sentences may be shown; raises BadInput."""
-        with one_line_errors(folder):
-            capture: Capture = self._function("read")(folder, settings)
+        capture: Capture = self._called("read", folder, settings)
         return replace(capture, warnings=tuple(map(printable, capture.warnings)))
 
     def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
         """What the capture depends on; raises BadInput."""
-        with one_line_errors(folder):
-            paths: list[Path] = self._function("files")(folder, settings)
+        paths: list[Path] = self._called("files", folder, settings)
         return paths
 
-    def _function(self, name: str) -> Callable[..., Any]:
-        module = import_module(f"{__name__}.{self.module}")
-        return getattr(module if self.entry is None else getattr(module, self.entry), name)
+    def _called(self, name: str, folder: Path, how: Any) -> Any:
+        with one_line_errors(folder):
+            module = import_module(f"{__name__}.{self.module}")
+            return getattr(module if self.entry is None else getattr(module, self.entry), name)(folder, how)
 
 
 @contextmanager

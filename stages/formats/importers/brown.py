@@ -30,12 +30,12 @@ def brown_camera(
     size: tuple[int, int],
     focal: tuple[float, float],
     centre: tuple[float, float],
-    radial: Sequence[float],
-    tangential: tuple[float, float],
+    pose: np.ndarray,
     where: str,
+    radial: Sequence[float] = (),
+    tangential: tuple[float, float] = (0, 0),
 ) -> Camera:
-    """A camera at the origin.
-
+    """
     focal       fx, fy, pixels
     centre      cx, cy, pixels, the centre of the first pixel being at 0.5, 0.5
     radial      k1 to k4 at most
@@ -44,18 +44,17 @@ def brown_camera(
     """
     k1, k2, k3, k4 = (*map(float, radial), 0.0, 0.0, 0.0, 0.0)[:4]
     fx, fy, cx, cy, p1, p2 = map(float, (*focal, *centre, *tangential))
-    width, height = size
+    params: tuple[float, ...]
     if k4:
         top, bottom = quotient_of_cubics(np.array([1.0, k1, k2, k3, k4]), max(fx, fy), _reach(size, (fx, fy), (cx, cy)), where)
-        params: tuple[float, ...] = (fx, fy, cx, cy, top[1], top[2], p1, p2, top[3], *bottom[1:])
-        return Camera(name, width, height, "FULL_OPENCV", tuple(map(float, params)), np.eye(4))
-    if k3:
-        return Camera(name, width, height, "FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), np.eye(4))
-    if k1 or k2 or p1 or p2:
-        return Camera(name, width, height, "OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2), np.eye(4))
-    if fx == fy:
-        return Camera(name, width, height, "SIMPLE_PINHOLE", (fx, cx, cy), np.eye(4))
-    return Camera(name, width, height, "PINHOLE", (fx, fy, cx, cy), np.eye(4))
+        model, params = "FULL_OPENCV", tuple(map(float, (fx, fy, cx, cy, top[1], top[2], p1, p2, top[3], *bottom[1:])))
+    elif k3:
+        model, params = "FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    elif k1 or k2 or p1 or p2:
+        model, params = "OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2)
+    else:
+        model, params = ("SIMPLE_PINHOLE", (fx, cx, cy)) if fx == fy else ("PINHOLE", (fx, fy, cx, cy))
+    return Camera(name, *size, model, params, pose)
 
 
 def _reach(size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]) -> float:

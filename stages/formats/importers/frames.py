@@ -106,14 +106,13 @@ def _parts(name: str) -> tuple[str, ...]:
 
 def _best_folder(source: Source, names: Sequence[str], parts: tuple[str, ...], taken: set[Path], bare: bool) -> dict[str, Path]:
     """Name -> image in the one folder that holds most of the names."""
-    index = source.images_by_stem()
     by_folder: dict[Path, dict[str, Path]] = {}
     for name in names:
         last = (_parts(name) or ("",))[-1]
         stem, suffix = name_key(last), ""
         if PurePosixPath(last).suffix.lower() in IMAGE_SUFFIXES:
             stem, suffix = name_key(PurePosixPath(last).stem), PurePosixPath(last).suffix.lower()
-        for path in index.get(stem, ()):
+        for path in source.images_by_stem.get(stem, ()):
             folder = path.parent
             if path in taken or _BESIDE_IMAGES & {part.lower() for part in folder.relative_to(source.root).parts}:
                 continue

@@ -60,6 +60,14 @@ def rotation(columns: np.ndarray, where: str) -> np.ndarray:
     return np.asarray(left @ right)
 
 
+def inverse(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """(4, 4) camera to world, of the rotation (3, 3) and the translation (3,) from world to camera."""
+    pose = np.eye(4)
+    pose[:3, :3] = turn.T
+    pose[:3, 3] = -turn.T @ shift
+    return pose
+
+
 def image_size(width: float, height: float, where: str, remedy: str) -> tuple[int, int]:
     """A size that a file states; BadInput for anything but whole pixels."""
     if not 0 < min(width, height) <= max(width, height) <= 65535 or width != int(width) or height != int(height):

@@ -98,31 +98,29 @@ def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
         raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error
     if len(data) > 17 * 8 * max_frames + 4096:
         raise BadInput(f"{path}: {path.stat().st_size} bytes; more than {max_frames} poses are not read.")
-    shape, fortran, kind, start = npy_header(path, data)
-    if len(shape) != 2 or shape[1] != 17 or kind.kind not in "fiu":
-        found = f"{kind} {shape}"
-        raise BadInput(f"{path}: {found:.80}; expected numbers of shape (N, 17): 3x5 poses, near and far. Write it again with LLFF's imgs2poses.")
-    size = shape[0] * 17 * kind.itemsize
-    if not 0 <= size <= len(data) - start:
-        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({len(data)} bytes for {shape[0]} poses).")
-    rows = np.frombuffer(data, kind, shape[0] * 17, start).reshape(shape, order="F" if fortran else "C").astype(np.float64)
-    unusable = ~(np.abs(rows) <= LARGEST_NUMBER).all(1)  # nan, too
-    if unusable.any():
-        raise BadInput(f"{path}: row {int(np.flatnonzero(unusable)[0])} holds numbers that are not finite, or beyond {LARGEST_NUMBER:g}. Write it again.")
-    return rows
+    return rows_of_npy(data, str(path), 17, "3x5 poses, near and far", "Write it again with LLFF's imgs2poses.")
 
 
-def npy_header(path: Path, data: bytes) -> tuple[tuple[int, ...], bool, np.dtype, int]:
-    """Shape, whether columns come first, type, and where the numbers begin, of a .npy file; nothing is allocated on its word."""
+def rows_of_npy(data: bytes, where: str, columns: int, what: str, remedy: str) -> np.ndarray:
+    """(N, columns) float64, finite, of a .npy file; nothing but plain numbers is read, and nothing is allocated on its header's word. Raises BadInput."""
     file = io.BytesIO(data)
     try:
         major, _ = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-        shape, fortran, kind = read(file)
+        shape, fortran, kind = (np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0)(file)
     except Exception as error:  # a damaged header is parsed as a Python literal, which raises anything
         reason = printable(next(iter(str(error).splitlines()), type(error).__name__), 80)
-        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({reason}).") from error
-    return tuple(map(int, shape)), fortran, kind, file.tell()  # True is an integer to the parser
+        raise BadInput(f"{where}: not a NumPy array of numbers, or truncated ({reason}). {remedy}") from error
+    shape = tuple(map(int, shape))  # True is an integer to the parser
+    if len(shape) != 2 or shape[1] != columns or kind.kind not in "fiu":
+        found = f"{kind} {shape}"
+        raise BadInput(f"{where}: {found:.80}; expected numbers of shape (N, {columns}): {what}. {remedy}")
+    if not 0 <= shape[0] * columns * kind.itemsize <= len(data) - file.tell():
+        raise BadInput(f"{where}: not a NumPy array of numbers, or truncated ({len(data)} bytes for {shape[0]} rows). {remedy}")
+    rows = np.frombuffer(data, kind, shape[0] * columns, file.tell()).reshape(shape, order="F" if fortran else "C").astype(np.float64)
+    unusable = ~(np.abs(rows) <= LARGEST_NUMBER).all(1)  # nan, too
+    if unusable.any():
+        raise BadInput(f"{where}: row {int(np.flatnonzero(unusable)[0])} holds numbers that are not finite, or beyond {LARGEST_NUMBER:g}. {remedy}")
+    return rows
 
 
 def _images(source: Source, count: int) -> tuple[list[Path], int, list[str]]:

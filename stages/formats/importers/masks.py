@@ -8,8 +8,8 @@ may lie in the folder of the photograph itself. Where it is black, the image is 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 
 from stages.formats.importers.source import MASK_ENDINGS, Source, images_in, name_key, pictures_in
@@ -18,53 +18,16 @@ FOLDERS = ("masks", "mask")
 _SUFFIX = ".mask"
 
 
-@dataclass
-class _Folders:
-    """The contents of folders, each read once.
-
-    masks   folders of masks by the folder that they lie in
-    inside  masks by the key of their stem, by the folder of masks
-    beside  masks by the key of their name without what follows the ending, by the folder of the photographs
-    """
-
-    masks: dict[Path, list[Path]] = field(default_factory=dict)
-    inside: dict[Path, dict[str, Path]] = field(default_factory=dict)
-    beside: dict[Path, dict[str, Path]] = field(default_factory=dict)
-
-    def masks_in(self, folder: Path) -> list[Path]:
-        if folder not in self.masks:
-            names = sorted(os.listdir(folder)) if os.path.isdir(folder) else []
-            found = sorted((FOLDERS.index(name_key(name)), name) for name in names if name_key(name) in FOLDERS)
-            self.masks[folder] = [folder / name for _, name in found if os.path.isdir(folder / name)]
-        return self.masks[folder]
-
-    def files_inside(self, folder: Path) -> dict[str, Path]:
-        if folder not in self.inside:
-            found: dict[str, Path] = {}
-            for path in [*images_in(folder), *_with_mask_as_suffix(folder)]:
-                found.setdefault(name_key(path.stem), path)
-            self.inside[folder] = found
-        return self.inside[folder]
-
-    def files_beside(self, folder: Path) -> dict[str, Path]:
-        if folder not in self.beside:
-            found = {name_key(path.name): path for path in _with_mask_as_suffix(folder)}
-            for path in pictures_in(folder):
-                if (key := name_key(path.stem)).endswith(MASK_ENDINGS):
-                    found.setdefault(key, path)
-            self.beside[folder] = found
-        return self.beside[folder]
-
-
 def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
     """Image -> mask, of those that have one."""
-    folders, photographs = _Folders(), set(images)
+    masks_in, files_inside, files_beside = cache(_masks_in), cache(_files_inside), cache(_files_beside)  # each folder is read once
+    photographs = set(images)
     found = {}
     for image in images:
         stem, name = name_key(image.stem), name_key(image.name)
         endings = [f"{each}{ending}" for each in (stem, name) for ending in reversed(MASK_ENDINGS)]
-        listings = [(folders.files_inside(place), [name, stem, *endings]) for place in dict.fromkeys(_places(source, image, folders))]
-        listings.append((folders.files_beside(image.parent), endings))
+        listings = [(files_inside(place), [name, stem, *endings]) for place in dict.fromkeys(_places(source, image, masks_in))]
+        listings.append((files_beside(image.parent), endings))
         candidates = (listing[key] for listing, keys in listings for key in keys if key in listing)
         mask = next((path for path in candidates if path not in photographs), None)
         if mask is not None:
@@ -72,18 +35,36 @@ def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
     return found
 
 
-def _places(source: Source, image: Path, folders: _Folders) -> Iterator[Path]:
+def _places(source: Source, image: Path, masks_in: Callable[[Path], list[Path]]) -> Iterator[Path]:
     """Where the mask of an image may lie, in order: of images/a/1.jpg in images/a/masks, masks/images/a, images/masks/a, masks/a."""
     root = source.root
     inside = image.parent.relative_to(root) if image.parent.is_relative_to(root) else Path()
-    yield from folders.masks_in(image.parent)
-    yield from (masks / inside for masks in folders.masks_in(root))
+    yield from masks_in(image.parent)
+    yield from (masks / inside for masks in masks_in(root))
     for depth in range(len(inside.parts)):
         above, below = root.joinpath(*inside.parts[:depth]), inside.parts[depth:]
-        for masks in folders.masks_in(above):
+        for masks in masks_in(above):
             yield masks.joinpath(*below)
             yield masks.joinpath(*below[1:])
-        yield from (masks.joinpath(*below[1:]) for masks in folders.masks_in(above / below[0]))
+        yield from (masks.joinpath(*below[1:]) for masks in masks_in(above / below[0]))
+
+
+def _masks_in(folder: Path) -> list[Path]:
+    """The folders of masks that lie in a folder."""
+    names = sorted(os.listdir(folder)) if os.path.isdir(folder) else []
+    found = sorted((FOLDERS.index(name_key(name)), name) for name in names if name_key(name) in FOLDERS)
+    return [folder / name for _, name in found if os.path.isdir(folder / name)]
+
+
+def _files_inside(folder: Path) -> dict[str, Path]:
+    """The masks in a folder of masks by the key of their stem."""
+    return {name_key(path.stem): path for path in reversed([*images_in(folder), *_with_mask_as_suffix(folder)])}
+
+
+def _files_beside(folder: Path) -> dict[str, Path]:
+    """The masks in a folder of photographs by the key of their name without what follows the ending."""
+    beside = {name_key(path.stem): path for path in reversed(pictures_in(folder)) if name_key(path.stem).endswith(MASK_ENDINGS)}
+    return beside | {name_key(path.name): path for path in _with_mask_as_suffix(folder)}
 
 
 def _with_mask_as_suffix(folder: Path) -> list[Path]:

@@ -16,6 +16,7 @@ import os
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Protocol
 
@@ -90,8 +91,6 @@ class Source:
     _names: dict[Path, str] = field(default_factory=dict)
     _taken: set[str] = field(default_factory=set)
     _folders: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
-    _by_name: dict[str, list[Path]] | None = None
-    _by_stem: dict[str, list[Path]] | None = None
 
     def __post_init__(self) -> None:
         self.root = Path(os.path.abspath(self.root))
@@ -176,7 +175,7 @@ class Source:
             if found.path is not None:
                 return Found(found.path, "elsewhere")
         if absolute and parts:
-            alike = self._index().get(name_key(parts[-1]), [])
+            alike = self._by_name.get(name_key(parts[-1]), [])
             if len(alike) == 1:
                 return Found(self.check_inside(alike[0]), "elsewhere")
             if here is not None and os.path.isfile(here) and not inside:
@@ -205,22 +204,22 @@ class Source:
             self._folders[folder] = stems
         return self._folders[folder]
 
+    @cached_property
     def images_by_stem(self) -> dict[str, list[Path]]:
         """Every image of the source by the key of its stem; see `walk`."""
-        if self._by_stem is None:
-            self._by_stem = {}
-            for path in self.walk():
-                if path.suffix.lower() in IMAGE_SUFFIXES:
-                    self._by_stem.setdefault(name_key(path.stem), []).append(path)
-        return self._by_stem
+        found: dict[str, list[Path]] = {}
+        for path in self.walk():
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                found.setdefault(name_key(path.stem), []).append(path)
+        return found
 
-    def _index(self) -> dict[str, list[Path]]:
+    @cached_property
+    def _by_name(self) -> dict[str, list[Path]]:
         """Every file of the source by the key of its name; see `walk`."""
-        if self._by_name is None:
-            self._by_name = {}
-            for path in self.walk():
-                self._by_name.setdefault(name_key(path.name), []).append(path)
-        return self._by_name
+        found: dict[str, list[Path]] = {}
+        for path in self.walk():
+            found.setdefault(name_key(path.name), []).append(path)
+        return found
 
 
 def walk(folder: Path, runs: set[Path] | None = None, links: set[Path] | None = None, *, follow: bool = False) -> list[Path]:

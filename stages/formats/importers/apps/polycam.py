@@ -8,7 +8,6 @@ are undistorted; the two kinds share no frame and are not mixed. depth/ holds th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -80,8 +79,7 @@ def _camera(source: Source, path: Path) -> Camera:
     size = lenses.image_size(value("width"), value("height"), where, _AGAIN)
     rows = [[value(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     pose = pose_from_opengl(lenses.rigid([*rows, [0, 0, 0, 1]], where))
-    lens = brown_camera("", size, (value("fx"), value("fy")), (value("cx"), value("cy")), (), (0, 0), where)
-    return replace(lens, world_from_camera=pose)
+    return brown_camera("", size, (value("fx"), value("fy")), (value("cx"), value("cy")), pose, where)
 
 
 FORMAT = ListFormat("polycam", EXPECTED, _signs, _listed)

@@ -8,7 +8,6 @@ ARKit's: y up, metres. depth/<number>.exr holds metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -66,8 +65,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
             continue
         what = f"{where}: frame {index}"
         fx, fy, cx, cy = common or numbers(coefficients[index], 4, f"{what}: perFrameIntrinsicCoeffs", _AGAIN)
-        lens = brown_camera("", size, (fx, fy), (cx, cy), (), (0, 0), what)
-        camera = replace(lens, world_from_camera=_pose(numbers(poses[index], 7, f"{what}: pose", _AGAIN), what))
+        camera = brown_camera("", size, (fx, fy), (cx, cy), _pose(numbers(poses[index], 7, f"{what}: pose", _AGAIN), what), what)
         listed.append(Frame(image.name, image.parent, what, stated(camera)))
     return Listed(where, listed, signs, rejected=unposed, up=Y_UP, metric=True, depth=partial(_depth, source, place))
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -102,7 +101,7 @@ def _camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Came
     def at(name: str, size: tuple[int, int]) -> Camera:
         for width, height in (size, size[::-1]):  # a picture that EXIF turns has its camera stated for the pixels as stored
             if abs(k[2] - width / 2) <= OFF_CENTRE * width and abs(k[5] - height / 2) <= OFF_CENTRE * height:
-                return replace(brown_camera(name, (width, height), (k[0], k[4]), (k[2], k[5]), (), (0, 0), where), world_from_camera=pose)
+                return brown_camera(name, (width, height), (k[0], k[4]), (k[2], k[5]), pose, where)
         raise BadInput(
             f"{where}: the principal point {k[2]:g}, {k[5]:g} is not near the middle of the picture of {size[0]}x{size[1]}. Was it cropped or scaled? {_AGAIN}"
         )

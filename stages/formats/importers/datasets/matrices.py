@@ -1,25 +1,35 @@
-"""Matrices of text files, and what a 3x4 projection holds."""
+"""Matrices of cameras in text files, JSON and NumPy archives, and what a 3x4 projection holds."""
 
 from __future__ import annotations
 
+import re
+import zipfile
+import zlib
 from collections.abc import Callable
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
+from pipeline.text import printable
 from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera, without_skew
+from stages.formats.importers.llff import rows_of_npy
+from stages.formats.importers.source import MAX_FRAMES
+from stages.formats.importers.texts import numbers, read_text
+from stages.io import json_file
 
-_AGAIN = "Write the data set again."
+MAX_CAMERA_BYTES = 1 << 16  # of a text file with one camera
+MAX_ARCHIVE_BYTES, MAX_MATRIX_BYTES = 256 << 20, 4096
+_AGAIN = "Write or download the data set again, or choose another format with --as."
 
 
-def pinhole(name: str, size: tuple[int, int], k: np.ndarray, where: str) -> Camera:
-    """A camera at the origin from its (3, 3) matrix K, the centre of the first pixel being at 0.5, 0.5. Raises BadInput."""
+def _pinhole(name: str, size: tuple[int, int], k: np.ndarray, pose: np.ndarray, where: str) -> Camera:
+    """A camera from its (3, 3) matrix K, the centre of the first pixel being at 0.5, 0.5. Raises BadInput."""
     if abs(k[2] - (0, 0, 1)).max() > 1e-6 or k[1, 0]:
         raise BadInput(f"{where}: no matrix of a camera: rows {k[1].tolist()} and {k[2].tolist()}, expected 0 fy cy and 0 0 1. {_AGAIN}")
-    camera = brown_camera(name, size, (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), (), (0, 0), where)
+    camera = brown_camera(name, size, (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), pose, where)
     lenses.validated(camera, where)
     without_skew(k[0, 1], k[1, 1], size, k[1, 2], "a skew of", where)
     for centre, side in ((k[0, 2], size[0]), (k[1, 2], size[1])):
@@ -33,16 +43,13 @@ def pinhole(name: str, size: tuple[int, int], k: np.ndarray, where: str) -> Came
 
 def pinhole_frame(k: np.ndarray, pose: np.ndarray, where: str, stated: tuple[int, int] | None = None) -> Callable[[str, tuple[int, int]], Camera]:
     """For a frame: the camera of K and a pose, at the stated (width, height) or else at the image's."""
-    return lambda name, size: replace(pinhole(name, stated or size, k, where), world_from_camera=pose)
+    return lambda name, size: _pinhole(name, stated or size, k, pose, where)
 
 
 def from_world(matrix: np.ndarray, where: str) -> np.ndarray:
     """(4, 4) world to camera -> camera to world. Raises BadInput where it is no rigid motion."""
     rigid = lenses.rigid(matrix, where)
-    pose = np.eye(4)
-    pose[:3, :3] = rigid[:3, :3].T
-    pose[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
-    return pose
+    return lenses.inverse(rigid[:3, :3], rigid[:3, 3])
 
 
 def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -60,3 +67,58 @@ def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarr
     pose[:3, :3] = lenses.rotation(turn, where).T
     pose[:3, 3] = -np.linalg.solve(left, projection[:, 3])
     return k / k[2, 2], pose
+
+
+def intrinsics_of(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
+    """K (3, 3), and (width, height) where the file states it. Raises BadInput."""
+    if path.suffix == ".json":
+        return _open3d_intrinsics(path)
+    found, where = read_text(path, MAX_CAMERA_BYTES).split(), path.name
+    if len(found) in (9, 16):
+        side = 3 if len(found) == 9 else 4
+        return numbers(found, len(found), where).reshape(side, side)[:3, :3], None
+    if len(found) == 4:
+        fx, fy, cx, cy = numbers(found, 4, where)
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), None
+    if len(found) < 6:
+        raise BadInput(f"{where}: {len(found)} numbers; expected a matrix of 3x3 or 4x4, fx fy cx cy, or f cx cy first and height, width last. {_AGAIN}")
+    focal, cx, cy = numbers(found[:3], 3, where)
+    height, width = numbers(found[-2:], 2, where)
+    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), lenses.image_size(width, height, where, _AGAIN)
+
+
+def _open3d_intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int]]:
+    """Of a JSON file: width, height, and intrinsic_matrix, column by column."""
+    document, where = json_file.read_object(path, path.name, _AGAIN), path.name
+    matrix = json_file.numbers(document.get("intrinsic_matrix"), 9, f"{where}: intrinsic_matrix, column by column,", _AGAIN)
+    width, height = (json_file.number(document, key, where, _AGAIN) for key in ("width", "height"))
+    return np.array(matrix).reshape(3, 3).T, lenses.image_size(width, height, where, _AGAIN)
+
+
+def archive_matrices(path: Path, where: str) -> dict[str, np.ndarray]:
+    """world_mat_<i> and scale_mat_<i>, (4, 4) float64, of an archive, of which nothing but plain numbers is read. Raises BadInput."""
+    found: dict[str, np.ndarray] = {}
+    if path.stat().st_size > MAX_ARCHIVE_BYTES:
+        raise BadInput(f"{where}: larger than {MAX_ARCHIVE_BYTES >> 20} MiB. {_AGAIN}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                match = re.fullmatch(r"((?:world|scale)_mat_[0-9]{1,6})\.npy", info.filename)
+                if not match:
+                    continue
+                if len(found) >= 2 * MAX_FRAMES:
+                    raise BadInput(f"{where}: more than {MAX_FRAMES} cameras; that many are not read.")
+                with archive.open(info) as entry:
+                    found[match[1]] = _archive_matrix(entry.read(MAX_MATRIX_BYTES + 1), f"{where}: {match[1]}")
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise BadInput(f"{where}: not a NumPy archive, or truncated ({printable(error, 80)}). {_AGAIN}") from None
+    return found
+
+
+def _archive_matrix(data: bytes, where: str) -> np.ndarray:
+    if len(data) > MAX_MATRIX_BYTES:
+        raise BadInput(f"{where}: more than {MAX_MATRIX_BYTES} bytes; expected a 4x4 matrix. {_AGAIN}")
+    matrix = rows_of_npy(data, where, 4, "4x4 matrices", _AGAIN)
+    if len(matrix) != 4:
+        raise BadInput(f"{where}: {len(matrix)} rows; expected a 4x4 matrix. {_AGAIN}")
+    return matrix

@@ -15,9 +15,8 @@ x right, y down, z forward in all but the first.
 from __future__ import annotations
 
 import re
-import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -28,19 +27,16 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.colmap_model import FISHEYE, as_traced, count_parameters
-from stages.formats.importers.datasets.matrices import decomposed, from_world, pinhole_frame
+from stages.formats.importers.datasets.matrices import MAX_CAMERA_BYTES, archive_matrices, decomposed, from_world, intrinsics_of, pinhole_frame
 from stages.formats.importers.frames import Frame
 from stages.formats.importers.listed import Z_UP, Listed, ListFormat, places_of, sparse_points
-from stages.formats.importers.llff import npy_header
 from stages.formats.importers.source import MAX_FRAMES, Source, images_in
 from stages.formats.importers.texts import head, number, numbers, read_text
 from stages.formats.importers.transforms import read_document
 from stages.formats.importers.transforms_camera import camera_of
 from stages.io.capture import SparsePoints
-from stages.io.json_file import LARGEST_NUMBER, finite, read_json
+from stages.io.json_file import LARGEST_NUMBER, read_json
 
-MAX_CAMERA_BYTES = 1 << 16  # of a text file with one camera
-MAX_ARCHIVE_BYTES, MAX_MATRIX_BYTES = 256 << 20, 4096
 MAX_POINTS = 5_000_000
 MAX_RIGS = 8  # within each other
 DTU_LIGHT = 3  # of seven: each view has it
@@ -276,7 +272,7 @@ def _idr_files(source: Source) -> Sequence[Path]:
 
 def _idr(source: Source, signs: Sequence[Path]) -> Listed:
     where = source.name_of(signs[0])
-    matrices = _idr_matrices(source.real(signs[0]), where)
+    matrices = archive_matrices(source.real(signs[0]), where)
     images, masks = _images(source.root, ("image", "images", "rgb")), _images(source.root, ("mask", "masks"))
     count = sum(name.startswith("world_mat_") for name in matrices)
     frames.check_count(count, where)
@@ -306,53 +302,18 @@ def _idr_bounds(matrices: dict[str, np.ndarray], where: str) -> np.ndarray | Non
     return np.stack([matrix[:3, 3] - radius, matrix[:3, 3] + radius])
 
 
-def _idr_matrices(path: Path, where: str) -> dict[str, np.ndarray]:
-    """world_mat_<i> and scale_mat_<i>, (4, 4) float64, of an archive, of which nothing but plain numbers is read. Raises BadInput."""
-    found: dict[str, np.ndarray] = {}
-    if path.stat().st_size > MAX_ARCHIVE_BYTES:
-        raise BadInput(f"{where}: larger than {MAX_ARCHIVE_BYTES >> 20} MiB. {_AGAIN}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for info in archive.infolist():
-                match = re.fullmatch(r"((?:world|scale)_mat_[0-9]{1,6})\.npy", info.filename)
-                if not match:
-                    continue
-                if len(found) >= 2 * MAX_FRAMES:
-                    raise BadInput(f"{where}: more than {MAX_FRAMES} cameras; that many are not read.")
-                with archive.open(info) as entry:
-                    found[match[1]] = _idr_matrix(entry.read(MAX_MATRIX_BYTES + 1), f"{where}: {match[1]}")
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-        raise BadInput(f"{where}: not a NumPy archive, or truncated ({printable(error, 80)}). {_AGAIN}") from None
-    return found
-
-
-def _idr_matrix(data: bytes, where: str) -> np.ndarray:
-    if len(data) > MAX_MATRIX_BYTES:
-        raise BadInput(f"{where}: more than {MAX_MATRIX_BYTES} bytes; expected a 4x4 matrix. {_AGAIN}")
-    shape, fortran, kind, start = npy_header(Path(where), data)
-    if shape != (4, 4) or kind.kind not in "fiu" or len(data) - start < 16 * kind.itemsize:
-        what = f"{kind} {shape}"
-        raise BadInput(f"{where}: {what:.80}; expected numbers of shape (4, 4). {_AGAIN}")
-    matrix = np.frombuffer(data, kind, 16, start).reshape(4, 4, order="F" if fortran else "C").astype(np.float64)
-    if not (np.abs(matrix) <= LARGEST_NUMBER).all():  # nor nan
-        raise BadInput(f"{where}: numbers that are not finite, or beyond {LARGEST_NUMBER:g}. {_AGAIN}")
-    return matrix
-
-
 # NSVF
 def _nsvf_files(source: Source) -> Sequence[Path]:
     """The intrinsics, and the poses by name."""
     intrinsics, place = source.root / "intrinsics.txt", source.root / "pose"
-    if not intrinsics.is_file() or not source.real(intrinsics).is_file() or not place.is_dir():
-        return []
-    poses = sorted(source.check_inside(path) for path in place.glob("*.txt") if path.is_file())
-    return [intrinsics, *poses] if poses else []
+    poses = sorted(source.check_inside(path) for path in place.glob("*.txt") if path.is_file()) if intrinsics.is_file() else []
+    return [source.check_inside(intrinsics), *poses] if poses else []
 
 
 def _nsvf(source: Source, signs: Sequence[Path]) -> Listed:
     intrinsics, *poses = signs
     frames.check_count(len(poses), "pose")
-    k, stated = _intrinsics(source.real(intrinsics))
+    k, stated = intrinsics_of(source.real(intrinsics))
     beside = _folder(source.root, ("rgb", "images", "image", "color"))
     splits = {"0_": "train", "1_": "val" if any(path.name.startswith("2_") for path in poses) else "test", "2_": "test"}
     split = splits if all(path.name[:2] in splits for path in poses) else {}
@@ -371,52 +332,15 @@ def _nsvf(source: Source, signs: Sequence[Path]) -> Listed:
     return Listed("pose", listed, [*signs, box], bounds=corners)
 
 
-def _intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
-    """K (3, 3), and (width, height) where the file states it. Raises BadInput."""
-    if path.suffix == ".json":
-        return _open3d_intrinsics(path)
-    found, where = read_text(path, MAX_CAMERA_BYTES).split(), path.name
-    if len(found) in (9, 16):
-        side = 3 if len(found) == 9 else 4
-        return numbers(found, len(found), where).reshape(side, side)[:3, :3], None
-    if len(found) == 4:
-        fx, fy, cx, cy = numbers(found, 4, where)
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), None
-    if len(found) < 6:
-        raise BadInput(f"{where}: {len(found)} numbers; expected a matrix of 3x3 or 4x4, fx fy cx cy, or f cx cy first and height, width last. {_AGAIN}")
-    focal, cx, cy = numbers(found[:3], 3, where)
-    height, width = numbers(found[-2:], 2, where)
-    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), lenses.image_size(width, height, where, _AGAIN)
-
-
-def _open3d_intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int]]:
-    """Of a JSON file: width, height, and intrinsic_matrix, column by column."""
-    document = read_json(path, _AGAIN)
-    matrix = document.get("intrinsic_matrix") if isinstance(document, dict) else None
-    values = [finite(value) for value in matrix] if isinstance(matrix, list) and len(matrix) == 9 else [None]
-    sides = [document.get(key) for key in ("width", "height")] if isinstance(document, dict) else []
-    if None in values or not all(isinstance(side, int) and 0 < side <= 65535 for side in sides):
-        raise BadInput(f"{path.name}: expected width, height and an intrinsic_matrix of 9 numbers, column by column. {_AGAIN}")
-    return np.array(values, np.float64).reshape(3, 3).T, (int(sides[0]), int(sides[1]))  # type: ignore[arg-type]
-
-
 # Tanks and Temples
 def _tanks_files(source: Source) -> Sequence[Path]:
     """Trajectories: files that begin with three whole numbers and a matrix."""
     found = []
-    for path in sorted(source.root.glob("*.log")):
-        words = head(source.real(path)).split()[:19] if path.is_file() else []
-        if len(words) == 19 and all(_is_number(word) for word in words) and [float(word) for word in words[15:]] == [0, 0, 0, 1]:
-            found.append(path)
+    for path in filter(Path.is_file, sorted(source.root.glob("*.log"))):
+        with suppress(ValueError):  # it is another text
+            if [float(word) for word in head(source.real(path)).split()[:19]][15:] == [0, 0, 0, 1]:
+                found.append(path)
     return found
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
@@ -426,7 +350,7 @@ def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
     lens = next((source.root / name for name in names if (source.root / name).is_file()), None)
     if lens is None:
         raise BadInput(f"{signs[0]}: a trajectory without intrinsics. Write fx fy cx cy, in pixels, into {source.root / names[0]}.")
-    k, stated = _intrinsics(source.real(lens))
+    k, stated = intrinsics_of(source.real(lens))
     images = _images(source.root, ("images", "image", "rgb", "color", "."))
     where = source.name_of(signs[0])
     words = read_text(source.real(signs[0])).split()

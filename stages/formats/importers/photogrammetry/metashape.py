@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -74,7 +75,12 @@ def _project(source: Source, file: Path, where: str, chunk: Element, warnings: l
     world, metric, up, remark = _world(transform, where)
     if remark:
         warnings.append(remark)
-    sensors = _Sensors(chunk, where)
+    sensors = {one.get("id"): one for one in chunk.iterfind("sensors/sensor")}
+
+    @cache
+    def sensor(of: str | None) -> Camera:
+        return _sensor(sensors.get(of), f"{where}: sensor {printable(of, 20)}", warnings)
+
     listed: list[frames.Frame] = []
     rejected: list[tuple[str, str]] = []
     for index, one in enumerate(cameras):
@@ -89,63 +95,43 @@ def _project(source: Source, file: Path, where: str, chunk: Element, warnings: l
             rejected.append((name, "in another component"))
         else:
             pose = lenses.rigid(numbers((matrix.text or "").split(), 16, f"{place}: transform").reshape(4, 4), place)
-            camera = replace(sensors.camera(one.get("sensor_id")), world_from_camera=world.pose(pose))
+            camera = replace(sensor(one.get("sensor_id")), world_from_camera=world.pose(pose))
             listed.append(frames.Frame(label, source.root, place, frames.stated(camera), bare=True))
-    warnings += sensors.remarks
-    facts: dict[str, object] = {"label": printable(chunk.get("label") or "", frames.MAX_NAME), "sensors": len(sensors.elements)}
+    facts: dict[str, object] = {"label": printable(chunk.get("label") or "", frames.MAX_NAME), "sensors": len(sensors)}
     return Listed(where, listed, [file], rejected, warnings, up, metric=metric, facts=facts)
 
 
-class _Sensors:
-    """The sensors of a chunk: cameras at the origin.
-
-    remarks  what was left out of them
-    """
-
-    def __init__(self, chunk: Element, where: str) -> None:
-        self.elements = {one.get("id"): one for one in chunk.iterfind("sensors/sensor")}
-        self.where = where
-        self.remarks: list[str] = []
-        self._made: dict[str | None, Camera] = {}
-
-    def camera(self, number_of: str | None) -> Camera:
-        """Raises BadInput for a sensor that is missing, not calibrated, or of a type that no camera model describes."""
-        if number_of not in self._made:
-            element = self.elements.get(number_of)
-            where = f"{self.where}: sensor {printable(number_of, 20)}"
-            if element is None:
-                raise BadInput(f"{where}: listed by a camera, and missing. {_ALIGN}")
-            self._made[number_of] = self._sensor(element, where)
-        return self._made[number_of]
-
-    def _sensor(self, element: Element, where: str) -> Camera:
-        kind = element.get("type") or "frame"
-        calibrations = {one.get("class"): one for one in element.iterfind("calibration")}
-        calibration = calibrations.get("adjusted", calibrations.get("initial", calibrations.get(None)))
-        if calibration is None:
-            raise BadInput(f"{where}: not calibrated. {_ALIGN}")
-        resolution = calibration.find("resolution")
-        resolution = element.find("resolution") if resolution is None else resolution
-        if resolution is None:
-            raise BadInput(f"{where}: no resolution. {_ALIGN}")
-        sides = numbers([resolution.get("width") or "", resolution.get("height") or ""], 2, f"{where}: resolution")
-        size = lenses.image_size(sides[0], sides[1], where, _ALIGN)
-        k = {key: number(calibration.findtext(key) or "0", f"{where}: {key}") for key in PARAMETERS}
-        if not k["f"] > 0:
-            raise BadInput(f"{where}: focal length {k['f']:g}; expected more than zero pixels. {_ALIGN}")
-        if k["p3"] or k["p4"]:
-            raise BadInput(f"{where}: p3, p4 are in no camera model that is supported. Export undistorted images and their cameras instead.")
-        focal, centre = (k["f"] + k["b1"], k["f"]), (size[0] / 2 + k["cx"], size[1] / 2 + k["cy"])
-        remark = without_skew(k["b2"], k["f"], size, centre[1], "b2 (skew)", where)
-        if remark:
-            self.remarks.append(f"{where}: {remark}.")
-        if kind == "frame":
-            return brown_camera("", size, focal, centre, (k["k1"], k["k2"], k["k3"], k["k4"]), (k["p2"], k["p1"]), where)
-        if kind == "fisheye":
-            if k["p1"] or k["p2"]:
-                raise BadInput(f"{where}: a fisheye lens with p1, p2, which no camera model that is supported has. Align again without them.")
-            return Camera("", *size, "OPENCV_FISHEYE", (*focal, *centre, k["k1"], k["k2"], k["k3"], k["k4"]), np.eye(4))
-        raise BadInput(f"{where}: a {printable(kind, 40)} camera; frame and fisheye cameras are read. Export undistorted images and their cameras instead.")
+def _sensor(element: Element | None, where: str, warnings: list[str]) -> Camera:
+    """A camera at the origin; what is left out of it goes into the warnings. Raises BadInput where the sensor is missing, not calibrated, or of a type that no
+    camera model describes."""
+    if element is None:
+        raise BadInput(f"{where}: listed by a camera, and missing. {_ALIGN}")
+    kind = element.get("type") or "frame"
+    calibrations = {one.get("class"): one for one in element.iterfind("calibration")}
+    calibration = calibrations.get("adjusted", calibrations.get("initial", calibrations.get(None)))
+    if calibration is None:
+        raise BadInput(f"{where}: not calibrated. {_ALIGN}")
+    resolution = calibration.find("resolution")
+    resolution = element.find("resolution") if resolution is None else resolution
+    if resolution is None:
+        raise BadInput(f"{where}: no resolution. {_ALIGN}")
+    sides = numbers([resolution.get("width") or "", resolution.get("height") or ""], 2, f"{where}: resolution")
+    size = lenses.image_size(sides[0], sides[1], where, _ALIGN)
+    k = {key: number(calibration.findtext(key) or "0", f"{where}: {key}") for key in PARAMETERS}
+    if not k["f"] > 0:
+        raise BadInput(f"{where}: focal length {k['f']:g}; expected more than zero pixels. {_ALIGN}")
+    if k["p3"] or k["p4"]:
+        raise BadInput(f"{where}: p3, p4 are in no camera model that is supported. Export undistorted images and their cameras instead.")
+    focal, centre = (k["f"] + k["b1"], k["f"]), (size[0] / 2 + k["cx"], size[1] / 2 + k["cy"])
+    if remark := without_skew(k["b2"], k["f"], size, centre[1], "b2 (skew)", where):
+        warnings.append(f"{where}: {remark}.")
+    if kind == "frame":
+        return brown_camera("", size, focal, centre, np.eye(4), where, (k["k1"], k["k2"], k["k3"], k["k4"]), (k["p2"], k["p1"]))
+    if kind == "fisheye":
+        if k["p1"] or k["p2"]:
+            raise BadInput(f"{where}: a fisheye lens with p1, p2, which no camera model that is supported has. Align again without them.")
+        return Camera("", *size, "OPENCV_FISHEYE", (*focal, *centre, k["k1"], k["k2"], k["k3"], k["k4"]), np.eye(4))
+    raise BadInput(f"{where}: a {printable(kind, 40)} camera; frame and fisheye cameras are read. Export undistorted images and their cameras instead.")
 
 
 def _world(transform: Element | None, where: str) -> tuple[Similarity, bool, np.ndarray | None, str | None]:

@@ -24,7 +24,7 @@ from stages.formats.importers.listed import Z_UP, Listed, ListFormat, places_of,
 from stages.formats.importers.source import Source
 from stages.formats.importers.texts import read_text
 from stages.io.capture import SparsePoints
-from stages.io.json_file import finite, number, read_json, shown
+from stages.io.json_file import finite, number, numbers, read_json, shown
 
 PLACES = ("opensfm/reconstruction.json", "reconstruction.json")
 MAX_POINTS = 2_000_000
@@ -67,13 +67,6 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     )
 
 
-def _vector(value: Any, where: str) -> np.ndarray:
-    found = [finite(entry) for entry in value] if isinstance(value, list) and len(value) == 3 else [None]
-    if None in found:
-        raise BadInput(f"{where}: {shown(value)}; expected three finite numbers. {_AGAIN}")
-    return np.array(found, np.float64)
-
-
 def _frames(source: Source, file: Path, reconstruction: dict[str, Any]) -> list[frames.Frame]:
     where = source.name_of(file)
     frames.check_count(len(reconstruction["shots"]), where)
@@ -83,10 +76,8 @@ def _frames(source: Source, file: Path, reconstruction: dict[str, Any]) -> list[
         place = f"{where}: shot {printable(name, frames.MAX_NAME)}"
         if not isinstance(shot, dict):
             raise BadInput(f"{place}: {shown(shot)}; expected an object. {_AGAIN}")
-        turn = rotation_of(_vector(shot.get("rotation"), f"{place}: rotation"))
-        pose = np.eye(4)
-        pose[:3, :3] = turn.T
-        pose[:3, 3] = -turn.T @ _vector(shot.get("translation"), f"{place}: translation")
+        turn, shift = (np.array(numbers(shot.get(key), 3, f"{place}: {key}", _AGAIN)) for key in ("rotation", "translation"))
+        pose = lenses.inverse(rotation_of(turn), shift)
         lens = reconstruction["cameras"].get(shot.get("camera")) if isinstance(shot.get("camera"), str) else None
         if not isinstance(lens, dict):
             raise BadInput(f"{place}: camera {shown(shot.get('camera'))} is not among the cameras. {_AGAIN}")
@@ -121,10 +112,8 @@ def _camera(lens: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str
         fx, fy = focal[0] * longer, focal[1] * longer
         centre = width / 2 + shift[0] * longer, height / 2 + shift[1] * longer
         if kind in _FISHEYE:
-            found = Camera(name, width, height, "OPENCV_FISHEYE", (fx, fy, *centre, k["k1"], k["k2"], k["k3"], k["k4"]), pose)
-        else:
-            found = brown_camera(name, (width, height), (fx, fy), centre, (k["k1"], k["k2"], k["k3"]), (k["p1"], k["p2"]), where)
-        return replace(found, world_from_camera=pose)
+            return Camera(name, width, height, "OPENCV_FISHEYE", (fx, fy, *centre, k["k1"], k["k2"], k["k3"], k["k4"]), pose)
+        return brown_camera(name, (width, height), (fx, fy), centre, pose, where, (k["k1"], k["k2"], k["k3"]), (k["p1"], k["p2"]))
 
     return camera
 
@@ -141,8 +130,8 @@ def _points(source: Source, file: Path, reconstruction: dict[str, Any], places: 
     for name, point in points.items():
         if not isinstance(point, dict):
             raise BadInput(f"{where}: point {printable(name, 40)}: {shown(point)}; expected an object. {_AGAIN}")
-        xyz.append(_vector(point.get("coordinates"), f"{where}: point {printable(name, 40)}"))
-        rgb.append(_vector(point.get("color", [128, 128, 128]), f"{where}: colour of point {printable(name, 40)}"))
+        xyz.append(numbers(point.get("coordinates"), 3, f"{where}: point {printable(name, 40)}", _AGAIN))
+        rgb.append(numbers(point.get("color", [128, 128, 128]), 3, f"{where}: colour of point {printable(name, 40)}", _AGAIN))
     tracks = _tracks(source, file.with_name("tracks.csv"), {name: index for index, name in enumerate(points)}, places)
     return sparse_points(np.array(xyz), np.array(rgb), tracks)
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -134,7 +133,7 @@ def _lens(
         longer = max(size)
         pixels = focal / FILM * longer
         centre = size[0] / 2 + principal[0] * longer, size[1] / 2 + principal[1] * longer
-        return replace(brown_camera(name, size, (pixels, pixels), centre, radial, tangential, where), world_from_camera=pose)
+        return brown_camera(name, size, (pixels, pixels), centre, pose, where, radial, tangential)
 
     return camera
 
