@@ -11,7 +11,8 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, Similarity, pose_from_opengl
 from pipeline.errors import BadInput
-from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
+from stages.formats.importers.lenses import rigid
+from stages.io.json_file import finite, numbers, read_json, shown
 
 MAX_FILE = 64 << 20
 MAX_SIZE = 16384
@@ -55,7 +56,7 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
         where = f"{path}: camera_path[{k}]"
         if not isinstance(entry, dict):
             raise BadInput(f"{where}: expected an object, found {shown(entry)}.")
-        pose = world_from_capture.pose(_pose(entry.get("camera_to_world"), where))
+        pose = world_from_capture.pose(_pose(entry.get("camera_to_world"), f"{where}.camera_to_world"))
         vertical = _number(entry.get("fov", document.get("default_fov")), f"{where}.fov", "degrees between 0 and 180", MIN_ANGLE, 180.0 - MIN_ANGLE)
         focal = 0.5 * size[1] / math.tan(math.radians(vertical / 2))
         cameras.append(Camera(f"frame_{k:04d}", size[0], size[1], "SIMPLE_PINHOLE", (focal, size[0] / 2, size[1] / 2), pose))
@@ -81,22 +82,8 @@ def _size(document: dict[str, Any], path: Path, width: int | None, height: int |
 
 def _pose(value: Any, where: str) -> np.ndarray:
     """camera_to_world with the project's axes, its rotation made exactly orthonormal."""
-    where = f"{where}.camera_to_world"
-    if not isinstance(value, list) or len(value) != 16 or any(isinstance(x, bool) or not isinstance(x, int | float) for x in value):
-        raise BadInput(f"{where}: expected 16 numbers, found {shown(value)}.")
-    numbers = [finite(x) for x in value]
-    if None in numbers:
-        raise BadInput(f"{where}: holds a number that is not finite, or beyond {LARGEST_NUMBER:g}.")
-    matrix = np.array(numbers, np.float64).reshape(4, 4)
-    if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-        hint = " It looks transposed; write it row by row." if np.allclose(matrix[:, 3], (0, 0, 0, 1), atol=1e-6) else ""
-        raise BadInput(f"{where}: its last row is {matrix[3].tolist()}, expected 0 0 0 1.{hint}")
-    rotation = matrix[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise BadInput(f"{where}: its upper left 3x3 is no rotation (determinant {np.linalg.det(rotation):.4g}).")
-    u, _, vt = np.linalg.svd(rotation)
-    matrix[:3, :3] = u @ vt
-    return pose_from_opengl(matrix)
+    matrix = numbers(value, 16, where, "Export the path again.")
+    return pose_from_opengl(rigid(np.reshape(matrix, (4, 4)), where))
 
 
 def _number(value: Any, where: str, expected: str, low: float, high: float) -> float:

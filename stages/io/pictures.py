@@ -90,7 +90,7 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
             warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
             raw = path.suffix.lower() in RAW_SUFFIXES and "RAW" in formats
             image: Any
-            with _raw(file) if raw else Image.open(file, formats=_possible(file, formats)) as image:
+            with RawFile(file) if raw else Image.open(file, formats=_possible(file, formats)) as image:
                 width, height = image.size
                 _check_size(width, height, file.size)
                 if image.format in _JPEG and has_more_scans(file, most_scans(width, height)):
@@ -149,11 +149,6 @@ def _possible(file: _Bounded, formats: Sequence[str]) -> tuple[str, ...]:
         pillow_heif.register_heif_opener()
         return ("HEIF",)
     return tuple(name for name in formats if name not in ("HEIF", "AVIF", "RAW"))
-
-
-def _raw(file: _Bounded) -> Any:
-    """A camera's raw picture."""
-    return RawFile(file)
 
 
 def _reason(error: Exception) -> str:

@@ -131,15 +131,8 @@ def views_of(scene: Scene, split: str) -> tuple[View, ...]:
 def save(scene: Scene, folder: Path) -> None:
     """Write scene.json."""
     views = [
-        {
-            "image": view.image,
-            "mask": view.mask,
-            "split": view.split,
-            "near": view.near,
-            "far": view.far,
-            "camera": camera_to_json(view.camera),
-            "source_camera": camera_to_json(view.source_camera),
-        }
+        {name: getattr(view, name) for name in ("image", "mask", "split", "near", "far")}
+        | {"camera": camera_to_json(view.camera), "source_camera": camera_to_json(view.source_camera)}
         for view in scene.views
     ]
     document = {
@@ -280,17 +273,7 @@ def describe(folder: Path) -> dict[str, Any]:
     """What `enerf inspect RUN/poses` prints: the source's cameras in the capture's frame, and the facts of the scene."""
     scene = load(folder)
     cameras = [
-        {
-            "name": view.name,
-            "width": view.source_camera.width,
-            "height": view.source_camera.height,
-            "model": view.source_camera.model,
-            "params": list(view.source_camera.params),
-            "split": view.split,
-            "capture_from_camera": view.source_camera.world_from_camera.tolist(),
-            "working_size": [view.camera.width, view.camera.height],
-        }
-        for view in scene.views
+        described_camera(view.source_camera, view.split) | {"name": view.name, "working_size": [view.camera.width, view.camera.height]} for view in scene.views
     ]
     corners = np.stack(np.meshgrid(*scene.bounds.T, indexing="ij"), -1).reshape(-1, 3)
     in_capture = scene.world_from_capture.inverse().points(corners)
@@ -345,6 +328,12 @@ def similarity_to_json(similarity: Similarity) -> dict[str, Any]:
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """A camera as JSON holds it."""
     return {**vars(camera), "params": list(camera.params), "world_from_camera": camera.world_from_camera.tolist()}
+
+
+def described_camera(camera: Camera, split: str | None) -> dict[str, Any]:
+    """A camera in the capture's frame, as `enerf inspect` prints it."""
+    facts = {name: getattr(camera, name) for name in ("name", "width", "height", "model")}
+    return facts | {"params": list(camera.params), "split": split, "capture_from_camera": camera.world_from_camera.tolist()}
 
 
 def camera_from(data: CameraDocument, where: str) -> Camera:

@@ -72,7 +72,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
 
 def _camera(model: Model, image: PosedImage, where: str) -> Callable[[str, tuple[int, int]], Camera]:
     lens, pose = model.cameras[image.camera], pose_from_colmap(np.array(image.quaternion), np.array(image.translation))
-    return lambda name, size: lenses.validated(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {image.camera}")
+    return lambda name, size: lenses.validated(replace(lens, name=name, world_from_camera=pose), f"{where}: camera {image.camera}")
 
 
 def _image_folder(source: Source, model: Model) -> Path:

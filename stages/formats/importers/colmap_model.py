@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import MODELS
+from efficientnerf.geometry.cameras import MODELS, Camera
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers.lenses import image_size
@@ -47,16 +47,6 @@ _AGAIN = "Copy the model again, or export it anew."
 
 
 @dataclass(frozen=True)
-class Lens:
-    """A camera of cameras.bin|txt."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class PosedImage:
     """An image of images.bin|txt: world to camera as quaternion w x y z and translation."""
 
@@ -68,8 +58,10 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class Model:
+    """cameras: at the origin"""
+
     folder: Path
-    cameras: dict[int, Lens]
+    cameras: dict[int, Camera]
     images: dict[int, PosedImage]
 
 
@@ -169,15 +161,14 @@ def as_traced(model: str, params: tuple[float, ...]) -> tuple[str, tuple[float, 
     return "OPENCV_FISHEYE", (focal, focal, cx, cy, *radial, *([0.0] * (4 - len(radial))))
 
 
-def _lens(path: Path, number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
+def _lens(path: Path, number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
     if (expected := count_parameters(model)) is None:
         supported = ", ".join([*MODELS, *FISHEYE])
         raise BadInput(f"{path}: camera {number} is a {printable(model, 40)}; supported are {supported}. Undistort with `colmap image_undistorter` first.")
     if len(params) != expected:
         raise BadInput(f"{path}: camera {number}: {model} has {expected} parameters, found {len(params)}. {_AGAIN}")
     width, height = image_size(width, height, f"{path}: camera {number}", _AGAIN)
-    model, params = as_traced(model, params)
-    return Lens(model, width, height, params)
+    return Camera("", width, height, *as_traced(model, params), np.eye(4))
 
 
 def _posed(path: Path, name: str, camera: int, numbers: tuple[float, ...]) -> PosedImage:
@@ -190,7 +181,7 @@ def _posed(path: Path, name: str, camera: int, numbers: tuple[float, ...]) -> Po
     return PosedImage(name, camera, quaternion, translation)  # type: ignore[arg-type]
 
 
-def _cameras_bin(path: Path) -> dict[int, Lens]:
+def _cameras_bin(path: Path) -> dict[int, Camera]:
     file, cameras = _Bytes(path), {}
     for _ in range(file.count(24, "cameras", MAX_IMAGES)):
         number, model_number, width, height = file.take("<IiQQ")
@@ -271,7 +262,7 @@ def _integer(path: Path, line: int, word: str) -> int:
     return int(word)
 
 
-def _cameras_txt(path: Path) -> dict[int, Lens]:
+def _cameras_txt(path: Path) -> dict[int, Camera]:
     cameras = {}
     for line, text in _lines(path):
         words = text.split()

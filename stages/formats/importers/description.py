@@ -16,6 +16,7 @@ from stages.formats.importers.photographs import is_video, photographs
 from stages.formats.importers.source import Source
 from stages.io.capture import Capture
 from stages.io.pictures import UnreadableImage, read_header
+from stages.io.scene import described_camera
 from stages.video.reading import UnreadableVideo, opened
 
 
@@ -50,18 +51,6 @@ def _posed(capture: Capture) -> dict[str, Any]:
         bounds["points"] = np.percentile(capture.points.xyz, [1, 99], axis=0).tolist()
     if capture.bounds is not None:
         bounds["stated"] = capture.bounds.tolist()
-    cameras = [
-        {
-            "name": photo.camera.name,
-            "width": photo.camera.width,
-            "height": photo.camera.height,
-            "model": photo.camera.model,
-            "params": list(photo.camera.params),
-            "split": photo.split,
-            "capture_from_camera": photo.camera.world_from_camera.tolist(),
-        }
-        for photo in capture.photos
-    ]
     return {
         "count": len(capture.photos),
         "splits": dict(Counter(photo.split or "not stated" for photo in capture.photos)),
@@ -75,7 +64,7 @@ def _posed(capture: Capture) -> dict[str, Any]:
         "facts": capture.facts,
         "rejected": [{"name": name, "reason": reason} for name, reason in capture.rejected],
         "warnings": list(capture.warnings),
-        "cameras": cameras,
+        "cameras": [described_camera(photo.camera, photo.split) for photo in capture.photos],
     }
 
 

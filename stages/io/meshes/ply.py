@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from pipeline.text import printable
 from stages.io.meshes.geometry import AT_ONCE, Damaged, Geometry, exactly, lines_of, triangles_of
 
 MAX_HEADER = 2**16  # bytes
@@ -25,7 +26,7 @@ _COLOURS = ("red", "green", "blue")
 
 
 @dataclass(frozen=True)
-class _Property:
+class Property:
     """counts: the type of a list's length, of a list alone"""
 
     name: str
@@ -34,10 +35,10 @@ class _Property:
 
 
 @dataclass(frozen=True)
-class _Element:
+class Element:
     name: str
     count: int
-    properties: list[_Property]
+    properties: list[Property]
 
     @property
     def place(self) -> int:
@@ -47,18 +48,9 @@ class _Element:
 
 def read_ply(file: BinaryIO, size: int) -> Geometry:
     """The vertices, with their colours, and the faces of a PLY. Raises Damaged and ValueError."""
-    head = file.read(MAX_HEADER)
-    end = re.search(rb"\nend_header\r?\n", head)
-    if not head.startswith(b"ply") or end is None:
-        raise Damaged("no PLY, or one of a header beyond 64 KiB")
-    lines = [line.split() for line in head[: end.start()].decode("ascii", "replace").splitlines()]
-    kind = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
-    order = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}.get(kind)
-    if order is None:
-        raise Damaged("its header has no format that is known")
-    file.seek(end.end())
+    kind, _, elements = read_header(file)
     vertices, colours, triangles = np.empty((0, 3)), None, np.empty((0, 3), np.int64)
-    for element in _elements(lines, order):
+    for element in elements:
         if any(each.counts is not None for each in element.properties):
             corners, sizes = (_text_lists if kind == "ascii" else _lists)(file, element)
             if corners.itemsize < 4 and len(corners) > MOST_OF_SHORT:
@@ -72,7 +64,23 @@ def read_ply(file: BinaryIO, size: int) -> Geometry:
     return Geometry(vertices, triangles, colours)
 
 
-def _columns(element: _Element) -> list[str]:
+def read_header(file: BinaryIO) -> tuple[str, list[str], list[Element]]:
+    """The kind of a PLY ("ascii"), its comments, and its elements; the file is left where their rows begin. Raises Damaged."""
+    head = file.read(MAX_HEADER)
+    end = re.search(rb"\nend_header\r?\n", head)
+    if not head.startswith(b"ply") or end is None:
+        raise Damaged("no PLY, or one of a header beyond 64 KiB")
+    lines = head[: end.start()].decode("ascii", "replace").splitlines()
+    words = [line.split() for line in lines]
+    kind = next((line[1] for line in words if line[:1] == ["format"] and len(line) > 1), "")
+    order = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}.get(kind)
+    if order is None:
+        raise Damaged("its header has no format that is known")
+    file.seek(end.end())
+    return kind, [line.strip()[8:] for line in lines if line.startswith("comment ")], _elements(words, order)
+
+
+def _columns(element: Element) -> list[str]:
     """The properties of a vertex that are read: its place, and its colours where it has them; of others none."""
     names = {each.name for each in element.properties}
     if element.name != "vertex" or not names.issuperset("xyz"):
@@ -80,29 +88,29 @@ def _columns(element: _Element) -> list[str]:
     return [*"xyz", *(_COLOURS if names.issuperset(_COLOURS) else ())]
 
 
-def _elements(lines: list[list[str]], order: str) -> list[_Element]:
-    found: list[_Element] = []
+def _elements(lines: list[list[str]], order: str) -> list[Element]:
+    found: list[Element] = []
     for words in lines:
         if words[:1] == ["element"]:
             if len(words) != 3 or not re.fullmatch(r"[0-9]{1,12}", words[2]):
                 raise Damaged("its header has an element without a number")
-            found.append(_Element(words[1], int(words[2]), []))
+            found.append(Element(words[1], int(words[2]), []))
             if len(found) > MAX_ELEMENTS:
                 raise Damaged(f"more than {MAX_ELEMENTS} elements")
         elif words[:1] == ["property"]:
             kinds = words[2:4] if words[1:2] == ["list"] else words[1:2]
             if not found or len(words) != (5 if words[1:2] == ["list"] else 3) or not all(each in TYPES for each in kinds):
-                raise Damaged("its header has a property that is none")
+                raise Damaged(f"its header has the line '{printable(' '.join(words), 80)}'; expected a property of a known type")
             types = [np.dtype(order + TYPES[each]) for each in kinds]
             if len(types) == 2 and types[0].kind not in "iu":
                 raise Damaged("its header has a list of a length that is no whole number")
-            found[-1].properties.append(_Property(words[-1], types[-1], types[0] if len(types) == 2 else None))
+            found[-1].properties.append(Property(words[-1], types[-1], types[0] if len(types) == 2 else None))
             if len(found[-1].properties) > MAX_PROPERTIES:
                 raise Damaged(f"an element of more than {MAX_PROPERTIES} properties")
     return found
 
 
-def _rows(file: BinaryIO, element: _Element, wanted: list[int]) -> np.ndarray:
+def _rows(file: BinaryIO, element: Element, wanted: list[int]) -> np.ndarray:
     """(count, len(wanted)) of an element without lists."""
     row = np.dtype([(str(place), each.type) for place, each in enumerate(element.properties)])
     if not wanted:
@@ -120,7 +128,7 @@ def _rows(file: BinaryIO, element: _Element, wanted: list[int]) -> np.ndarray:
     return found
 
 
-def _lists(file: BinaryIO, element: _Element) -> tuple[np.ndarray, np.ndarray]:
+def _lists(file: BinaryIO, element: Element) -> tuple[np.ndarray, np.ndarray]:
     """The corners of all faces of an element with lists, and how many each has."""
     place, start = element.place, file.tell()
     data = file.read()
@@ -166,7 +174,7 @@ def _length_at(data: bytes, counts: np.dtype[np.generic]) -> Callable[[int], int
     return read
 
 
-def _first_row(data: bytes, element: _Element) -> tuple[np.dtype[np.void] | None, dict[int, int]]:
+def _first_row(data: bytes, element: Element) -> tuple[np.dtype[np.void] | None, dict[int, int]]:
     """The type of all rows where they are as the first one is, and the lengths of its lists by their places; None where there is no first one."""
     fields: list[tuple[str, np.dtype[np.generic]] | tuple[str, np.dtype[np.generic], tuple[int]]] = []
     at, lengths = 0, {}
@@ -184,7 +192,7 @@ def _first_row(data: bytes, element: _Element) -> tuple[np.dtype[np.void] | None
     return np.dtype(fields), lengths
 
 
-def _text_rows(file: BinaryIO, element: _Element, wanted: list[int]) -> np.ndarray:
+def _text_rows(file: BinaryIO, element: Element, wanted: list[int]) -> np.ndarray:
     """As `_rows`, of text."""
     numbers, lines = array("d"), lines_of(file)
     for _ in range(element.count):
@@ -195,7 +203,7 @@ def _text_rows(file: BinaryIO, element: _Element, wanted: list[int]) -> np.ndarr
     return np.array(numbers).reshape(-1, max(len(wanted), 1))
 
 
-def _text_lists(file: BinaryIO, element: _Element) -> tuple[np.ndarray, np.ndarray]:
+def _text_lists(file: BinaryIO, element: Element) -> tuple[np.ndarray, np.ndarray]:
     """As `_lists`, of text."""
     corners, sizes, lines, place = array("q"), array("q"), lines_of(file), element.place
     for _ in range(element.count):

@@ -24,7 +24,7 @@ from pipeline.text import printable
 from stages.formats.exporters.splats import gltf, spz
 from stages.io.meshes.geometry import AT_ONCE, Damaged, exactly
 from stages.io.meshes.glb import Glb
-from stages.io.meshes.ply import MAX_HEADER, TYPES
+from stages.io.meshes.ply import Element, read_header
 
 MAX_GLTF_JSON = 2**24  # bytes; of Gaussians it takes a few thousand
 DENSEST = 1032  # bytes that one byte of deflate, or of a zstd frame as SPZ writes them, can stand for
@@ -101,30 +101,24 @@ def describe_splats(path: Path) -> dict[str, Any] | None:
 
 
 def _ply(file: BinaryIO, size: int) -> _Found | None:
-    head = file.read(MAX_HEADER)
-    end = re.search(rb"\nend_header\r?\n", head)
-    if not head.startswith(b"ply") or end is None:
-        return None
-    lines = [line.strip() for line in head[: end.start()].decode("ascii", "replace").splitlines()]
-    names = {line.split()[-1] for line in lines if line.startswith("property ")}
+    kind, comments, elements = read_header(file)
+    names = {each.name for element in elements for each in element.properties}
     if {"packed_position", "packed_rotation"} <= names:
         raise Damaged("a PLY compressed as SuperSplat does it; expected the columns of 3DGS (convert it: splat-transform in.ply out.ply)")
     if _PLY_NAMES - names:
         return None
-    order = {"format binary_little_endian 1.0": "<", "format binary_big_endian 1.0": ">"}.get(next((line for line in lines if line.startswith("format")), ""))
-    if order is None:
+    if kind == "ascii":
         raise Damaged("a PLY of 3D Gaussians that is not binary; expected 'format binary_little_endian 1.0'")
-    count, rows, more = _ply_rows(lines, order)
-    start = end.end()
+    count, rows = _ply_rows(elements[0])
+    start = file.tell()
     if _PLY_NAMES - {*(rows.names or ())}:
         raise Damaged("its vertices lack columns of Gaussians, which other elements have")
-    if size < start + count * rows.itemsize or (size > start + count * rows.itemsize and not more):
+    if size < start + count * rows.itemsize or (size > start + count * rows.itemsize and len(elements) == 1):
         raise Damaged(f"{size} bytes; expected {start + count * rows.itemsize} for the {count} Gaussians that its header names")
     above = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in rows.names or ())
     if above not in (0, 9, 24, 45, 72):
         raise Damaged(f"{above} columns f_rest_*; expected 0, 9, 24, 45 or 72")
-    found = _Found("PLY (3DGS)", count, round((above / 3 + 1) ** 0.5) - 1, notes=[printable(line[8:], 200) for line in lines if line.startswith("comment ")])
-    file.seek(start)
+    found = _Found("PLY (3DGS)", count, round((above / 3 + 1) ** 0.5) - 1, notes=[printable(comment, 200) for comment in comments])
     for some in _pieces(count):
         part = np.frombuffer(exactly(file, some * rows.itemsize), rows)
         found.places.add(np.stack([part[name] for name in "xyz"], axis=1))
@@ -134,21 +128,14 @@ def _ply(file: BinaryIO, size: int) -> _Found | None:
     return found
 
 
-def _ply_rows(lines: list[str], order: str) -> tuple[int, np.dtype[Any], bool]:
-    """The number of the vertices, a row of them, and whether other elements follow; the vertices have to come first."""
-    elements = [number for number, line in enumerate(lines) if line.startswith("element ")]
-    first = lines[elements[0]].split() if elements else []
-    if first[:2] != ["element", "vertex"] or len(first) != 3 or not re.fullmatch(r"\d{1,12}", first[2]):
+def _ply_rows(element: Element) -> tuple[int, np.dtype[Any]]:
+    """The number of the vertices, which have to come first, and a row of them."""
+    if element.name != "vertex":
         raise Damaged("its first element is not 'element vertex N'")
-    columns: list[tuple[str, str]] = []
-    for line in lines[elements[0] + 1 : elements[1] if len(elements) > 1 else None]:
-        words = line.split()
-        if words[:1] != ["property"]:
-            continue
-        if len(words) != 3 or words[1] not in TYPES or words[2] in (name for name, _ in columns):
-            raise Damaged(f"its header has the line '{printable(line, 80)}'; expected columns of numbers, each once")
-        columns.append((words[2], order + TYPES[words[1]]))
-    return int(first[2]), np.dtype(columns), len(elements) > 1
+    columns = [(each.name, each.type) for each in element.properties]
+    if any(each.counts is not None for each in element.properties) or len(dict(columns)) < len(columns):
+        raise Damaged("its vertices have a property list, or a column twice; expected columns of numbers, each once")
+    return element.count, np.dtype(columns)
 
 
 # SPZ
