@@ -298,14 +298,8 @@ def describe(folder: Path) -> dict[str, Any]:
 
 
 def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:
-    return {
-        **forward.ndc.to_json(),
-        "bounds": forward.bounds.tolist(),
-        "far": forward.far,
-        "radii": list(forward.radii),
-        "focus": forward.focus,
-        "tangents": list(forward.tangents),
-    }
+    facts = {"bounds": forward.bounds.tolist(), "far": forward.far, "radii": list(forward.radii), "focus": forward.focus}
+    return {**forward.ndc.to_json(), **facts, "tangents": list(forward.tangents)}
 
 
 def _forward_from(document: SceneDocument) -> ForwardFacing | None:

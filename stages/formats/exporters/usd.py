@@ -123,10 +123,14 @@ def _put_material(stage: Any, shape: Any, pictures: list[str], normal_map: bool)
     """UsdPreviewSurface, bound to the mesh."""
     from pxr import Gf, Sdf, UsdShade  # an extra
 
+    def shader(name: str, kind: str) -> Any:
+        made = UsdShade.Shader.Define(stage, f"/surface/material/{name}")
+        made.CreateIdAttr(kind)
+        return made
+
     kinds = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, "/surface/material")
-    surface = UsdShade.Shader.Define(stage, "/surface/material/surface")
-    surface.CreateIdAttr("UsdPreviewSurface")
+    surface = shader("surface", "UsdPreviewSurface")
     for name, value in (("roughness", 1.0), ("metallic", 0.0), ("ior", 1.0)):
         surface.CreateInput(name, kinds.Float).Set(value)
     if not normal_map:
@@ -137,18 +141,15 @@ def _put_material(stage: Any, shape: Any, pictures: list[str], normal_map: bool)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
     if not pictures:
-        vertex = UsdShade.Shader.Define(stage, "/surface/material/vertex_colours")
-        vertex.CreateIdAttr("UsdPrimvarReader_float3")
+        vertex = shader("vertex_colours", "UsdPrimvarReader_float3")
         vertex.CreateInput("varname", kinds.String).Set("displayColor")
         colour.ConnectToSource(vertex.CreateOutput("result", kinds.Float3))
         return
-    place = UsdShade.Shader.Define(stage, "/surface/material/place")
-    place.CreateIdAttr("UsdPrimvarReader_float2")
+    place = shader("place", "UsdPrimvarReader_float2")
     place.CreateInput("varname", kinds.String).Set("st")
     result = place.CreateOutput("result", kinds.Float2)
     for name, file in zip(("colours", "normals"), pictures):
-        texture = UsdShade.Shader.Define(stage, f"/surface/material/{name}")
-        texture.CreateIdAttr("UsdUVTexture")
+        texture = shader(name, "UsdUVTexture")
         texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(f"./{file}"))
         texture.CreateInput("st", kinds.Float2).ConnectToSource(result)
         texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB" if name == "colours" else "raw")

@@ -232,21 +232,14 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line.rstrip("\r\n")
 
 
-def _stated(path: Path, what: str) -> int | None:
-    """The count that COLMAP writes into a comment at the top."""
+def _check_count(path: Path, what: str, found: int) -> None:
+    """Against the count that COLMAP writes into a comment at the top."""
     for number, line in _lines(path):
         if number > 10 or not line.startswith("#"):
-            break
-        if line.startswith(f"# Number of {what}:"):
-            digits = line.split(":")[1].split(",")[0].strip()
-            return int(digits) if re.fullmatch("[0-9]{1,19}", digits) else None
-    return None
-
-
-def _check_count(path: Path, what: str, found: int) -> None:
-    stated = _stated(path, what)
-    if stated is not None and stated > found:
-        raise BadInput(f"{path}: truncated: its first lines say {stated} {what}, it holds {found}. {_AGAIN} (Or correct that comment.)")
+            return
+        stated = re.match(rf"# Number of {what}:\s*([0-9]{{1,19}})\s*(,|:|$)", line)
+        if stated and int(stated[1]) > found:
+            raise BadInput(f"{path}: truncated: its first lines say {stated[1]} {what}, it holds {found}. {_AGAIN} (Or correct that comment.)")
 
 
 def _numbers(path: Path, line: int, words: list[str]) -> list[float]:

@@ -82,17 +82,7 @@ def _videos(source: Source, videos: list[Path]) -> dict[str, Any]:
                 described.append({"name": name, **facts})
         except UnreadableVideo as error:
             rejected.append({"name": name, "reason": str(error)})
-    return {
-        "count": len(described),
-        "videos": described,
-        "resolution": _sizes([(video["width"], video["height"]) for video in described]),
-        "models": [],
-        "bounds": None,
-        "masks": 0,
-        "rejected": rejected,
-        "warnings": [f"{entry['name']}: {entry['reason']}" for entry in rejected],
-        "cameras": [],
-    }
+    return _unposed([(video["width"], video["height"]) for video in described], rejected, [], videos=described)
 
 
 def _photographs(folder: Path) -> dict[str, Any]:
@@ -109,19 +99,15 @@ def _photographs(folder: Path) -> dict[str, Any]:
             continue
         sizes.append(header.size)
         turned += header.orientation != 1
-    warnings = [f"{entry['name']}: {entry['reason']}" for entry in rejected]
-    warnings += source.warnings()
+    warnings = source.warnings()
     if turned:
         warnings.append(f"{turned} images are rotated by their EXIF orientation.")
     if len(set(sizes)) > 1:
         warnings.append("images are of mixed sizes.")
-    return {
-        "count": len(sizes),
-        "resolution": _sizes(sizes),
-        "models": [],
-        "bounds": None,
-        "masks": len(masks_of(source, images)),
-        "rejected": rejected,
-        "warnings": warnings,
-        "cameras": [],
-    }
+    return _unposed(sizes, rejected, warnings, masks=len(masks_of(source, images)))
+
+
+def _unposed(sizes: list[tuple[int, int]], rejected: list[dict[str, str]], warnings: list[str], masks: int = 0, **more: Any) -> dict[str, Any]:
+    unreadable = [f"{entry['name']}: {entry['reason']}" for entry in rejected]
+    found = {"resolution": _sizes(sizes), "models": [], "bounds": None, "masks": masks, "rejected": rejected}
+    return {"count": len(sizes), **more, **found, "warnings": [*unreadable, *warnings], "cameras": []}

@@ -134,8 +134,37 @@ class Source:
         return path
 
     def walk(self) -> list[Path]:
-        """Every file of the source, without those of run folders in it; see `walk`."""
-        return walk(self.root, self.runs, self.links, follow=self.allow_outside)
+        """Every file of the source in sorted order; hidden ones are left out, and so are those of run folders in it.
+
+        Linked folders that lead out of the source are followed where that is allowed, each once; those that lead to a place within it are left out, for that
+        is walked.
+        """
+        found: list[Path] = []
+        root, seen = self._real[self.root], {_identity(self.root)}
+        for parent, folders, names in os.walk(self.root, followlinks=True):
+            here = Path(parent)
+            if here != self.root and run.NAME in names and is_run(here):
+                folders.clear()
+                self.runs.add(here)
+                continue
+            kept = []
+            for path in [here / name for name in sorted(folders) if not name.startswith(".")]:
+                if path.is_symlink():
+                    if Path(os.path.realpath(path)).is_relative_to(root):
+                        continue
+                    if not self.allow_outside:
+                        self.links.add(path)
+                        continue
+                if self.allow_outside:
+                    if (identity := _identity(path)) in seen:
+                        continue
+                    seen.add(identity)
+                kept.append(path.name)
+            folders[:] = kept
+            found += [here / name for name in sorted(names) if not name.startswith(".")]
+            if len(found) > MAX_FILES:
+                raise BadInput(f"{self.root}: more than {MAX_FILES} files. Name the folder of the data set itself.")
+        return found
 
     def warnings(self) -> list[str]:
         """Sentences about what look-ups came by and left aside, as they may be shown."""
@@ -159,7 +188,8 @@ class Source:
         beside = beside or self.root
         if not name.strip() or len(name) > MAX_PATH or not _is_encodable(name):
             return Found(None)
-        foreign = PureWindowsPath(name) if "\\" in name or PureWindowsPath(name).drive else PurePosixPath(name)
+        windows = ("\\" in name or PureWindowsPath(name).drive) and not os.path.isfile(beside / name)
+        foreign = PureWindowsPath(name) if windows else PurePosixPath(name)
         absolute = bool(foreign.root or foreign.drive)
         parts = [part for part in foreign.parts[1 if foreign.anchor else 0 :] if part != "."]
         here = Path(name) if absolute and isinstance(foreign, PurePosixPath) else None if absolute else Path(os.path.normpath(beside.joinpath(*parts)))
@@ -220,42 +250,6 @@ class Source:
         for path in self.walk():
             found.setdefault(name_key(path.name), []).append(path)
         return found
-
-
-def walk(folder: Path, runs: set[Path] | None = None, links: set[Path] | None = None, *, follow: bool = False) -> list[Path]:
-    """Every file below a folder in sorted order; hidden ones are left out, and so are run folders, which go into `runs`.
-
-    links   where linked folders go that lead out of the folder and are not followed; those that lead to a place within it are left out, for that is walked
-    follow  whether the former are followed, each folder once
-    """
-    found: list[Path] = []
-    root, seen = os.path.realpath(folder), {_identity(folder)}
-    for parent, folders, names in os.walk(folder, followlinks=True):
-        here = Path(parent)
-        if here != folder and run.NAME in names and is_run(here):
-            folders.clear()
-            if runs is not None:
-                runs.add(here)
-            continue
-        kept = []
-        for path in [here / name for name in sorted(folders) if not name.startswith(".")]:
-            if path.is_symlink():
-                if Path(os.path.realpath(path)).is_relative_to(root):
-                    continue
-                if not follow:
-                    if links is not None:
-                        links.add(path)
-                    continue
-            if follow:
-                if (identity := _identity(path)) in seen:
-                    continue
-                seen.add(identity)
-            kept.append(path.name)
-        folders[:] = kept
-        found += [here / name for name in sorted(names) if not name.startswith(".")]
-        if len(found) > MAX_FILES:
-            raise BadInput(f"{folder}: more than {MAX_FILES} files. Name the folder of the data set itself.")
-    return found
 
 
 def _identity(folder: Path) -> tuple[int, int]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.errors import BadInput
 from pipeline.text import printable
-from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.depth import MILLIMETRE, DepthFile, depth_file
 from stages.formats.importers.frames import MAX_NAME, Frame
 from stages.formats.importers.listed import Z_UP, Listed, ListFormat, Masks, sparse_points
 from stages.formats.importers.masks import masks_of
@@ -39,7 +39,6 @@ _NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_
 _NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
 _NGP_FACTS = ("aabb_scale", "scale", "offset")
 _NGP_KEYS = (*_NGP_FACTS, "is_fisheye", "from_na", "n_extra_learnable_dims", "enable_depth_loading", "integer_depth_scale", "render_aabb")
-_MILLIMETRE = 0.001  # metres
 _NGP_SCALE = 0.33  # of instant-ngp, where the file states none
 
 
@@ -179,7 +178,7 @@ def _depth(source: Source, frame: Frame, image: Path) -> DepthFile | None:
     """The depth of a frame: nerfstudio's in millimetres, instant-ngp's in units that the file states. Of poses that were scaled afterwards it is not used."""
     document, entry = frame.own
     if isinstance(entry.get("depth_file_path"), str) and "applied_scale" not in document:
-        listed, unit = entry["depth_file_path"], _MILLIMETRE
+        listed, unit = entry["depth_file_path"], MILLIMETRE
     elif isinstance(entry.get("depth_path"), str):
         listed, unit = entry["depth_path"], finite(document.get("integer_depth_scale")) or 0.0
     else:

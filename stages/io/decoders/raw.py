@@ -19,10 +19,6 @@ _PLAIN, _EXIF = (271, 272), 34665  # make, model; the directory of
 _DETAILS = (37386, 41989, 41486, 41488, 40962, 42036)  # focal lengths, density of the sensor's pixels, name of the lens
 
 
-class NoLibRaw(ValueError):
-    """rawpy is not installed."""
-
-
 class RawFile(ImageFile.ImageFile):
     """A camera's raw picture; it is developed when its pixels are loaded."""
 
@@ -33,7 +29,7 @@ class RawFile(ImageFile.ImageFile):
         try:
             import rawpy  # an extra
         except ImportError as error:
-            raise NoLibRaw("a camera's raw picture, which needs: pip install 'efficientnerf[raw]'") from error
+            raise ValueError("a camera's raw picture, which needs: pip install 'efficientnerf[raw]'") from error
         assert self.fp is not None
         data = self.fp.read()
         if holds_more_scans(data, MOST_SCANS):

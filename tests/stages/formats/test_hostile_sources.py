@@ -19,7 +19,7 @@ from pipeline.run import Run
 from pipeline.stage import Job
 from stages.formats import importers
 from stages.formats.importers.description import describe_source
-from stages.formats.importers.source import walk
+from stages.formats.importers.source import Source
 from stages.io import pictures, scene
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
@@ -164,7 +164,7 @@ def test_a_run_below_its_source_is_no_part_of_it(tmp_path: Path) -> None:
     captures.write_pictures(mine.path / "poses/images", ["a.png", "b.png", "c.png"])
     captures.write_pictures(source / ".hidden", ["h.png"])
     assert importers.files(source, Settings()) == before
-    assert [path.name for path in walk(source)] == ["a.png", "b.png", "c.png"]
+    assert [path.name for path in Source(source).walk()] == ["a.png", "b.png", "c.png"]
     described = describe_source(source)
     assert described["count"] == 3
     assert "shots/run: a run inside the source folder; what was made there is not read." in described["warnings"]

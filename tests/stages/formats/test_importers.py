@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -131,6 +132,11 @@ def test_llff_takes_the_largest_images_and_scales_the_focal_length(tmp_path: Pat
     assert capture.photos[0].camera.params == (80.0, 32.0, 24.0)
     assert (capture.photos[0].near, capture.photos[0].far) == (2.0, 7.0)
     assert_same_rays(read(folder, llff_factor=4), captures.cameras())
+
+
+def test_a_backslash_may_be_part_of_a_name(tmp_path: Path) -> None:
+    made = [replace(camera, name=camera.name.replace("_", "\\")) for camera in captures.cameras()]
+    assert_same_rays(read(captures.llff(tmp_path / "a", made)), made)
 
 
 def test_lists_that_have_travelled(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from efficientnerf.geometry.cameras import Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.depth import MILLIMETRE, SENSOR_RANGE, DepthFile, depth_file
 from stages.formats.importers.frames import Frame, check_count, stated
 from stages.formats.importers.listed import Y_UP, Listed, ListFormat
 from stages.formats.importers.source import Source, images_in
@@ -24,9 +24,7 @@ from stages.io.json_file import number, read_object
 KEYFRAMES = "keyframes"
 EXPECTED = f"{KEYFRAMES}/images with {KEYFRAMES}/cameras, or their corrected versions"
 LARGEST_CAMERA = 1 << 20  # bytes
-MILLIMETRE = 0.001  # metres
 HIGH = 255  # confidence; 127 is medium
-FARTHEST = 5.0  # metres, the range of the sensor
 _KINDS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _AGAIN = "Export the raw data again."
 
@@ -56,7 +54,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
 
 def _depth(source: Source, frame: Frame, image: Path) -> DepthFile | None:
     place = source.root / KEYFRAMES
-    return depth_file(source, place / f"depth/{image.stem}.png", MILLIMETRE, place / f"confidence/{image.stem}.png", HIGH, FARTHEST)
+    return depth_file(source, place / f"depth/{image.stem}.png", MILLIMETRE, place / f"confidence/{image.stem}.png", HIGH, SENSOR_RANGE)
 
 
 def _cameras(source: Source, name: str) -> list[Path]:

@@ -17,20 +17,19 @@ from efficientnerf.geometry.cameras import pose_from_colmap, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.depth import SENSOR_RANGE, DepthFile, depth_file
 from stages.formats.importers.frames import Frame, check_count, stated
 from stages.formats.importers.listed import Y_UP, Listed, ListFormat
 from stages.formats.importers.source import Source, images_in
 from stages.io.json_file import numbers, read_json, shown
 
 PLACES = (".", "EXR_RGBD")
-FARTHEST = 5.0  # metres, the range of the sensor
 METADATA, IMAGES = "metadata.json", "rgb"
 _AGAIN = "Export from Record3D again, as EXR + JPG."
 
 
 def _depth(source: Source, place: Path, frame: Frame, image: Path) -> DepthFile | None:
-    return depth_file(source, place / f"depth/{image.stem}.exr", 1.0, farthest=FARTHEST)
+    return depth_file(source, place / f"depth/{image.stem}.exr", 1.0, farthest=SENSOR_RANGE)
 
 
 def _signs(source: Source) -> Sequence[Path]:

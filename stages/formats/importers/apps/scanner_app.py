@@ -20,7 +20,7 @@ from efficientnerf.geometry.cameras import Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera
-from stages.formats.importers.depth import DepthFile, depth_file
+from stages.formats.importers.depth import MILLIMETRE, SENSOR_RANGE, DepthFile, depth_file
 from stages.formats.importers.frames import Frame, check_count
 from stages.formats.importers.listed import Y_UP, Listed, ListFormat
 from stages.formats.importers.source import Source, images_in
@@ -28,9 +28,7 @@ from stages.io.json_file import numbers, read_json, read_object
 
 POSE, INTRINSICS = "cameraPoseARFrame", "intrinsics"
 LARGEST_FRAME = 1 << 20  # bytes
-MILLIMETRE = 0.001  # metres
 HIGH = 2  # confidence
-FARTHEST = 5.0  # metres, the range of the sensor
 OFF_CENTRE = 0.1  # of a side: as far as the principal point of a picture that was neither cropped nor scaled may lie from its middle
 _FRAME = re.compile(r"frame_\d+")
 _TRIED = 10  # frames that are read to recognise the format, for some may be damaged
@@ -71,7 +69,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
 
 def _depth(source: Source, place: Path, frame: Frame, image: Path) -> DepthFile | None:
     number = image.stem.removeprefix("frame_")
-    return depth_file(source, place / f"depth_{number}.png", MILLIMETRE, place / f"conf_{number}.png", HIGH, FARTHEST)
+    return depth_file(source, place / f"depth_{number}.png", MILLIMETRE, place / f"conf_{number}.png", HIGH, SENSOR_RANGE)
 
 
 def _place(source: Source) -> Path:
