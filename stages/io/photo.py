@@ -80,10 +80,10 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
         _draft(image, max_side)
         rgb, alpha = rgb_and_alpha(image)
     width, height = full if orientation < 5 else full[::-1]
-    rgb = _resized(apply_exif_orientation(rgb, orientation), working_size(width, height, max_side))
+    rgb = resized(apply_exif_orientation(rgb, orientation), working_size(width, height, max_side))
     opaque = None
     if alpha is not None and (alpha < 128).any():
-        opaque = _resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
+        opaque = resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
     size = width, height, rgb.shape[1], rgb.shape[0]
     return DecodedPhoto(*size, orientation, focal_from_exif(details, *taken), maker, names_fisheye(details), rgb, opaque)
 
@@ -204,7 +204,8 @@ def apply_exif_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return pixels[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1]
 
 
-def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """By area averaging; contiguous."""
     pixels = np.ascontiguousarray(pixels)
     if pixels.shape[1::-1] == size:
         return pixels

@@ -32,31 +32,13 @@ from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import SparsePoints
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha
-from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded, json_of_run
+from stages.io.scene_schema import CameraDocument, Orbit, SceneDocument, ViewDocument, decoded, json_of_run
 from stages.reports import poses_report
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
 AGAIN = "Run the poses stage again."
 WORKING_FORMATS = ("PNG", "JPEG")  # of images/; masks/ hold PNG
-
-
-@dataclass(frozen=True)
-class Orbit:
-    """The orbit of the capture's cameras round the subject, for turntables; in the training frame.
-
-    centre          point that the cameras look at
-    radius          median distance of the cameras from it, world units
-    elevation       median angle above the horizon, degrees
-    forward_facing  whether the cameras are on one side of the subject
-    heading         azimuth of the mean camera seen from the centre, degrees, anticlockwise from +x
-    """
-
-    centre: tuple[float, float, float]
-    radius: float
-    elevation: float
-    forward_facing: bool
-    heading: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +154,7 @@ def _scene_from(document: SceneDocument) -> Scene:
     """The scene; ValueError for what no scene can be."""
     if document.format < 1 or (document.format > 1 and document.space is None):
         raise ValueError(f"format version {document.format} without all that belongs to it")
-    transform, orbit, bounds = document.world_from_capture, document.orbit, np.array(document.bounds, np.float64)
+    transform, bounds = document.world_from_capture, np.array(document.bounds, np.float64)
     if not (bounds[0] < bounds[1]).all():
         raise ValueError(f"bounds are empty ({bounds.tolist()})")
     rotation = np.array(transform.rotation, np.float64)
@@ -184,7 +166,7 @@ def _scene_from(document: SceneDocument) -> Scene:
         bounds=bounds,
         background=document.background,
         world_from_capture=Similarity(transform.scale, rotation, np.array(transform.translation, np.float64)),
-        orbit=Orbit(orbit.centre, orbit.radius, orbit.elevation, orbit.forward_facing, orbit.heading),
+        orbit=document.orbit,
         points=document.points,
         metric=document.metric,
         space="auto" if document.format == 1 else str(document.space),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -49,7 +50,17 @@ class SimilarityDocument(Struct):
     translation: Vector
 
 
-class OrbitDocument(Struct):
+@dataclass(frozen=True)
+class Orbit:
+    """The orbit of the capture's cameras round the subject, for turntables; in the training frame.
+
+    centre          point that the cameras look at
+    radius          median distance of the cameras from it, world units
+    elevation       median angle above the horizon, degrees
+    forward_facing  whether the cameras are on one side of the subject
+    heading         azimuth of the mean camera seen from the centre, degrees, anticlockwise from +x
+    """
+
     centre: Vector
     radius: Number
     elevation: Number
@@ -75,7 +86,7 @@ class SceneDocument(Struct):
     kind: str
     bounds: Box
     world_from_capture: SimilarityDocument
-    orbit: OrbitDocument
+    orbit: Orbit
     points: bool
     metric: bool
     views: list[ViewDocument]

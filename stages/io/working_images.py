@@ -17,7 +17,7 @@ from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo, Silhouettes
 from stages.io.matting import without_background
-from stages.io.photo import apply_exif_orientation, mask_at, same_aspect, upright_mask, working_size
+from stages.io.photo import apply_exif_orientation, mask_at, resized, same_aspect, upright_mask, working_size
 from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, profile_of, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
@@ -154,10 +154,8 @@ def _is_plain(image: Any) -> bool:
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resized by area averaging in sRGB, colours weighted by alpha."""
-    if pixels.shape[1::-1] == size:
-        return pixels
-    if pixels.shape[2] == 3:
-        return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+    if pixels.shape[1::-1] == size or pixels.shape[2] == 3:
+        return resized(pixels, size)
     whole = pixels.astype(np.float32)
     whole[..., :3] *= whole[..., 3:] / 255
     whole = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""Formats that a capture can come in: one file each, or an entry in `datasets.published`; a plain dict as the table.
+"""Formats that a capture can come in: one file each, or an entry in `datasets`; a plain dict as the table.
 
 Nothing heavy is imported until something is read.
 """
@@ -80,9 +80,9 @@ IMPORTERS: dict[str, Importer] = {
     "nerfstudio": Importer("transforms", "NERFSTUDIO", renders=True),
     "instant-ngp": Importer("transforms", "INSTANT_NGP", renders=True),
     "scannetpp": Importer("datasets.published", "SCANNETPP"),
-    "polycam": Importer("apps.polycam"),
-    "record3d": Importer("apps.record3d"),
-    "3d-scanner-app": Importer("apps.scanner_app"),
+    "polycam": Importer("datasets.phones", "POLYCAM"),
+    "record3d": Importer("datasets.phones", "RECORD3D"),
+    "3d-scanner-app": Importer("datasets.phones", "SCANNER_APP"),
     "metashape": Importer("photogrammetry.metashape"),
     "realitycapture": Importer("photogrammetry.realitycapture"),
     "opensfm": Importer("photogrammetry.opensfm"),

@@ -26,7 +26,6 @@ from stages.io.photo import same_aspect
 from stages.io.pictures import UnreadableImage, integers_of, opened, read_header
 
 MILLIMETRE = 0.001  # metres
-SENSOR_RANGE = 5.0  # metres, of a phone's
 MAX_POINTS = 20_000
 MAX_LOOKUPS = 4_000_000  # points times maps that they are looked up in
 MAX_MAPS = 1000  # that are used, evenly over the photos

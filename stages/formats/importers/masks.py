@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
-from stages.formats.importers.source import MASK_ENDINGS, Source, images_in, name_key, pictures_in
+from stages.formats.importers.source import MASK_ENDINGS, Source, files_in, images_in, name_key, pictures_in
 
 FOLDERS = ("masks", "mask")
-_SUFFIX = ".mask"
+_SUFFIX = (".mask",)  # IMG_1.mask, whatever format it has
 
 
 def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
@@ -58,17 +58,10 @@ def _masks_in(folder: Path) -> list[Path]:
 
 def _files_inside(folder: Path) -> dict[str, Path]:
     """The masks in a folder of masks by the key of their stem."""
-    return {name_key(path.stem): path for path in reversed([*images_in(folder), *_with_mask_as_suffix(folder)])}
+    return {name_key(path.stem): path for path in reversed([*images_in(folder), *files_in(folder, _SUFFIX)])}
 
 
 def _files_beside(folder: Path) -> dict[str, Path]:
     """The masks in a folder of photographs by the key of their name without what follows the ending."""
     beside = {name_key(path.stem): path for path in reversed(pictures_in(folder)) if name_key(path.stem).endswith(MASK_ENDINGS)}
-    return beside | {name_key(path.name): path for path in _with_mask_as_suffix(folder)}
-
-
-def _with_mask_as_suffix(folder: Path) -> list[Path]:
-    """Pictures that are called IMG_1.mask, whatever format they have."""
-    if not os.path.isdir(folder):
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() == _SUFFIX and not path.name.startswith(".") and path.is_file())
+    return beside | {name_key(path.name): path for path in files_in(folder, _SUFFIX)}

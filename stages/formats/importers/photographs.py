@@ -8,7 +8,6 @@ their extension, those that were taken at one time, or look alike.
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -19,7 +18,18 @@ import numpy as np
 
 from pipeline.errors import BadInput
 from stages.formats.importers.masks import FOLDERS, masks_of
-from stages.formats.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, abbreviated, images_in, name_key, one_of_each
+from stages.formats.importers.source import (
+    IMAGE_SUFFIXES,
+    MAX_FRAMES,
+    MIN_IMAGES,
+    ImportSettings,
+    Source,
+    abbreviated,
+    files_in,
+    images_in,
+    name_key,
+    one_of_each,
+)
 from stages.io.photo import read_photo
 from stages.io.pictures import RAW_SUFFIXES, UnreadableImage, exif_of, opened, read_header
 from stages.video import KNOWN, SUFFIXES
@@ -35,18 +45,12 @@ _SMALL, _ALIKE, _ANYWHERE = 64, 4.0, 48  # px, longest side; levels of 255 that 
 
 
 def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return bool(images_in(folder) or images_in(folder / "images") or _videos_in(folder))
+    return bool(images_in(folder) or images_in(folder / "images") or files_in(folder, SUFFIXES))
 
 
 def is_video(path: Path) -> bool:
     """Whether a file has the name of a video."""
     return path.suffix.lower() in SUFFIXES
-
-
-def _videos_in(folder: Path) -> list[Path]:
-    if not os.path.isdir(folder):
-        return []
-    return sorted(path for path in folder.iterdir() if is_video(path) and not path.name.startswith(".") and path.is_file())
 
 
 def photographs(source: Source) -> list[Path]:
@@ -68,7 +72,7 @@ def _all(source: Source) -> list[Path]:
         everything = source.walk()
         usable = [path for path in everything if not _is_beside(path, folder)]
         found = _corrected_once(_without_maps(one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES))))
-        videos = _videos_in(folder) or sorted(filter(is_video, usable))
+        videos = files_in(folder, SUFFIXES) or sorted(filter(is_video, usable))
         if not found and not videos:
             raise BadInput(_nothing(source, everything))
         few = len(found) < MIN_IMAGES

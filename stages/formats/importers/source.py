@@ -277,6 +277,13 @@ def _is_encodable(name: str) -> bool:
         return False
 
 
+def files_in(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """The files directly in a folder, if it is there, that have one of these extensions, sorted by name; without hidden ones."""
+    if not os.path.isdir(folder):
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file())
+
+
 def images_in(folder: Path) -> list[Path]:
     """The image files directly in a folder, sorted by name."""
     return one_of_each(pictures_in(folder))
@@ -284,9 +291,7 @@ def images_in(folder: Path) -> list[Path]:
 
 def pictures_in(folder: Path) -> list[Path]:
     """The same with the masks next to them, and with raw pictures that have a JPEG."""
-    if not os.path.isdir(folder):
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file())
+    return files_in(folder, IMAGE_SUFFIXES)
 
 
 def one_of_each(images: Sequence[Path]) -> list[Path]:

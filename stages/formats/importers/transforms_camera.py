@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,16 +43,14 @@ def lens_of(given: dict[str, Any], name: str, actual: tuple[int, int], pose: np.
     given  what stands at the top, overruled by what stands in the frame
     """
 
-    def number(key: str, default: float = 0.0) -> float:
-        return json_file.number(given, key, where, "Write the data set again.", default)
-
+    number = partial(json_file.number, given, where=where, remedy="Write the data set again.", default=0.0)
     for key in _UNSUPPORTED:
         if given.get(key):
             raise BadInput(f"{where}: lens model {key} is not supported. Undistort the images first, e.g. to a pinhole or OPENCV_FISHEYE camera.")
-    width, height = (number("w", actual[0]), number("h", actual[1])) if "w" in given and "h" in given else actual
+    width, height = (number("w"), number("h")) if "w" in given and "h" in given else actual
     stated = lenses.image_size(width, height, where, "Correct w and h.")
     fx, fy = _focal(given, number, width, height, where)
-    named = {"f": fx, "fx": fx, "fy": fy, "cx": number("cx", width / 2), "cy": number("cy", height / 2)}
+    named = {"f": fx, "fx": fx, "fy": fy, "cx": number("cx", default=width / 2), "cy": number("cy", default=height / 2)}
     named |= {key: number(key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
     model = _model(given, named, where)
     camera = Camera(name, *stated, model, tuple(named[parameter] for parameter in MODELS[model]), pose)

@@ -1,1 +1,1 @@
-"""Published data sets."""
+"""Published data sets and exports of phones, several formats a file."""

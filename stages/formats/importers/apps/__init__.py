@@ -1,1 +1,0 @@
-"""Cameras that phone apps tracked."""
