@@ -2,7 +2,8 @@
 
 Three kinds of matches contradict the cameras. Wrong ones lie anywhere. Repeated texture joins a place to its twin, which in a third photograph is joined to
 itself again. Moving parts are found again by one motion of their own: a similarity takes a patch of features to the other photograph, and on to a third one,
-and hardly any match of these features agrees with the cameras. Only the last is reported. docs/experiments/sfm.md
+and hardly any match of these features agrees with the cameras. Only the last is reported, unless more features inside of a part's outline stand still than
+move: a carpet or knitted cloth, whose pattern is matched with itself a stitch away in some pairs and rightly in others. docs/experiments/sfm.md
 
 Two kinds are not seen: parts that are gone in other photographs have no matches, and motion along epipolar lines alone contradicts nothing.
 """
@@ -55,9 +56,10 @@ def moving_parts(cameras: Mapping[int, Camera], keypoints: Mapping[int, np.ndarr
         np.add.at(moving, together.ravel(), 1)
         joined.append(together)
     moves = (moving > agreeing) & (_photographs_of(np.concatenate(joined), np.repeat(np.arange(len(order)), sizes)) >= PHOTOGRAPHS)
-    shares = {
-        image: share_of_parts(keypoints[image][moves[first[image] : first[image] + size]], cameras[image]) for image, size in zip(order, sizes, strict=True)
-    }
+    shares = {}
+    for image, size in zip(order, sizes, strict=True):
+        own = slice(first[image], first[image] + size)
+        shares[image] = share_of_parts(keypoints[image][moves[own]], keypoints[image][(agreeing > moving)[own]], cameras[image])
     found = {image: share for image, share in shares.items() if share > 0}
     return found if len(found) >= PHOTOGRAPHS else {}
 
@@ -108,15 +110,22 @@ def _photographs_of(joined: np.ndarray, image_of: np.ndarray) -> np.ndarray:
     return np.asarray(np.bincount(there, minlength=count)[track])
 
 
-def share_of_parts(places: np.ndarray, camera: Camera) -> float:
-    """The share of the picture inside of the outlines of the parts: features (N, 2) that are near to each other, OF_A_PART or more."""
-    places = np.unique(np.round(places), axis=0)  # a feature may have two directions
+def share_of_parts(moving: np.ndarray, still: np.ndarray, camera: Camera) -> float:
+    """The share of the picture inside of the outlines of the parts: moving features (N, 2) that are near to each other, OF_A_PART or more, and more than
+    there are still features (M, 2) inside of their outline."""
+    places, still = (np.unique(np.round(each), axis=0) for each in (moving, still))  # a feature may have two directions
     if len(places) < OF_A_PART:
         return 0.0
     near = np.linalg.norm(places[:, None] - places, axis=2) < LINK * _longest(camera)
     count, part = connected_components(near, directed=False)
-    parts = [places[part == k].astype(np.float32) for k in range(count)]
-    area = sum(cv2.contourArea(cv2.convexHull(each)) for each in parts if len(each) >= OF_A_PART)
+    area = 0.0
+    for k in range(count):
+        of_part = places[part == k].astype(np.float32)
+        if len(of_part) >= OF_A_PART:
+            outline = cv2.convexHull(of_part)
+            inside = sum(cv2.pointPolygonTest(outline, (float(x), float(y)), False) >= 0 for x, y in still)
+            if inside < len(of_part):
+                area += cv2.contourArea(outline)
     return float(min(1.0, area / (camera.width * camera.height)))
 
 

@@ -15,6 +15,7 @@ from stages.sfm.reconstruction import find_models
 from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, SIZE, cameras, clouds, matched
 
 BALL = 60  # points that move
+NONE = np.zeros((0, 2))
 TAKEN = dict(enumerate(cameras()))
 Matches = dict[tuple[int, int], np.ndarray]
 
@@ -42,7 +43,7 @@ def test_a_ball_that_is_elsewhere_in_each_photograph_is_found_in_all_of_them() -
     found = moving_parts(TAKEN, pixels, all_matches().items())
     assert sorted(found) == list(range(COUNT))
     for k, share in found.items():
-        whole = share_of_parts(pixels[k][-BALL:], TAKEN[k])
+        whole = share_of_parts(pixels[k][-BALL:], NONE, TAKEN[k])
         assert 0.5 * whole < share < 1.2 * whole
     assert found == moving_parts(TAKEN, pixels, all_matches().items())
 
@@ -94,12 +95,34 @@ def test_a_motion_is_a_similarity_of_a_patch() -> None:
 def test_the_share_is_that_of_the_outlines_of_what_lies_together() -> None:
     y, x = np.mgrid[0:5, 0:5]
     patch = 10.0 * np.stack([x.ravel(), y.ravel()], 1)  # 40 by 40 px
-    one = share_of_parts(patch + 50, TAKEN[0])
+    one = share_of_parts(patch + 50, NONE, TAKEN[0])
     assert one == pytest.approx(1600 / (SIZE[0] * SIZE[1]))
-    assert share_of_parts(np.concatenate([patch + 50, patch + 250]), TAKEN[0]) == pytest.approx(2 * one)
-    assert share_of_parts(np.concatenate([patch + 50, patch[:3] + 250, patch + 50.2]), TAKEN[0]) == pytest.approx(one)
-    assert share_of_parts(patch[: OF_A_PART - 1], TAKEN[0]) == 0.0
-    assert share_of_parts(patch[:0], TAKEN[0]) == 0.0
+    assert share_of_parts(np.concatenate([patch + 50, patch + 250]), NONE, TAKEN[0]) == pytest.approx(2 * one)
+    assert share_of_parts(np.concatenate([patch + 50, patch[:3] + 250, patch + 50.2]), NONE, TAKEN[0]) == pytest.approx(one)
+    assert share_of_parts(patch[: OF_A_PART - 1], NONE, TAKEN[0]) == 0.0
+    assert share_of_parts(patch[:0], NONE, TAKEN[0]) == 0.0
+
+
+def test_a_part_with_more_still_features_than_moving_ones_stands_still() -> None:
+    """As a carpet, whose stitches are matched with their neighbours in some pairs."""
+    y, x = np.mgrid[0:5, 0:5]
+    patch = 10.0 * np.stack([x.ravel(), y.ravel()], 1)
+    both = np.concatenate([patch + 50, patch + 250])
+    one = share_of_parts(patch + 50, NONE, TAKEN[0])
+    within = patch[:24] * 0.8 + 53
+    assert share_of_parts(both, within, TAKEN[0]) == pytest.approx(2 * one)
+    assert share_of_parts(both, np.concatenate([within, patch[:1] * 0.8 + 90]), TAKEN[0]) == pytest.approx(one)
+    assert share_of_parts(patch + 50, patch + 100, TAKEN[0]) == pytest.approx(one), "those outside of its outline say nothing"
+
+
+def test_a_pattern_that_is_matched_a_stitch_away_moves_nothing() -> None:
+    """Some of its features are, in every pair; of more the others say that it stands still."""
+    pixels, matches = seen(0), all_matches(0.0)
+    for k, cloud in enumerate(clouds()):
+        stitches = cloud[-3 * BALL :] * 0.2
+        pixels[k][-3 * BALL :] = project(TAKEN[k], stitches)[0]
+        pixels[k][-BALL:] = project(TAKEN[k], stitches[-BALL:] + 0.12 * np.array((np.cos(k), np.sin(k), 0.0)))[0]
+    assert moving_parts(TAKEN, pixels, matches.items()) == {}
 
 
 @pytest.mark.parametrize("elsewhere", [0, BALL])
