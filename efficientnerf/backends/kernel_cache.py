@@ -39,7 +39,7 @@ import platformdirs
 from efficientnerf.backends import Notice
 
 ROOT = Path(__file__).resolve().parents[2]  # where the packages lie
-KERNELS = ("efficientnerf/backends/numba", "workflows/paper/structures")  # folders that hold kernels
+KERNELS = "efficientnerf/backends/numba"  # the folder that holds kernels
 CONSTANTS = (  # modules whose constants these import: numbers among them are part of the compiled code
     "efficientnerf/backends/layout.py", "efficientnerf/geometry/cameras.py", "efficientnerf/geometry/ndc.py", "efficientnerf/geometry/spaces.py",
     "efficientnerf/rendering/compositing.py", "efficientnerf/rendering/harmonics.py", "efficientnerf/sampling/samples.py",
@@ -60,8 +60,7 @@ def key_of(root: Path) -> str:
     digest = hashlib.sha256()
     versions = (version("numba"), version("llvmlite"), version("numpy"), sys.implementation.cache_tag or sys.version, platform.machine())
     digest.update("\n".join(versions).encode())
-    paths = [path for folder in KERNELS for path in sorted((root / folder).rglob("*.py"))]
-    for path in (*paths, *(root / name for name in CONSTANTS)):
+    for path in (*sorted((root / KERNELS).rglob("*.py")), *(root / name for name in CONSTANTS)):
         content = path.read_bytes()
         digest.update(f"\n{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
     return digest.hexdigest()[:16]

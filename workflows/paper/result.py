@@ -11,14 +11,6 @@ PAPER = " (paper)"
 
 
 @dataclass(frozen=True)
-class Repetitions:
-    """Of the timings of table 7; their medians are reported."""
-
-    cachings: int = 5
-    queries: int = 9
-
-
-@dataclass(frozen=True)
 class Request:
     """What a table is measured on.
 
@@ -28,7 +20,6 @@ class Request:
     device  "cpu" or "cuda"
     say     takes sentences for the user
     report  takes the events of the stages; None: they are dropped
-    timings repetitions of timings
     """
 
     data: Path | None
@@ -37,7 +28,6 @@ class Request:
     device: str = "cpu"
     say: Callable[[str], None] = print
     report: Callable[[dict[str, Any]], None] | None = None
-    timings: Repetitions = Repetitions()
 
 
 @dataclass(frozen=True)

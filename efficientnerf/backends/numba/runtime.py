@@ -58,7 +58,7 @@ class KernelLocator(caching._CacheLocator):
     @classmethod
     def from_function(cls, function: Callable[..., Any], path: str) -> KernelLocator | None:
         source = Path(path).resolve()
-        if not any(source.is_relative_to(kernel_cache.ROOT / folder) for folder in kernel_cache.KERNELS):
+        if not source.is_relative_to(kernel_cache.ROOT / kernel_cache.KERNELS):
             return None
         found = cls(function, source.relative_to(kernel_cache.ROOT))
         found.ensure_cache_path()

@@ -256,9 +256,7 @@ def test_the_key_stands_for_each_kernel_source_and_its_place(package: Path) -> N
     keys.append(kernel_cache.key_of(package.parent))
     inner.rename(inner.with_name("outermost.py"))
     keys.append(kernel_cache.key_of(package.parent))
-    other = package.parent / kernel_cache.KERNELS[1]
-    other.mkdir(parents=True)
-    (other / "new.py").touch()
+    (package.parent / kernel_cache.KERNELS / "new.py").touch()
     keys.append(kernel_cache.key_of(package.parent))
     (package.parent / kernel_cache.CONSTANTS[0]).write_text("FARTHEST = 1")
     keys.append(kernel_cache.key_of(package.parent))
@@ -269,16 +267,15 @@ def test_the_key_stands_for_each_kernel_source_and_its_place(package: Path) -> N
 
 def test_the_key_stands_for_all_constants_that_kernels_import() -> None:
     """They are part of the compiled code; classes and functions of other folders are called by Python alone."""
-    folders, known = ({name.removesuffix(".py").replace("/", ".") for name in names} for names in (kernel_cache.KERNELS, kernel_cache.CONSTANTS))
+    known = {name.removesuffix(".py").replace("/", ".") for name in kernel_cache.CONSTANTS}
     found = set()
-    for folder in kernel_cache.KERNELS:
-        for path in (kernel_cache.ROOT / folder).rglob("*.py"):
-            for node in ast.parse(path.read_text(encoding="utf-8")).body:
-                if isinstance(node, ast.ImportFrom) and path.name != "runtime.py":
-                    assert node.level == 0, path
-                    constants = node.module if any(alias.name.isupper() for alias in node.names) else None
-                    found |= {constants or f"{node.module}.{alias.name}" for alias in node.names if constants or f"{node.module}.{alias.name}" in known}
-    ours = {name for name in found if name.startswith(("efficientnerf", "workflows")) and not name.startswith(tuple(folders))}
+    for path in (kernel_cache.ROOT / kernel_cache.KERNELS).rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and path.name != "runtime.py":
+                assert node.level == 0, path
+                constants = node.module if any(alias.name.isupper() for alias in node.names) else None
+                found |= {constants or f"{node.module}.{alias.name}" for alias in node.names if constants or f"{node.module}.{alias.name}" in known}
+    ours = {name for name in found if name.startswith("efficientnerf") and not name.startswith(kernel_cache.KERNELS.replace("/", "."))}
     assert len(ours) > 2
     assert ours <= known
 
@@ -339,9 +336,8 @@ def test_folders_out_of_use_are_removed_and_nothing_else(tmp_path: Path) -> None
 def test_no_kernel_lets_the_compiler_reorder_sums() -> None:
     """Copies of a function that are optimised in different surroundings would differ in the last bit, and so would runs that compile and runs that load."""
     found = []
-    for folder in kernel_cache.KERNELS:
-        for path in sorted((kernel_cache.ROOT / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.keyword) and node.arg in ("fastmath", "flags"):
-                    found.append(f"{path.relative_to(kernel_cache.ROOT)}:{node.value.lineno}")
+    for path in sorted((kernel_cache.ROOT / kernel_cache.KERNELS).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.keyword) and node.arg in ("fastmath", "flags"):
+                found.append(f"{path.relative_to(kernel_cache.ROOT)}:{node.value.lineno}")
     assert not found

@@ -1,4 +1,4 @@
-"""Dense voxels, hash map, octree and NerfTree: all give what a dict gives; the same in numba and in torch."""
+"""Dense voxels, hash map, octree and NerfTree: all give what a dict gives."""
 
 from __future__ import annotations
 
@@ -10,34 +10,23 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workflows.paper.structures import bricks, torch_structures
-from workflows.paper.structures.bricks import BrickTree, FullBricks
-from workflows.paper.structures.dense import DenseVoxels
-from workflows.paper.structures.hashing import HashMap
-from workflows.paper.structures.octree import Octree
-from workflows.paper.structures.synthetic import clustered, random_points, ray_points, scattered, shuffled
-from workflows.paper.structures.voxels import Voxels
+from workflows.paper.structures import BrickTree, DenseVoxels, FullBricks, HashMap, Octree, Structure
+from workflows.paper.voxels import Voxels, clustered, random_points, ray_points, scattered
 
-KERNELS = (DenseVoxels, HashMap, Octree, BrickTree, FullBricks)
-TORCH = (torch_structures.DenseVoxels, torch_structures.HashMap, torch_structures.Octree, torch_structures.BrickTree, torch_structures.FullBricks)
+STRUCTURES = (DenseVoxels, HashMap, Octree, BrickTree, FullBricks)
 
 
-def query(structure: type, voxels: Voxels, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cache and query; results overwrite garbage."""
-    packed, occupied = np.full(len(points), 7, np.uint64), np.ones(len(points), bool)
-    structure.cache(voxels).query(points, packed, occupied)
-    return packed, occupied
+def cached(structure: type[Structure], voxels: Voxels, device: str = "cpu") -> Structure:
+    return structure.cache(voxels.side, torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.packed).to(device))
 
 
-def query_in_torch(structure: type, voxels: Voxels, points: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
-    coordinates, packed = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.packed.view(np.int64)).to(device)
-    packed, occupied = structure.cache(voxels.side, coordinates, packed).query(torch.from_numpy(points).to(device))
-    return packed.cpu().numpy().view(np.uint64), occupied.cpu().numpy()
+def query(structure: type[Structure], voxels: Voxels, points: np.ndarray, device: str = "cpu") -> np.ndarray:
+    return cached(structure, voxels, device).query(torch.from_numpy(points).to(device)).cpu().numpy()
 
 
 def query_dict(voxels: Voxels, points: np.ndarray) -> np.ndarray:
     held = {tuple(at): word for at, word in zip(voxels.coordinates.tolist(), voxels.packed.tolist(), strict=True)}
-    return np.array([held.get(tuple(math.floor(c) for c in p), 0) if np.isfinite(p).all() else 0 for p in points.tolist()], np.uint64)
+    return np.array([held.get(tuple(math.floor(c) for c in p), 0) if np.isfinite(p).all() else 0 for p in points.tolist()], np.int64)
 
 
 @st.composite
@@ -51,7 +40,7 @@ def grids(draw: st.DrawFn) -> tuple[Voxels, np.ndarray]:
     points = rng.uniform(-1, side + 1, (300, 3)).astype(np.float32)
     points[:100] = np.round(points[:100])
     points[:6] = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [side, 0, 0], [-1e30, 0, 0], [-1e-30, 0, 0]], np.float32)
-    return Voxels(side, coordinates, values.view(np.uint64)[:, 0]), points
+    return Voxels(side, coordinates, values.view(np.int64)[:, 0]), points
 
 
 @settings(max_examples=30, deadline=None)
@@ -59,43 +48,34 @@ def grids(draw: st.DrawFn) -> tuple[Voxels, np.ndarray]:
 def test_every_structure_gives_what_a_dict_gives(case: tuple[Voxels, np.ndarray]) -> None:
     voxels, points = case
     expected = query_dict(voxels, points)
-    for structure in KERNELS:
-        packed, occupied = query(structure, voxels, points)
-        np.testing.assert_array_equal(packed, expected, err_msg=str(structure))
-        np.testing.assert_array_equal(occupied, expected != 0, err_msg=str(structure))
-    for structure in TORCH:
-        packed, occupied = query_in_torch(structure, voxels, points)
-        np.testing.assert_array_equal(packed, expected, err_msg=str(structure))
-        np.testing.assert_array_equal(occupied, expected != 0, err_msg=str(structure))
+    for structure in STRUCTURES:
+        np.testing.assert_array_equal(query(structure, voxels, points), expected, err_msg=str(structure))
 
 
 @pytest.mark.parametrize("make", [clustered, scattered])
 def test_structures_agree_along_rays_of_a_larger_grid(make) -> None:  # type: ignore[no-untyped-def]
     voxels = make(70, 0.2, 3)
     points = np.concatenate([ray_points(70, 20_000, 1), random_points(70, 20_000, 2)])
-    expected, occupied = query(DenseVoxels, voxels, points)
-    assert 0.1 < occupied.mean() < 0.5
-    for structure in KERNELS[1:]:
-        for listed in (voxels, shuffled(voxels, 5)):
-            np.testing.assert_array_equal(query(structure, listed, points)[0], expected, err_msg=str(structure))
-    for structure in TORCH:
-        np.testing.assert_array_equal(query_in_torch(structure, voxels, points)[0], expected, err_msg=str(structure))
+    expected = query(DenseVoxels, voxels, points)
+    assert 0.1 < (expected != 0).mean() < 0.5
+    for structure in STRUCTURES[1:]:
+        np.testing.assert_array_equal(query(structure, voxels, points), expected, err_msg=str(structure))
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("structure", TORCH)
-def test_structures_agree_on_cuda(structure: type) -> None:
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_structures_agree_on_cuda(structure: type[Structure]) -> None:
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device that torch can use")
     voxels, points = clustered(70, 0.2, 3), random_points(70, 20_000, 2)
-    np.testing.assert_array_equal(query_in_torch(structure, voxels, points, "cuda")[0], query(DenseVoxels, voxels, points)[0])
+    np.testing.assert_array_equal(query(structure, voxels, points, "cuda"), query(DenseVoxels, voxels, points))
 
 
 def test_a_tree_of_bricks_takes_a_quarter_of_dense_voxels_at_a_fifth() -> None:
     for voxels in (clustered(128, 0.2, 0), scattered(128, 0.2, 0)):
-        tree = BrickTree.cache(voxels)
-        assert len(tree.values) == len(voxels.packed)
-        assert 4 * sum(a.nbytes for a in tree.arrays.values()) < DenseVoxels.cache(voxels).grid.nbytes
+        tree = cached(BrickTree, voxels)
+        assert len(tree.tensors["values"]) == len(voxels.packed)
+        assert 4 * sum(tensor.nbytes for tensor in tree.tensors.values()) < 8 * voxels.side**3
 
 
 @pytest.mark.parametrize("make", [clustered, scattered])
@@ -106,6 +86,7 @@ def test_shares_are_exact_and_repeat(make, share: float) -> None:  # type: ignor
     order = (voxels.coordinates.astype(np.int64) * (33**2, 33, 1)).sum(axis=1)
     assert (np.diff(order) > 0).all()
     assert np.isfinite(voxels.packed.view(np.float16)).all()
+    assert len(np.unique(voxels.packed)) == len(voxels.packed)
     again = make(33, share, 7)
     np.testing.assert_array_equal(voxels.coordinates, again.coordinates)
     np.testing.assert_array_equal(voxels.packed, again.packed)
@@ -118,14 +99,3 @@ def test_rays_run_through_the_grid_one_voxel_at_a_time() -> None:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert np.median(steps) == pytest.approx(1, abs=1e-3)
     assert (steps > 2).mean() < 0.1  # where the next ray begins
-
-
-def test_bricks_are_the_same_whichever_way_they_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
-    for voxels, apart in ((scattered(40, 0.2, 1), True), (clustered(40, 0.2, 1), False), (shuffled(clustered(40, 0.2, 1), 2), True)):
-        assert bricks._is_scattered(voxels.coordinates) == apart
-        made = []
-        for way in (True, False):
-            monkeypatch.setattr(bricks, "_is_scattered", lambda coordinates, way=way: way)
-            made.append(bricks.BrickTree.cache(voxels).arrays)
-        monkeypatch.undo()
-        assert all(np.array_equal(made[0][name], made[1][name]) for name in made[0])

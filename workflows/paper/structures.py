@@ -1,7 +1,12 @@
-"""The structures of table 7 in plain torch, on any device: the same arrays, built and queried by gathers, scatters and scans.
+"""Data structures for the occupied voxels of a cubic grid, and point queries in them (EfficientNeRF, section 3.5 and table 7), in torch on any device.
 
-They show the cost of the structures without kernels of their own, and are what runs on CUDA. Packed values are int64 of the same bits, for torch has few
-operations on uint64.
+    DenseVoxels  one value for each voxel of the grid
+    HashMap      open addressing over 64-bit keys, as in MinkowskiEngine and spconv: the sparse tensor
+    Octree       the node arrays of svox (PlenOctree)
+    FullBricks   NerfTree as the paper prints it: a number for each coarse cell of 4^3 voxels, and bricks of 64 values, occupied or not
+    BrickTree    NerfTree of occupied voxels only: bit masks of blocks of 4^3 coarse cells, of occupied cells, and values
+
+All are built by gathers, scatters and scans from one list of voxels (`workflows.paper.voxels`), of which all give the same 64-bit words back.
 
 N voxels, M points.
 """
@@ -9,17 +14,17 @@ N voxels, M points.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
 CHUNK = 1 << 24  # points of a query that are processed at a time: temporary tensors of 128 MiB
-LOAD_FACTOR = 0.5  # of the hash map, at most
+LOAD_FACTOR = 0.5  # of the hash map
 
 
-def popcount(word: Tensor) -> Tensor:
+def _popcount(word: Tensor) -> Tensor:
     """Number of set bits of each int64."""
     word = word - ((word >> 1) & 0x5555555555555555)
     word = (word & 0x3333333333333333) + ((word >> 2) & 0x3333333333333333)
@@ -29,7 +34,7 @@ def popcount(word: Tensor) -> Tensor:
 def _rank(masks: Tensor, first: Tensor, at: Tensor, bit: Tensor) -> tuple[Tensor, Tensor]:
     """Index of a bit of a mask among all set bits, and whether it is set."""
     mask = masks[at]
-    return first[at] + popcount(mask & ((1 << bit) - 1)), ((mask >> bit) & 1).bool()
+    return first[at] + _popcount(mask & ((1 << bit) - 1)), ((mask >> bit) & 1).bool()
 
 
 def _local_index(voxel: Tensor) -> Tensor:
@@ -42,58 +47,54 @@ def _flat_index(voxel: Tensor, side: int) -> Tensor:
     return (voxel[:, 0] * side + voxel[:, 1]) * side + voxel[:, 2]
 
 
-def _chunks(points: Tensor, side: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Slices of the points, their voxels (m, 3) int64, and whether they lie in the grid."""
-    for begin in range(0, len(points), CHUNK):
-        part = slice(begin, begin + CHUNK)
-        inside = ((points[part] >= 0) & (points[part] < side)).all(dim=1)
-        yield part, torch.where(inside[:, None], points[part], torch.zeros_like(points[part])).long(), inside
-
-
-class _Structure(ABC):
+@dataclass(frozen=True, eq=False)
+class Structure(ABC):
     """A structure of `tensors` with `side` voxels along each side."""
 
     side: int
     tensors: dict[str, Tensor]
 
-    def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Packed values (M,) int64 and occupied (M,) bool at points (M, 3), voxel coordinates."""
+    @classmethod
+    @abstractmethod
+    def cache(cls, side: int, coordinates: Tensor, packed: Tensor) -> Self:
+        """Build it from coordinates (N, 3) int32 and packed values (N,) int64."""
+
+    def query(self, points: Tensor) -> Tensor:
+        """Packed values (M,) int64 at points (M, 3), voxel coordinates; 0 in empty space and outside of the grid."""
         packed = torch.empty(len(points), dtype=torch.int64, device=points.device)
-        for part, voxel, inside in _chunks(points, self.side):
-            packed[part] = torch.where(inside, self._at(voxel), 0)
-        return packed, packed != 0
+        for point, out in zip(points.split(CHUNK), packed.split(CHUNK), strict=True):
+            inside = ((point >= 0) & (point < self.side)).all(dim=1)
+            out[:] = torch.where(inside, self._at(torch.where(inside[:, None], point, torch.zeros_like(point)).long()), 0)
+        return packed
 
     @abstractmethod
     def _at(self, voxel: Tensor) -> Tensor:
         """Packed values at voxels (m, 3) int64 of the grid, 0 where there is none."""
 
 
-@dataclass(frozen=True, eq=False)
-class DenseVoxels(_Structure):
-    """See `workflows.paper.structures.dense`."""
+class DenseVoxels(Structure):
+    """8 bytes for each voxel of the grid, x slowest."""
 
-    side: int
-    tensors: dict[str, Tensor]
-
-    @staticmethod
-    def cache(side: int, coordinates: Tensor, packed: Tensor) -> DenseVoxels:
+    @classmethod
+    def cache(cls, side: int, coordinates: Tensor, packed: Tensor) -> Self:
         grid = torch.zeros(side**3, dtype=torch.int64, device=packed.device)
         grid[_flat_index(coordinates.long(), side)] = packed
-        return DenseVoxels(side, {"grid": grid})
+        return cls(side, {"grid": grid})
 
     def _at(self, voxel: Tensor) -> Tensor:
         return self.tensors["grid"][_flat_index(voxel, self.side)]
 
 
-@dataclass(frozen=True, eq=False)
-class BrickTree(_Structure):
-    """See `workflows.paper.structures.bricks.BrickTree`; masks and ranks in tensors of their own."""
+class BrickTree(Structure):
+    """NerfTree of occupied voxels only, found by 64-bit masks (x slowest), each with the number of its first set bit.
 
-    side: int
-    tensors: dict[str, Tensor]
+    blocks  masks of the 4^3 coarse cells of a block: a query of a point in an empty cell ends there
+    cells   masks of the 4^3 voxels of each occupied cell
+    values  of the occupied voxels, in the order of the cells
+    """
 
-    @staticmethod
-    def cache(side: int, coordinates: Tensor, packed: Tensor) -> BrickTree:
+    @classmethod
+    def cache(cls, side: int, coordinates: Tensor, packed: Tensor) -> Self:
         blocks_side, device = -(-side // 16), packed.device
         masks = torch.zeros(64 * blocks_side**3, dtype=torch.int64, device=device)
         voxel = coordinates.long()
@@ -102,11 +103,11 @@ class BrickTree(_Structure):
         occupied = (masks != 0).view(-1, 64)
         blocks = (occupied.long() << torch.arange(64, device=device)).sum(dim=1)
         cells = masks[occupied.view(-1)]
-        tensors = {"blocks": blocks, "blocks_first": _exclusive_sum(popcount(blocks)), "cells": cells, "cells_first": _exclusive_sum(popcount(cells))}
+        tensors = {"blocks": blocks, "blocks_first": _exclusive_sum(_popcount(blocks)), "cells": cells, "cells_first": _exclusive_sum(_popcount(cells))}
         record, _ = _rank(blocks, tensors["blocks_first"], cell >> 6, cell & 63)
         number, _ = _rank(cells, tensors["cells_first"], record, bit)
         tensors["values"] = torch.empty_like(packed).index_copy_(0, number, packed)
-        return BrickTree(side, tensors)
+        return cls(side, tensors)
 
     def _at(self, voxel: Tensor) -> Tensor:
         t = self.tensors
@@ -122,15 +123,11 @@ def _exclusive_sum(counts: Tensor) -> Tensor:
     return counts.cumsum(0) - counts
 
 
-@dataclass(frozen=True, eq=False)
-class FullBricks(_Structure):
-    """See `workflows.paper.structures.bricks.FullBricks`."""
+class FullBricks(Structure):
+    """NerfTree as printed; number 0 is an empty brick."""
 
-    side: int
-    tensors: dict[str, Tensor]
-
-    @staticmethod
-    def cache(side: int, coordinates: Tensor, packed: Tensor) -> FullBricks:
+    @classmethod
+    def cache(cls, side: int, coordinates: Tensor, packed: Tensor) -> Self:
         cells_side, voxel = -(-side // 4), coordinates.long()
         cell = _flat_index(voxel >> 2, cells_side)
         occupied = torch.zeros(cells_side**3, dtype=torch.int32, device=packed.device)
@@ -138,25 +135,19 @@ class FullBricks(_Structure):
         index = occupied.cumsum(0, dtype=torch.int32) * occupied
         bricks = torch.zeros(64 * (1 + int(occupied.sum())), dtype=torch.int64, device=packed.device)
         bricks[(index[cell].long() << 6) | _local_index(voxel)] = packed
-        return FullBricks(side, {"index": index, "bricks": bricks})
+        return cls(side, {"index": index, "bricks": bricks})
 
     def _at(self, voxel: Tensor) -> Tensor:
         brick = self.tensors["index"][_flat_index(voxel >> 2, -(-self.side // 4))].long()
         return self.tensors["bricks"][(brick << 6) | _local_index(voxel)]
 
 
-@dataclass(frozen=True, eq=False)
-class HashMap(_Structure):
-    """See `workflows.paper.structures.hashing`. All keys are inserted, and queried, in lockstep: of those that write to one free slot one wins, and the others
-    probe the next.
-    """
+class HashMap(Structure):
+    """Linear probing. All keys are inserted, and queried, in lockstep: of those that write to one free slot one wins, and the others probe the next."""
 
-    side: int
-    tensors: dict[str, Tensor]
-
-    @staticmethod
-    def cache(side: int, coordinates: Tensor, packed: Tensor) -> HashMap:
-        slots = max(-(-len(packed) * 100 // round(100 * LOAD_FACTOR)), 1)
+    @classmethod
+    def cache(cls, side: int, coordinates: Tensor, packed: Tensor) -> Self:
+        slots = max(int(len(packed) / LOAD_FACTOR), 1)
         keys = torch.full((slots,), -1, dtype=torch.int64, device=packed.device)
         values = torch.zeros(slots, dtype=torch.int64, device=packed.device)
         key = _keys(coordinates.long())
@@ -167,7 +158,7 @@ class HashMap(_Structure):
             won = keys[slot] == key
             values[slot[won]] = word[won]
             key, word, slot = key[~won], word[~won], (slot[~won] + 1) % slots
-        return HashMap(side, {"keys": keys, "values": values})
+        return cls(side, {"keys": keys, "values": values})
 
     def _at(self, voxel: Tensor) -> Tensor:
         keys, values = self.tensors["keys"], self.tensors["values"]
@@ -198,17 +189,14 @@ def _shift_right(word: Tensor, by: int) -> Tensor:
     return (word >> by) & ((1 << (64 - by)) - 1)
 
 
-@dataclass(frozen=True, eq=False)
-class Octree(_Structure):
-    """See `workflows.paper.structures.octree`; depth levels of nodes."""
+class Octree(Structure):
+    """A row for each node, a column for each octant: `child` holds the offset in rows to the child node, 0 for a leaf; `data` the leaf's values, 0 where it is
+    empty. As in svox every node has both rows. Nodes are numbered level after level in Morton order; svox refines from the root, in Python.
+    """
 
-    side: int
-    depth: int
-    tensors: dict[str, Tensor]
-
-    @staticmethod
-    def cache(side: int, coordinates: Tensor, packed: Tensor) -> Octree:
-        depth = max((side - 1).bit_length(), 1)
+    @classmethod
+    def cache(cls, side: int, coordinates: Tensor, packed: Tensor) -> Self:
+        depth = _depth(side)
         code = _morton(coordinates.long())
         levels = [torch.unique(code >> 3)]  # codes of the nodes of a level, in order; the lowest first
         while len(levels) < depth:
@@ -226,17 +214,22 @@ class Octree(_Structure):
             node = begins[number] + torch.arange(len(levels[number]), device=packed.device)
             child[(parent << 3) | (levels[number] & 7)] = (node - parent).int()
         data[((begins[-2] + torch.searchsorted(levels[-1], code >> 3)) << 3) | (code & 7)] = packed
-        return Octree(side, depth, {"child": child, "data": data})
+        return cls(side, {"child": child, "data": data})
 
     def _at(self, voxel: Tensor) -> Tensor:
         code = _morton(voxel)
         out, node, active = torch.zeros_like(code), torch.zeros_like(code), torch.arange(len(code), device=code.device)
-        for level in range(self.depth - 1, 0, -1):
+        for level in range(_depth(self.side) - 1, 0, -1):
             skip = self.tensors["child"][(node << 3) | ((code >> (3 * level)) & 7)].long()
             inner = skip != 0
             active, code, node = active[inner], code[inner], (node + skip)[inner]
         out[active] = self.tensors["data"][(node << 3) | (code & 7)]
         return out
+
+
+def _depth(side: int) -> int:
+    """Levels of nodes of an octree."""
+    return max((side - 1).bit_length(), 1)
 
 
 def _morton(voxel: Tensor) -> Tensor:
