@@ -9,6 +9,7 @@ corrupt  the files are not those that were written
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import artifact, files, manifest
-from pipeline.errors import BadInput, CorruptArtifact, Interrupted, PipelineError
+from pipeline.errors import BadInput, CorruptArtifact, Interrupted, PipelineError, UsageError
 from pipeline.hashes import Hashes
 from pipeline.manifest import ABSENT, Manifest, Request
 from pipeline.run import Run
@@ -51,6 +52,33 @@ class Decision:
     @property
     def fresh(self) -> bool:
         return self.state == "fresh"
+
+
+def selection(stages: Sequence[Stage], *, until: str | None, start: str | None, only: str | None, force: bool) -> tuple[list[Stage], frozenset[str]]:
+    """(the stages to consider, the names of those to run even if fresh)."""
+    names = [stage.name for stage in stages]
+    for name in (until, start, only):
+        if name is not None and name not in names:
+            near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+            raise UsageError(f"{name}: no such stage. " + (f"Did you mean {near[0]}?" if near else f"There are: {', '.join(names)}."))
+    if only is not None:
+        if until is not None or start is not None:
+            raise UsageError("a single stage goes together with neither a first nor a last one")
+        return [stages[names.index(only)]], frozenset([only] if force else [])
+    last = len(names) - 1 if until is None else names.index(until)
+    first = last + 1 if start is None else names.index(start)
+    if start is not None and first > last:
+        raise UsageError(f"nothing to do from {start} until {until}: {until} comes first")
+    return list(stages[: last + 1]), frozenset(names[: last + 1] if force else names[first : last + 1])
+
+
+def needed_by(stages: Sequence[Stage], name: str) -> list[Stage]:
+    """The stages that this one needs, and those that they need, in order."""
+    needed: set[str] = set()
+    for stage in reversed(stages):  # each comes after those that it needs
+        if stage.name == name or stage.name in needed:
+            needed.update(stage.needs)
+    return [stage for stage in stages if stage.name in needed]
 
 
 def survey(stages: Sequence[Stage], run: Run, *, forced: Collection[str] = (), hashes: Hashes | None = None) -> list[Decision]:

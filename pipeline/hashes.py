@@ -44,13 +44,11 @@ def sha256_of(path: Path, safe_point: SafePoint | None = None, *, follow: bool =
 class Hashes:
     """Digests of files by key, where a key is the file's place within the run (or within the source), which moves with it.
 
-    path   the file that remembers them between processes; None: nothing is remembered. A damaged one is ignored: it only saves time
-    trust  False: read every file, whatever is remembered
+    path  the file that remembers them between processes; None: nothing is remembered. A damaged one is ignored: it only saves time
     """
 
-    def __init__(self, path: Path | None = None, *, trust: bool = True, safe_point: SafePoint | None = None) -> None:
+    def __init__(self, path: Path | None = None, *, safe_point: SafePoint | None = None) -> None:
         self.path = path
-        self.trust = trust
         self.safe_point = safe_point
         self._changed = False
         self._entries: dict[str, Entry] = {} if path is None else _read(path)
@@ -63,7 +61,7 @@ class Hashes:
         """
         before = os.stat(path, follow_symlinks=follow)
         known = self._entries.get(key)
-        if self.trust and not anew and known is not None and known[:4] == _identity(before):
+        if not anew and known is not None and known[:4] == _identity(before):
             return known[4]
         started = time.time_ns()
         digest = sha256_of(path, None if anew else self.safe_point, follow=follow)

@@ -170,10 +170,6 @@ def read_manifest(folder: Path) -> Manifest:
         raise CorruptArtifact(f"{where}: {printable(error, 300)}", (where,)) from None
 
 
-class _Bad(ValueError):
-    """A manifest with an invalid value."""
-
-
 def _plain_output(output: Output) -> dict[str, Any]:
     plain: dict[str, Any] = {"sha256": output.sha256, "size": output.size}
     return {**plain, "volatile": True} if output.volatile else plain
@@ -198,19 +194,19 @@ class _Document(msgspec.Struct):
 
 def _parsed(value: Any) -> Manifest:
     if not isinstance(value, dict):
-        raise _Bad(f"found {type(value).__name__}, expected an object")
+        raise ValueError(f"found {type(value).__name__}, expected an object")
     if value.get("format") != FORMAT:
-        raise _Bad(f"format {value.get('format')!r:.40}, expected {FORMAT!r}")
+        raise ValueError(f"format {value.get('format')!r:.40}, expected {FORMAT!r}")
     if value.get("format_version") != VERSION:
-        raise _Bad(f"format version {value.get('format_version')!r:.20}; this build reads {VERSION}. Upgrade {DISTRIBUTION}")
+        raise ValueError(f"format version {value.get('format_version')!r:.20}; this build reads {VERSION}. Upgrade {DISTRIBUTION}")
     rest = {key: item for key, item in value.items() if key != "checksum"}
     if value.get("checksum") != hashlib.sha256(files.canonical_json(rest)).hexdigest():
-        raise _Bad("its checksum is not that of its content: it was altered or damaged")
+        raise ValueError("its checksum is not that of its content: it was altered or damaged")
     document = msgspec.convert(value, _Document)
     for name in document.outputs:
         if not files.is_safe_name(name) or name == NAME:
-            raise _Bad(f"output {name!r:.80} is no name of a file in its folder")
+            raise ValueError(f"output {name!r:.80} is no name of a file in its folder")
     manifest = Manifest(**{each.name: getattr(document, each.name) for each in dataclasses.fields(Manifest)})
     if document.digest != manifest.digest or document.request_digest != manifest.request.digest:
-        raise _Bad("its digests are not those of what it lists")
+        raise ValueError("its digests are not those of what it lists")
     return manifest

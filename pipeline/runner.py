@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import signal
 import threading
 import time
@@ -14,7 +13,7 @@ from typing import Any, NoReturn
 
 from pipeline import artifact, files, manifest
 from pipeline.artifact import Workplace
-from pipeline.decide import Decision, decide, survey
+from pipeline.decide import Decision, decide, needed_by, selection, survey
 from pipeline.errors import BadInput, CorruptArtifact, Interrupted, PipelineError, UsageError
 from pipeline.executors import local
 from pipeline.executors.local import Usage
@@ -82,7 +81,7 @@ def run_stages(
 
     Raises PipelineError. What was published before stays; the next call resumes what was interrupted.
     """
-    chosen, forced = _selection(stages, until=until, start=start, only=only, force=force)
+    chosen, forced = selection(stages, until=until, start=start, only=only, force=force)
     refuse_what_cannot_work(chosen, run, forced)
     if dry_run:
         if only is not None:
@@ -104,16 +103,9 @@ class _Runner:
     """One call of run_stages."""
 
     def __init__(
-        self,
-        run: Run,
-        stages: Sequence[Stage],
-        device: str,
-        memory: Limit | None,
-        report: Report | None,
-        stop: Stop,
-        execute: Executor,
+        self, run: Run, stages: Sequence[Stage], device: str, memory: Limit | None, report: Report | None, stop: Stop, execute: Executor,
         beside: SideBySide | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.run = run
         self.stages = stages
         self.work = run.path / artifact.WORK
@@ -140,7 +132,7 @@ class _Runner:
                 current = ready[0].name
                 self.safe_point()
                 together = self._are_admitted(ready, forced, sum(outcome.seconds for outcome in outcomes))
-                outcomes += self._together(ready, forced) if together else [self.one(ready[0], forced=current in forced)]
+                outcomes += self._together(ready, forced) if together else [self.one(ready[0], current in forced, self.execute, self.memory)]
                 waiting = [stage for stage in waiting if stage.name not in {outcome.stage for outcome in outcomes}]
         except (Interrupted, KeyboardInterrupt) as error:
             raise self._interrupted(error, current, go_on(current)) from error
@@ -166,7 +158,7 @@ class _Runner:
         assert self.beside is not None
         memory = None if self.memory is None else Limit(self.memory.bytes // self.beside.jobs, self.memory.whose)
         with ThreadPoolExecutor(self.beside.jobs, thread_name_prefix="stage") as pool:
-            futures = [pool.submit(self.one, stage, forced=stage.name in forced, execute=self.beside.execute, memory=memory) for stage in ready]
+            futures = [pool.submit(self.one, stage, stage.name in forced, self.beside.execute, memory) for stage in ready]
             pending, asked = set(futures), False
             while pending:
                 ended = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED).done
@@ -184,13 +176,10 @@ class _Runner:
                 raise error
         return [future.result() for future in futures]
 
-    def one(self, stage: Stage, *, forced: bool, execute: Executor | None = None, memory: Limit | None = None) -> Outcome:
-        """Decide about one stage, and run it if needed.
-
-        execute  in place of the usual executor, with this `memory`
-        """
+    def one(self, stage: Stage, forced: bool, execute: Executor, memory: Limit | None) -> Outcome:
+        """Decide about one stage, and run it if needed."""
         with self._lock:
-            return self._one(stage, forced, execute or self.execute, memory if execute is not None else self.memory)
+            return self._one(stage, forced, execute, memory)
 
     def _one(self, stage: Stage, forced: bool, execute: Executor, memory: Limit | None) -> Outcome:
         decision = decide(stage, self.run, self.hashes)
@@ -338,10 +327,9 @@ def verify(run: Run, stages: Sequence[Stage], report: Report | None = None, *, a
 
     Takes no lock and writes nothing. A file too many is a warning. Raises CorruptArtifact that lists what is damaged, after all was read.
     """
-    damaged: list[str] = []
+    damaged = list(altered)
     outcomes = []
     for name in altered:
-        damaged.append(name)
         _emit(report, "warning", "", text=f"{name} altered", state="corrupt")
     for stage in stages:
         folder = run.folder(stage.name)
@@ -392,54 +380,9 @@ def _emit(report: Report | None, event: str, stage: str, **facts: Any) -> None:
         report({**facts, "event": event, "stage": stage, "time": time.time()})
 
 
-def _selection(stages: Sequence[Stage], *, until: str | None, start: str | None, only: str | None, force: bool) -> tuple[list[Stage], frozenset[str]]:
-    """(the stages to consider, the names of those to run even if fresh)."""
-    names = _checked_names(stages)
-    for name in (until, start, only):
-        if name is not None and name not in names:
-            near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-            raise UsageError(f"{name}: no such stage. " + (f"Did you mean {near[0]}?" if near else f"There are: {', '.join(names)}."))
-    if only is not None:
-        if until is not None or start is not None:
-            raise UsageError("a single stage goes together with neither a first nor a last one")
-        chosen = [stages[names.index(only)]]
-        return chosen, frozenset([only] if force else [])
-    last = len(names) - 1 if until is None else names.index(until)
-    first = last + 1 if start is None else names.index(start)
-    if start is not None and first > last:
-        raise UsageError(f"nothing to do from {start} until {until}: {until} comes first")
-    chosen = list(stages[: last + 1])
-    return chosen, frozenset(names[: last + 1] if force else names[first : last + 1])
-
-
-def _checked_names(stages: Sequence[Stage]) -> list[str]:
-    names: list[str] = []
-    for stage in stages:
-        missing = [need for need in stage.needs if need not in names]
-        if missing:
-            raise ValueError(f"stage {stage.name} comes before {missing[0]}, which it needs")
-        if stage.name in names:
-            raise ValueError(f"two stages are named {stage.name}")
-        names.append(stage.name)
-    return names
-
-
-def _ancestors(stages: Sequence[Stage], name: str) -> set[str]:
-    needs = {stage.name: stage.needs for stage in stages}
-    found: set[str] = set()
-    pending = list(needs[name])
-    while pending:
-        need = pending.pop()
-        if need not in found:
-            found.add(need)
-            pending.extend(needs[need])
-    return found
-
-
 def _warn_of_stale_needs(run: Run, stages: Sequence[Stage], only: str, report: Report | None, hashes: Hashes) -> None:
     """Name each stage before a single one that is not up to date."""
-    before = _ancestors(stages, only)
-    for decision in survey([stage for stage in stages if stage.name in before], run, hashes=hashes):
+    for decision in survey(needed_by(stages, only), run, hashes=hashes):
         if not decision.fresh:
             text = f"{decision.stage} is {decision.state} ({decision.reason}); {only} uses what the run has. To bring all up to date: {run.how_to_resume()}"
             _emit(report, "warning", only, text=text, about=decision.stage, state=decision.state, reason=decision.reason)

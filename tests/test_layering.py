@@ -48,8 +48,6 @@ LATE = {
     "efficientnerf/backends/dispatch.py": 1,
     "efficientnerf/geometry/ndc.py": 3,
     "pipeline/executors/dask.py": 2,
-    "pipeline/executors/local.py": 2,
-    "pipeline/executors/memory.py": 1,
     "pipeline/locks/lock.py": 1,
     "stages/cores.py": 1,
     "stages/figures/drawing.py": 3,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import resource
 import sys
 import time
 from dataclasses import dataclass
@@ -66,25 +67,17 @@ def _reset_peak() -> None:
 
 
 def peak_memory() -> int:
-    """Bytes; 0 where the system does not say."""
+    """Bytes."""
     with contextlib.suppress(OSError, ValueError), open("/proc/self/status", encoding="ascii", errors="replace") as file:
         for line in file:
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
-    with contextlib.suppress(ImportError):
-        import resource  # not on Windows
-
-        return _bytes(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-    return 0
+    return _bytes(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def peak_memory_of_children() -> int:
-    """Bytes of the largest child that has ended; 0 where the system does not say."""
-    with contextlib.suppress(ImportError):
-        import resource  # not on Windows
-
-        return _bytes(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
-    return 0
+    """Bytes of the largest child that has ended."""
+    return _bytes(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 
 
 def _bytes(resident: int) -> int:

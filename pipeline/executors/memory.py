@@ -14,6 +14,7 @@ import ctypes
 import gc
 import os
 import re
+import resource
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,10 +129,6 @@ def _cgroups(root: Path) -> Iterator[Limit]:
 
 def _rlimits(cores: int) -> list[Limit]:
     """Soft limits on this process's addresses, less what is reserved of them and not used; at least a sixteenth stays."""
-    try:
-        import resource  # not on Windows
-    except ImportError:
-        return []
     found = []
     for name, reserved, by_thread in (("RLIMIT_AS", RESERVED, RESERVED_BY_THREAD), ("RLIMIT_DATA", PRIVATE, PRIVATE_BY_THREAD)):
         soft, _ = resource.getrlimit(getattr(resource, name))

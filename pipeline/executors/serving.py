@@ -135,29 +135,29 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     return {**made, "action": outcome.action, **_estimates(program, path, surveyed, request, channel), **program.describe(path)}
 
 
-def _job_done(stage: Stage, facts: dict[str, Any], channel: _Channel) -> dict[str, Any]:
+def _job_done(stage: Stage, asked: dict[str, Any], channel: _Channel) -> dict[str, Any]:
     """Run a stage as `SideBySide.execute` asks for it: its parent holds the run's lock, and publishes what is made."""
-    sources = [Path(path) for path in facts["sources"]]
+    sources = [Path(path) for path in asked["sources"]]
     with stopping() as stop:
         try:
             job = Job(
-                settings=settings_from(stage.settings, facts["settings"], where=stage.name),
-                inputs={need: Path(folder) for need, folder in facts["inputs"].items()},
+                settings=settings_from(stage.settings, asked["settings"], where=stage.name),
+                inputs={need: Path(folder) for need, folder in asked["inputs"].items()},
                 source=sources[0] if sources else None,
                 also=sources[1:],
-                out=Path(facts["out"]),
-                work=Path(facts["work"]),
-                device=facts["device"],
-                memory=None if facts["memory"] is None else Limit(*facts["memory"]),
+                out=Path(asked["out"]),
+                work=Path(asked["work"]),
+                device=asked["device"],
+                memory=None if asked["memory"] is None else Limit(*asked["memory"]),
                 stage=stage.name,
                 report=channel.send,
                 stop=stop,
             )
             return {"usage": asdict(execute_alone(stage, job)), "facts": job.facts}
         except (Exception, KeyboardInterrupt) as error:
-            failure = interruption_in(error, stop()) or translated(error, stage.name, Path(facts["out"]))
-            named = {name: getattr(failure, name, None) for name in ("number", "needed", "files")}
-            told = {"error": type(failure).__name__, "error_facts": named, "text": str(failure), "trace": "".join(traceback.format_exception(error))}
+            failure = interruption_in(error, stop()) or translated(error, stage.name, Path(asked["out"]))
+            facts = {name: getattr(failure, name) for name in ("number", "needed", "files", "details") if hasattr(failure, name)}
+            told = {"error": type(failure).__name__, "facts": facts, "text": str(failure), "trace": "".join(traceback.format_exception(error))}
             return {**told, "ok": False, "kind": "error"}
 
 

@@ -13,8 +13,6 @@ from pipeline.executors.child import Children
 from pipeline.executors.local import Usage
 from pipeline.stage import Job, Stage, settings_dict
 
-_PLAIN = (errors.BadInput, errors.UsageError, errors.UnknownSetting, errors.StageFailed, errors.DiskFull, errors.RunLocked)
-
 
 class FailureInChild(Exception):
     """The traceback of what a child raised, as its text: the cause of the error that is raised here."""
@@ -91,13 +89,10 @@ def _error_of(stage: str, answer: dict[str, Any]) -> errors.PipelineError:
         if answer["kind"] == "stopped":
             return errors.Interrupted()
         return errors.StageFailed(f"{stage}: {text} {' '.join(answer['lines'][-1:])}".rstrip())
-    name, facts = answer["error"], answer["error_facts"]
-    if name == errors.Interrupted.__name__:
+    kind: Any = getattr(errors, answer["error"], errors.StageFailed)
+    facts = {name: tuple(found) if isinstance(found, list) else found for name, found in answer["facts"].items()}  # JSON has no tuples
+    if kind is errors.Interrupted:
         return errors.Interrupted(facts["number"], text)
-    if name == errors.TooLittleMemory.__name__:
-        return errors.TooLittleMemory(text, facts["needed"])
-    if name == errors.CorruptArtifact.__name__:
-        return errors.CorruptArtifact(text, tuple(facts["files"]))
-    made = next((kind for kind in _PLAIN if kind.__name__ == name), errors.StageFailed)(text)
+    made: errors.PipelineError = kind(text, **facts)
     made.__cause__ = FailureInChild(answer["trace"])
     return made

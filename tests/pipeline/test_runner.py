@@ -87,12 +87,6 @@ def test_until_from_and_force(run: Run) -> None:
         run_stages(run, STAGES, until="cuont")
 
 
-def test_a_workflow_in_the_wrong_order_is_a_mistake_of_ours(run: Run) -> None:
-    for stages in ([COUNT, LIST], [LIST, LIST]):
-        with pytest.raises(ValueError, match="list"):
-            run_stages(run, stages)
-
-
 def test_one_stage_alone_uses_what_there_is_and_warns_of_what_is_stale(run: Run) -> None:
     run_stages(run, STAGES)
     assert actions(run_stages(run, STAGES, only="double")) == {"double": "skipped"}
