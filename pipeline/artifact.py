@@ -176,16 +176,13 @@ def publish(run: Path, stage: str, place: Workplace) -> None:
 
 def finished(place: Workplace, stage: str) -> Manifest | None:
     """The manifest of a sealed out/ whose publication was cut short, every file checked; None if there is none."""
-    made = _sealed(place.out, stage)
-    if made is None or made.request.digest != place.request or differences(place.out, made.outputs).damaged:
-        return None
-    return made
+    made = _sealed(place.out, stage, place.request)
+    return None if made is None or differences(place.out, made.outputs).damaged else made
 
 
 def is_published(run: Path, stage: str, place: Workplace) -> bool:
     """Whether out/ has become RUN/<stage>, whatever failed after that."""
-    made = _sealed(run / stage, stage)
-    return made is not None and made.request.digest == place.request and not files.exists(place.out)
+    return _sealed(run / stage, stage, place.request) is not None and not files.exists(place.out)
 
 
 def clear_published(run: Path, place: Workplace) -> None:
@@ -224,7 +221,7 @@ def _recovered(run: Path, stage: str, old: Path) -> str:
         files.discard(old, work)
         return "what was set aside as the former artifact is none, and was deleted"
     files.discard(target, work)
-    whole = [path for path in (work / stage).glob("*/out") if _is_of(_sealed(path, stage), path.parent.name)]
+    whole = [path for path in (work / stage).glob("*/out") if _sealed(path, stage, path.parent.name) is not None]
     if len(whole) == 1:
         files.rename(whole[0], target)
         _sync(whole[0].parent, run)
@@ -238,25 +235,21 @@ def _recovered(run: Path, stage: str, old: Path) -> str:
 def _clear_published(run: Path, stage: str, root: Path) -> None:
     published = _sealed(run / stage, stage)
     for folder in list(root.iterdir()):
-        if files.is_folder(folder) and not files.exists(folder / "out") and _is_of(published, folder.name):
+        if published is not None and folder.name == published.request.digest and files.is_folder(folder) and not files.exists(folder / "out"):
             files.discard(folder, run / WORK)
     if files.is_empty(root):
         root.rmdir()
 
 
-def _is_of(made: Manifest | None, request: str) -> bool:
-    return made is not None and made.request.digest == request
-
-
-def _sealed(folder: Path, stage: str) -> Manifest | None:
-    """The manifest of an artifact of this stage; None if the folder is not one."""
+def _sealed(folder: Path, stage: str, request: str | None = None) -> Manifest | None:
+    """The manifest of an artifact of this stage, and of this request if one is given; None if the folder is not one."""
     if not files.is_folder(folder):
         return None
     try:
         made = manifest.read_manifest(folder)
     except CorruptArtifact:
         return None
-    return made if made.request.stage == stage else None
+    return made if made.request.stage == stage and request in (None, made.request.digest) else None
 
 
 def _sync(*folders: Path) -> None:

@@ -169,25 +169,12 @@ def atomic(path: Path, *, durable: bool = True) -> Iterator[Path]:
     durable  sync the file before and the folder after the rename: the file has its old content or all of the new after a power cut, too.
              Without, only a kill is survived: for scratch that is checked when it is read, or made again
     """
-    temporary = _created_beside(path)
-    try:
+    with atomic_together([path], durable=durable) as (temporary,):
         yield temporary
-        if durable:
-            sync_file(temporary)
-        rename(temporary, path)
-    except BaseException as error:
-        full = _disk_full_behind(error, path)
-        with contextlib.suppress(OSError):  # the error in flight is the one to report
-            temporary.unlink(missing_ok=True)
-        if full is not None:
-            raise full from error
-        raise
-    if durable:
-        sync_folder(path.parent)
 
 
 @contextmanager
-def atomic_together(paths: Sequence[Path]) -> Iterator[list[Path]]:
+def atomic_together(paths: Sequence[Path], *, durable: bool = True) -> Iterator[list[Path]]:
     """As `atomic`, for files of one folder that belong together: none appears before all are written and synced, and the last one appears last.
 
     Where a rename fails, those that were not there before go again; files that were replaced by then stay replaced.
@@ -198,13 +185,14 @@ def atomic_together(paths: Sequence[Path]) -> Iterator[list[Path]]:
         for path in paths:
             temporaries.append(_created_beside(path))
         yield temporaries
-        for temporary in temporaries:
+        for temporary in temporaries if durable else ():
             sync_file(temporary)
         for temporary, path in zip(temporaries, paths, strict=True):
             if not exists(path):
                 new.append(path)
             rename(temporary, path)
-        sync_folder(paths[-1].parent)
+        if durable:
+            sync_folder(paths[-1].parent)
     except BaseException as error:
         full = _disk_full_behind(error, paths[-1])
         for each in (*temporaries, *new):

@@ -205,7 +205,7 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
 
 def settings_dict(settings: Any) -> dict[str, Any]:
     """The plain values of an instance of a settings dataclass, as JSON holds them (tuples become lists)."""
-    return {f.name: _plain(getattr(settings, f.name)) for f in dataclasses.fields(settings)}
+    return {f.name: plain(getattr(settings, f.name)) for f in dataclasses.fields(settings)}
 
 
 def _unknown(prefix: str, name: str, known: list[str]) -> str:
@@ -214,8 +214,9 @@ def _unknown(prefix: str, name: str, known: list[str]) -> str:
     return f"{prefix}{name}: no such setting. {remedy}"
 
 
-def _plain(value: Any) -> Any:
-    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+def plain(value: Any) -> Any:
+    """A value as JSON holds it."""
+    return [plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
 def _numbers(value: Any) -> list[float]:

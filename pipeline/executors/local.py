@@ -13,9 +13,10 @@ import resource
 import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 from pipeline.executors.cores import cores
-from pipeline.executors.memory import give_back_freed
+from pipeline.executors.memory import give_back_freed, number_of
 from pipeline.stage import Job, Stage
 
 
@@ -68,11 +69,7 @@ def _reset_peak() -> None:
 
 def peak_memory() -> int:
     """Bytes."""
-    with contextlib.suppress(OSError, ValueError), open("/proc/self/status", encoding="ascii", errors="replace") as file:
-        for line in file:
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    return _bytes(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return number_of(Path("/proc/self/status"), "VmHWM") or _bytes(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def peak_memory_of_children() -> int:

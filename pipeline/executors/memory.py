@@ -82,14 +82,14 @@ def available_now(root: Path = Path("/")) -> int | None:
 
     It changes from moment to moment. Only where data lie may depend on it, and warnings; never what is made, nor what is refused.
     """
-    own, free = _field(root / "proc/self/status", "VmRSS"), _field(root / "proc/meminfo", "MemAvailable")
+    own, free = number_of(root / "proc/self/status", "VmRSS"), number_of(root / "proc/meminfo", "MemAvailable")
     if own is None or free is None:
         return None
     found = own + free
     for folder, _ in cgroup_folders(root, "memory"):
         limit, used = first_number(folder, _LIMITS), first_number(folder, ("memory.current", "memory.usage_in_bytes"))
         if limit is not None and used is not None and limit < MOST:
-            cached = sum(_statistic(folder / "memory.stat", name) for name in ("inactive_file", "active_file"))
+            cached = sum(number_of(folder / "memory.stat", name) or 0 for name in ("inactive_file", "active_file"))
             found = min(found, own + max(0, limit - used + cached))
     return found
 
@@ -97,7 +97,7 @@ def available_now(root: Path = Path("/")) -> int | None:
 def resident() -> int | None:
     """Bytes of this process in memory, what it has freed given back before; None where the system does not say."""
     give_back_freed()
-    return _field(Path("/proc/self/status"), "VmRSS")
+    return number_of(Path("/proc/self/status"), "VmRSS")
 
 
 def give_back_freed() -> None:
@@ -111,7 +111,7 @@ _LIMITS = ("memory.max", "memory.limit_in_bytes")  # of version 2, of version 1
 
 
 def _machine(root: Path) -> Iterator[Limit]:
-    total = _field(root / "proc/meminfo", "MemTotal")
+    total = number_of(root / "proc/meminfo", "MemTotal")
     if total is None and root == Path("/"):  # no Linux
         with contextlib.suppress(AttributeError, OSError, ValueError):
             total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -137,21 +137,11 @@ def _rlimits(cores: int) -> list[Limit]:
     return found
 
 
-def _field(path: Path, name: str) -> int | None:
-    """Bytes of a line `name: 123 kB`."""
+def number_of(path: Path, name: str) -> int | None:
+    """The number of a line `name 123`; bytes of a line `name: 123 kB`."""
     with contextlib.suppress(OSError, ValueError), path.open(encoding="ascii", errors="replace") as file:
         for line in file:
-            key, _, value = line.partition(":")
-            if key == name:
-                return int(value.split()[0]) * 1024
+            words = line.replace(":", " ").split()
+            if words[:1] == [name]:
+                return int(words[1]) * (1024 if words[2:] == ["kB"] else 1)
     return None
-
-
-def _statistic(path: Path, name: str) -> int:
-    """The number of a line `name 123`; 0 where there is none."""
-    with contextlib.suppress(OSError, ValueError), path.open(encoding="ascii", errors="replace") as file:
-        for line in file:
-            key, _, value = line.partition(" ")
-            if key == name:
-                return int(value)
-    return 0

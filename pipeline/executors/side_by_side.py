@@ -90,9 +90,9 @@ def _error_of(stage: str, answer: dict[str, Any]) -> errors.PipelineError:
             return errors.Interrupted()
         return errors.StageFailed(f"{stage}: {text} {' '.join(answer['lines'][-1:])}".rstrip())
     kind: Any = getattr(errors, answer["error"], errors.StageFailed)
-    facts = {name: tuple(found) if isinstance(found, list) else found for name, found in answer["facts"].items()}  # JSON has no tuples
     if kind is errors.Interrupted:
-        return errors.Interrupted(facts["number"], text)
+        return errors.Interrupted(answer["facts"]["number"], text)
+    facts = {name: tuple(found) if isinstance(found, list) else found for name, found in answer["facts"].items()}  # JSON has no tuples
     made: errors.PipelineError = kind(text, **facts)
     made.__cause__ = FailureInChild(answer["trace"])
     return made

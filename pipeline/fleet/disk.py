@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.links import WORK
@@ -16,7 +16,7 @@ def free_space(fleet: Path) -> int:
     return shutil.disk_usage(fleet).free
 
 
-def has_room(free: int, wanted: tuple[Path, int], running: Iterable[tuple[Path, int]], *, written: Callable[[Path], int] | None = None) -> bool:
+def has_room(free: int, wanted: tuple[Path, int], running: Iterable[tuple[Path, int]]) -> bool:
     """Whether a stage fits on the disk together with those that run.
 
     free     bytes
@@ -26,8 +26,7 @@ def has_room(free: int, wanted: tuple[Path, int], running: Iterable[tuple[Path, 
     pairs = [wanted, *running]
     if sum(need for _, need in pairs) + RESERVE <= free:
         return True
-    done = written or written_in
-    return sum(max(0, need - done(run)) for run, need in pairs) + RESERVE <= free
+    return sum(max(0, need - written_in(run)) for run, need in pairs) + RESERVE <= free
 
 
 def written_in(run: Path) -> int:

@@ -22,7 +22,7 @@ from pipeline.text import printable
 
 LOCKED_SECONDS = 600.0  # that a run may stay locked by another process; a lease has expired long before
 LOCKED_PAUSE = 2.0
-_HEADROOM = 1.05  # of a stated need: buffers of files and pipes
+HEADROOM = 1.05  # of what a stage takes, by itself or by an estimate: buffers of files and pipes
 _LEAST = 64 * 2**20  # bytes; less memory is no memory
 _MOST_ENLARGED = 3  # times that a stage may find that it needs more than it has: as it begins, and once it has counted what it will make
 
@@ -107,6 +107,6 @@ def _refused(what: str, text: str, needed: int, attempts: Attempts, given: int |
         before = "memory ran out, and with less it does not begin: " if attempts.out_of_memory else ""
         return Remedy("quarantined", before + text)
     attempts.enlarged += 1
-    asked = int(_HEADROOM * needed)
+    asked = int(HEADROOM * needed)
     attempts.memory = asked if largest is None else min(asked, largest)
     return Remedy("again", text)

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.executors.memory import size_text
-from pipeline.fleet.failure import Attempts
+from pipeline.fleet.failure import HEADROOM, Attempts
 from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, SceneState, StageState, Verdict
 from pipeline.fleet.workers import Task
 from pipeline.text import printable
 
 BESIDE_STAGES = 512 * 2**20  # bytes that preparing a run takes at most, and writing its pages
-HEADROOM = 1.05  # of what a stage is estimated to take: buffers of files and pipes
 
 
 @dataclass

@@ -38,9 +38,9 @@ def ask(fleet: Path, do: Literal["cancel", "retry"], scenes: Sequence[str] | Non
     return path
 
 
-def outcome(path: Path, is_running: Callable[[], bool], seconds: float | None = None) -> Literal["taken", "ended", "left"]:
-    """What becomes of a request: taken; ended: the fleet did first, and it is withdrawn; or left: no answer in this time, by default ANSWER_SECONDS."""
-    deadline = time.monotonic() + (ANSWER_SECONDS if seconds is None else seconds)
+def outcome(path: Path, is_running: Callable[[], bool]) -> Literal["taken", "ended", "left"]:
+    """What becomes of a request: taken; ended: the fleet did first, and it is withdrawn; or left: no answer within ANSWER_SECONDS."""
+    deadline = time.monotonic() + ANSWER_SECONDS
     look = time.monotonic() + 2.0
     while files.exists(path):
         now = time.monotonic()

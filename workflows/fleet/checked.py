@@ -11,7 +11,7 @@ from pipeline.errors import Mistakes, UsageError
 from pipeline.files import canonical_json
 from pipeline.fleet.state import Scene
 from pipeline.run import NAME as RUN_NAME
-from pipeline.stage import Stage, settings_from
+from pipeline.stage import Stage, plain, settings_from
 from pipeline.text import printable
 from workflows.budget import share_budget, train_share
 from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, seconds_of
@@ -93,7 +93,7 @@ class Checker:
             if f"{stage}.{name}" in GIVEN_BY_HAND and not by_hand:
                 raise UsageError(f"{stage}.{name}: found in a manifest, expected on the command line alone (--set {stage}.{name}=VALUE).")
             self._settings.put(stage, name, parse_value(str(value).strip()) if isinstance(value, Text) else [value], "")
-            self._known[key] = _plain(self._settings.values[stage][name])
+            self._known[key] = plain(self._settings.values[stage][name])
         return self._known[key]
 
     def given(self, table: Mapping[str, Mapping[str, Any]], seed: int | None = None) -> Table:
@@ -158,6 +158,18 @@ class Checker:
             found.budget = seconds_of(str(value))
 
 
+def table_of_options(texts: Sequence[str], workflow: Workflow) -> Table:
+    """The settings of `--set stage.name=value` for all scenes; each value is still Text, and checked. Raises UsageError."""
+    checked = Settings({stage.name: stage.settings for stage in workflow.stages})
+    found: Table = {}
+    for text in texts:
+        checked.put_option(text)
+        path, _, value = text.partition("=")
+        stage, _, name = path.strip().partition(".")
+        found.setdefault(stage, {})[name] = Text(value.strip())
+    return found
+
+
 def refuse_what_cannot_work(scenes: Sequence[Scene], workflow: Workflow, fleet: Path, what: str) -> None:
     """Raise Mistakes for the scenes whose settings a stage cannot work with (`Stage.check`); those that were begun are left to their runs.
 
@@ -191,7 +203,3 @@ def _why_refused(given: Mapping[str, Mapping[str, Any]], preset: Mapping[str, An
     except UsageError as error:
         return str(error)
     return None
-
-
-def _plain(value: Any) -> Any:
-    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value

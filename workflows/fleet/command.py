@@ -20,10 +20,10 @@ from workflows.cli.options import common_options, device_option, folder_type, js
 from workflows.cli.output import closing, listing, write_json
 from workflows.cli.progress import duration, size
 from workflows.cli.resolve import read_preset, read_toml
-from workflows.fleet.checked import Choice, refuse_what_cannot_work
+from workflows.fleet.checked import Choice, refuse_what_cannot_work, table_of_options
 from workflows.fleet.display import display
 from workflows.fleet.manifest import read_manifest
-from workflows.fleet.options import settings_of
+from workflows.fleet.pages.index import quality_of
 from workflows.fleet.running import Placement, check_fleet_folder, is_running, run_fleet, scenes_to_retry
 from workflows.fleet.sweeps import read_sweeps, swept
 from workflows.fleet.table import BAD_GRADES, overview
@@ -94,7 +94,7 @@ def run(
     check_fleet_folder(folder)
     if preset is not None:
         read_preset(preset, workflow().presets)
-    over = Choice(settings_of(sets, workflow()), preset, seed)
+    over = Choice(table_of_options(sets, workflow()), preset, seed)
     chosen = swept(read_manifest(scenes, workflow(), folder, over=over, roots=roots), read_sweeps(sweeps, workflow()), workflow().stages)
     refuse_what_cannot_work(chosen, workflow(), folder, scenes[0])
     return _run(folder, chosen, as_json=as_json, quiet=quiet, retry=None, **options)
@@ -195,8 +195,8 @@ def _is_bad(scene: SceneState) -> bool:
 
 
 def _line(scene: SceneState) -> str:
-    psnr = scene.metrics.get("asset", {}).get("psnr") if isinstance(scene.metrics.get("asset"), dict) else None
+    psnr = quality_of(scene)["psnr"]
     grade = "" if scene.result is None else f"{printable(scene.result.grade, 10)} result"
-    measures = [size(scene.bytes) if scene.bytes else "", f"{psnr:.2f} dB" if isinstance(psnr, float) else ""]
+    measures = [size(scene.bytes) if scene.bytes else "", f"{psnr:.2f} dB" if psnr is not None else ""]
     parts = [grade, duration(scene.seconds) if scene.seconds else "", *measures]
     return f"{scene.name:<24} {scene.state:<11} {'  '.join(part for part in (*parts, scene.stage or '', scene.reason or '') if part)}".rstrip()

@@ -271,12 +271,8 @@ class _Reader:
             if self.inside is not None and not any(Path(real).is_relative_to(os.path.realpath(root)) for root in self.inside):
                 return f"source: found {shown}, which leads out of {self.inside[0]}; expected a path in it. To allow others: --root FOLDER"
             if os.path.exists(path):
-                return None if os.path.isdir(path) or _is_video(path) else f"source: found the file {shown}, expected a folder or a video."
+                return None if os.path.isdir(path) or is_video(path) else f"source: found the file {shown}, expected a folder or a video."
         except (OSError, ValueError):
             return f"source: found {shown}, which is no path, expected that of a folder or of a video."
         begun = is_scene_name(entry.name) and (self.fleet / entry.name / "run.json").is_file()
         return None if begun else f"source: found {shown}, which does not exist, expected a folder or a video."
-
-
-def _is_video(path: Path) -> bool:
-    return is_video(path)

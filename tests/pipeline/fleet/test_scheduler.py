@@ -222,9 +222,9 @@ def test_who_asks_learns_what_became_of_it(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(requests.time, "monotonic", lambda: float(next(now)))
     monkeypatch.setattr(requests.time, "sleep", lambda seconds: None)
     ended = requests.ask(tmp_path, "retry", ["s0"])
-    assert requests.outcome(ended, lambda: False, 60.0) == "ended"
+    assert requests.outcome(ended, lambda: False) == "ended"
     assert not ended.exists()
-    assert requests.outcome(requests.ask(tmp_path, "retry", ["s0"]), lambda: True, 0.0) == "left"
+    assert requests.outcome(requests.ask(tmp_path, "retry", ["s0"]), lambda: True) == "left"
     requests.ask(tmp_path, "cancel", None)
     assert requests.left(tmp_path) == ["s0"]
     taken = requests.ask(tmp_path, "cancel", ["s0"])

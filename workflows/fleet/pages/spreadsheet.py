@@ -13,24 +13,9 @@ from workflows.fleet.pages.index import quality_of
 
 NAME = "fleet.csv"
 COLUMNS = (
-    "name",
-    "state",
-    "stage",
-    "psnr",
-    "ssim",
-    "seconds",
-    "bytes",
-    "cameras",
-    "result",
-    "warnings",
-    "attempts",
-    "reason",
-    "worker",
-    "run",
-    "sources",
-    "preset",
+    "name", "state", "stage", "psnr", "ssim", "seconds", "bytes", "cameras", "result", "warnings", "attempts", "reason", "worker", "run", "sources", "preset",
     "seed",
-)
+)  # fmt: skip
 _FORMULA = ("=", "+", "-", "@")  # what spreadsheets take for a formula
 
 
