@@ -22,19 +22,15 @@ from pipeline.decide import Decision, survey
 from pipeline.run import Run, cannot_write
 from pipeline.stage import Stage
 from pipeline.text import printable
-from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
 from stages.reports import CameraVerdict, PosesReport
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents
 from workflows.report.documents import Damaged, Metrics, Quality, ResultVerdict
 from workflows.report.signature import write_page
-from workflows.report.summary import against_network, quality_in_words, split_of
+from workflows.report.summary import BAKE, EVALUATE, MESH, POINTS, POSES, RUN, SPLATS, TRAIN, TURNTABLE, against_network, quality_in_words, split_of
 
 NAME = "report.html"
-RUN = Path()  # names are relative to the page
-POSES, TRAIN, BAKE, EVALUATE = PosesOutputs.of_run(RUN), TrainOutputs.of_run(RUN), BakeOutputs.of_run(RUN), EvaluateOutputs.of_run(RUN)
-TURNTABLE, MESH, POINTS, SPLATS = TurntableOutputs.of_run(RUN), MeshOutputs.of_run(RUN), PointsOutputs.of_run(RUN), SplatsOutputs.of_run(RUN)
 VIEWER = RUN / "viewer.html"
 DOWNLOADS = (
     (BAKE.asset, "the baked asset"),

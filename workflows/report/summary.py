@@ -17,27 +17,15 @@ from workflows.report import documents
 from workflows.report.documents import Metrics, ResultProblem, ResultVerdict
 
 RUN = Path()
+POSES, TRAIN, BAKE, EVALUATE = PosesOutputs.of_run(RUN), TrainOutputs.of_run(RUN), BakeOutputs.of_run(RUN), EvaluateOutputs.of_run(RUN)
+TURNTABLE, MESH, POINTS, SPLATS = TurntableOutputs.of_run(RUN), MeshOutputs.of_run(RUN), PointsOutputs.of_run(RUN), SplatsOutputs.of_run(RUN)
 # The files of a run that a user wants.
 ARTIFACTS = {
-    "scene": PosesOutputs.of_run(RUN).scene,
-    "field": TrainOutputs.of_run(RUN).field,
-    "asset": BakeOutputs.of_run(RUN).asset,
-    "metrics": EvaluateOutputs.of_run(RUN).metrics,
-    "verdict": EvaluateOutputs.of_run(RUN).verdict,
-    "captured_path": EvaluateOutputs.of_run(RUN).captured_path,
-    "strip_worst": EvaluateOutputs.of_run(RUN).strip_worst,
-    "strip_median": EvaluateOutputs.of_run(RUN).strip_median,
-    "strip_best": EvaluateOutputs.of_run(RUN).strip_best,
-    "turntable": TurntableOutputs.of_run(RUN).video,
-    "mesh_glb": MeshOutputs.of_run(RUN).glb,
-    "mesh_obj": MeshOutputs.of_run(RUN).obj,
-    "mesh_ply": MeshOutputs.of_run(RUN).ply,
-    "points": PointsOutputs.of_run(RUN).ply,
-    "splats_ply": SplatsOutputs.of_run(RUN).ply,
-    "splats_spz": SplatsOutputs.of_run(RUN).spz,
-    "report": RUN / "report.html",
-    "viewer": RUN / "viewer.html",
-}
+    "scene": POSES.scene, "field": TRAIN.field, "asset": BAKE.asset, "metrics": EVALUATE.metrics, "verdict": EVALUATE.verdict,
+    "captured_path": EVALUATE.captured_path, "strip_worst": EVALUATE.strip_worst, "strip_median": EVALUATE.strip_median, "strip_best": EVALUATE.strip_best,
+    "turntable": TURNTABLE.video, "mesh_glb": MESH.glb, "mesh_obj": MESH.obj, "mesh_ply": MESH.ply, "points": POINTS.ply, "splats_ply": SPLATS.ply,
+    "splats_spz": SPLATS.spz, "report": RUN / "report.html", "viewer": RUN / "viewer.html",
+}  # fmt: skip
 TITLES = {
     "asset": "asset", "captured_path": "video", "strip_worst": "strip", "turntable": "turntable", "mesh_glb": "mesh", "mesh_obj": "mesh", "mesh_ply": "mesh",
     "points": "points", "splats_ply": "splats", "splats_spz": "splats", "report": "report", "viewer": "viewer",
