@@ -74,8 +74,8 @@ def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]
     words = f"{len(positions)} of {len(capture.photos)} photographs have a GPS position, {distance:.2g} m from the cameras found in the median"
     if distance > UP * extent or straight:
         scaled = Similarity(aligned.scale, np.eye(3), np.zeros(3))
-        return _moved(_with(capture, gps=structs.replace(found, used="scale")), scaled), f"{words}: the scale is taken from them."
-    moved = replace(_moved(capture, aligned), up=np.array([0.0, 0.0, 1.0]))
+        return in_metres(_with(capture, gps=structs.replace(found, used="scale")), scaled), f"{words}: the scale is taken from them."
+    moved = replace(in_metres(capture, aligned), up=np.array([0.0, 0.0, 1.0]))
     return _with(moved, gps=structs.replace(found, used="scale and up")), f"{words}: scale and upward axis are taken from them."
 
 
@@ -93,7 +93,7 @@ def with_stated_cameras(capture: Capture, stated: Capture) -> tuple[Capture, str
         return _with(capture, stated_cameras=found), f"{words}, but not where they were found ({share} apart in the median): they are not used."
     if straight:
         return _with(capture, stated_cameras=found), f"{words}, along a line, which they may turn about: they are not used."
-    moved = replace(_moved(capture, aligned), up=stated.up, metric=stated.metric)
+    moved = replace(in_metres(capture, aligned), up=stated.up, metric=stated.metric)
     moved = _with(moved, stated_cameras=structs.replace(found, used="frame"))
     return moved, f"{words}: their frame and scale are kept, {distance / extent:.2%} of their extent apart."
 
@@ -109,10 +109,15 @@ def _aligned(capture: Capture, names: Sequence[str], places: np.ndarray) -> tupl
     return aligned, distance, float(np.linalg.norm(spread)), bool(spread[1] < FLAT * spread[0])
 
 
-def _moved(capture: Capture, similarity: Similarity) -> Capture:
-    photos = tuple(replace(photo, camera=similarity.camera(photo.camera)) for photo in capture.photos)
+def in_metres(capture: Capture, similarity: Similarity) -> Capture:
+    """The capture in the frame that the similarity leads to, whose unit is a metre; of one with bounds it only scales."""
+    k = similarity.scale
+    photos = tuple(
+        replace(photo, camera=similarity.camera(photo.camera), near=photo.near and k * photo.near, far=photo.far and k * photo.far) for photo in capture.photos
+    )
     points = capture.points and replace(capture.points, xyz=similarity.points(capture.points.xyz))
-    return replace(capture, photos=photos, points=points, metric=True)
+    bounds = None if capture.bounds is None else similarity.points(capture.bounds)
+    return replace(capture, photos=photos, points=points, bounds=bounds, metric=True)
 
 
 def _with(capture: Capture, **known: Alignment) -> Capture:

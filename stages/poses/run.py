@@ -27,6 +27,7 @@ from stages.figures.contact_sheet import write_contact_sheet
 from stages.formats import importers
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
 from stages.framing import training_frame
+from stages.framing.markers import with_markers
 from stages.framing.mask_use import MaskUse, doubts, find_mask_use, points_of_object, without_silhouette
 from stages.io import working_images
 from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
@@ -59,6 +60,8 @@ def run(job: Job) -> None:
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
     refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
+    if settings.marker_size != "off":
+        capture = with_markers(job, capture, settings.marker_size, warn)
     capture, use = with_mask_use(job, capture, reader, warn)
     capture, written = _write_images(job, capture, warn)
     judged = capture  # by all sparse points that its cameras were found with

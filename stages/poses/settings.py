@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, PositiveInt, resolved, setting
+from efficientnerf.settings import Auto, Off, PositiveInt, resolved, setting
 from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
 from stages.formats import importers
@@ -101,6 +101,12 @@ class PosesSettings:
     )
     feature_image_size: Annotated[int, Meta(ge=320, le=8192)] = setting(
         1600, "Longest side of the images in which features are detected.", unit="pixels", advanced=True
+    )
+    marker_size: Annotated[float, Meta(ge=1e-3, le=100.0)] | Off = setting(
+        "off",
+        "Length of the black edges of ArUco or AprilTag markers in the scene, which gives lengths in metres; off: none are looked for.",
+        unit="metres",
+        advanced=True,
     )
     seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = setting(0, "Seed of all random choices in finding cameras.", advanced=True)
 

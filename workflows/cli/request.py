@@ -17,7 +17,7 @@ from pipeline.stage import Stage
 from stages.video import KNOWN, SUFFIXES
 from workflows.budget import share_budget, train_share
 from workflows.cli.device import has_cuda
-from workflows.cli.resolve import Config, Settings, Table, read_config, read_preset, seconds_of, table_of
+from workflows.cli.resolve import Config, Settings, Table, metres_of, read_config, read_preset, seconds_of, table_of
 from workflows.cli.target import open_run, resume_command
 from workflows.workflow import Workflow
 
@@ -45,6 +45,7 @@ class Options:
     target_mib: float | None = None
     frames: int | None = None
     lens: str | None = None
+    marker_size: str | None = None
     mask_from: str | None = None
     mask_model: str | None = None
     features_model: tuple[str, str] | None = None
@@ -175,6 +176,7 @@ def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:
         ("strict", options.strict or None, "--strict"),
         ("frames", options.frames, f"--frames {options.frames}"),
         ("lens", options.lens, f"--lens {options.lens}"),
+        ("marker_size", options.marker_size and metres_of(options.marker_size), f"--marker-size {options.marker_size}"),
         ("allow_outside", options.allow_outside or None, "--allow-outside"),
     )
 

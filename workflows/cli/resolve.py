@@ -165,6 +165,14 @@ def seconds_of(text: str) -> float:
     return 3600 * hours + 60 * minutes + seconds
 
 
+def metres_of(text: str) -> float:
+    """Metres in `50mm`, `5cm`, `0.05m` or `2in`. Raises UsageError."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?(mm|cm|m|in)", text.strip())
+    if found is None:
+        raise UsageError(f"--marker-size {printable(text, MAX_SHOWN)}: expected a length with its unit, as in 50mm, 5cm, 0.05m or 2in.")
+    return float(found[1]) * {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}[found[2]]
+
+
 class Settings:
     """Builder of the settings of all stages; every value is checked when it is put.
 

@@ -59,6 +59,8 @@ GRADED = 6  # exit code of a run whose result is graded as --fail-on says
               help="Match photographs that get no camera otherwise with these networks, ONNX files of ALIKED and LightGlue; sets poses.features_model and"
               " poses.matcher_model.")  # fmt: skip
 @click.option("--lens", metavar="LENS", help="fisheye, or equirectangular (360 degrees); sets poses.lens. Detected from metadata by default.")
+@click.option("--marker-size", metavar="LENGTH",
+              help="Edge of printed ArUco or AprilTag markers (their black square), as 50mm, 5cm or 2in: gives metres; sets poses.marker_size.")  # fmt: skip
 @click.option("--strict", is_flag=True, help="Refuse a source with missing, unreadable or unregistered images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
 @click.option("--fail-on", type=click.Choice(["poor", "failed"]), help="Exit with code 6 if the result has this grade or worse; all files are still written.")

@@ -15,7 +15,7 @@ from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from pipeline.run import Run
 from pipeline.runner import refuse_what_cannot_work
 from workflows.asset import STAGES
-from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
+from workflows.cli.resolve import Settings, metres_of, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
 
 @dataclass(frozen=True)
@@ -145,3 +145,11 @@ def test_the_preset_whose_field_cannot_be_baked_is_refused_where_it_would_be(tmp
         with pytest.raises(UsageError, match=next(iter(settings)) if name == "other" else "baked"):
             refuse_what_cannot_work(STAGES, run)
         refuse_what_cannot_work(STAGES[:fine], run)
+
+
+@pytest.mark.parametrize(("text", "metres"), [("50mm", 0.05), ("5cm", 0.05), ("0.05m", 0.05), ("2 in", 0.0508)])
+def test_lengths_have_a_unit(text: str, metres: float) -> None:
+    assert metres_of(text) == pytest.approx(metres, rel=1e-12)
+    for other in ("50", "mm", "-5cm", "5 ft", ""):
+        with pytest.raises(UsageError, match="expected a length with its unit"):
+            metres_of(other)

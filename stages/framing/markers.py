@@ -1,0 +1,150 @@
+"""Metres by printed markers (ArUco, AprilTag) whose edges are of known length, found in the photographs at full size.
+
+OpenCV finds them; its corners are up to two pixels off where a picture is blurred. They are found again as where lines through the four edges meet: an edge is
+where half of the light between inside and outside is reached, of light that is linear, so that blur does not move it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from efficientnerf.capture.markers import MIN_VIEWS, SquareFit, common_length, common_normal, fit_square
+from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.rendering.colour import linear_from_srgb
+from pipeline.errors import BadInput
+from pipeline.stage import Job
+from stages.cores import count_cores, in_order
+from stages.framing.gps import in_metres
+from stages.framing.training_frame import estimated_up
+from stages.io.capture import Capture, Photo
+from stages.io.photo import read_photo
+from stages.io.pictures import MAX_SIDE, UnreadableImage
+from stages.poses.memory import reading_threads
+
+DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "ARUCO_MIP_36h12", "APRILTAG_25h9", "APRILTAG_36h11")
+WINDOW, NARROWEST, WIDEST = 0.08, 2.0, 8.0  # to both sides of an edge: share of its length, and pixels
+LARGEST_ERROR = 0.03  # of a length: what is less sure is no scale
+TILT = 30.0  # degrees from the upward axis that the cameras suggest, up to which markers are taken to lie on the ground
+MIN_CONTRAST = 0.02  # of linear light between inside and outside of an edge
+Seen = dict[tuple[str, int], np.ndarray]  # dictionary and number of a marker -> (4, 2) its corners
+
+
+def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], None]) -> Capture:
+    """The capture in metres, by markers with edges of `size` metres; as it is, with a warning, where none are found. Raises BadInput where they disagree."""
+    views = _by_marker(job, capture)
+    if not views:
+        warn(f"no marker is seen by {MIN_VIEWS} photographs: lengths are in no unit. Dictionaries tried: {', '.join(DICTIONARIES)}.")
+        return capture
+    fits = {number: fit_square([photo.camera for photo, _ in seen], np.stack([corners for _, corners in seen])) for number, seen in views.items()}
+    still = {number: fit for number, fit in fits.items() if fit.still}
+    moved = sorted(fits.keys() - still.keys())
+    if len(still) <= len(moved):
+        raise BadInput(f"{job.source}: markers {_listed(moved)} are not where other photographs see them: they moved, a number was printed twice, or {_ANYWAY}")
+    length, error, excess = common_length([*still.values()])
+    if excess > 3 and max(abs(fit.square.scale / length - 1) for fit in still.values()) > LARGEST_ERROR:
+        lengths = ", ".join(f"{number}: {fit.square.scale / length * size:.4g} m" for number, fit in sorted(still.items()))
+        raise BadInput(f"{job.source}: markers differ in size ({lengths}): they are not all of one size, they moved, or {_ANYWAY}")
+    if error > LARGEST_ERROR:
+        warn(f"markers give lengths within {error:.0%} only, and are not used. Photograph them larger, and from more sides.")
+        return capture
+    if moved:
+        warn(f"markers {_listed(moved)} moved, or their number was printed twice; they are not used.")
+    up = _up(capture, [*still.values()])
+    facts = {"used": sorted(still), "moved": moved, "size": size, "error": error, "up": up is not None}
+    job.say(f"{len(still)} markers give the scale, within {error:.2g} of each length (99 %){'' if up is None else ', and the upward axis'}.")
+    scaled = in_metres(capture if up is None else replace(capture, up=up), Similarity(size / length, np.eye(3), np.zeros(3)))
+    return replace(scaled, facts=scaled.facts | {"markers": facts})
+
+
+_LINEAR = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
+_ANYWAY = "the cameras are wrong. Without --marker-size (poses.marker_size=off) they are not looked for."
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers))
+
+
+def _by_marker(job: Job, capture: Capture) -> dict[int, list[tuple[Photo, np.ndarray]]]:
+    """Photographs and corners of each marker that enough of them see, of the dictionary that is seen most."""
+    sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
+    threads = reading_threads(job, sizes, count_cores())
+    found = []
+    for index, seen in enumerate(in_order(_markers_of, capture.photos, threads, job.safe_point)):
+        job.progress(index + 1, len(sizes), "finding markers")
+        found.append(seen)
+    often = Counter(itertools.chain.from_iterable(found))
+    kept = {key: count for key, count in often.items() if count >= MIN_VIEWS}
+    totals = {name: sum(count for (own, _), count in kept.items() if own == name) for name in DICTIONARIES}
+    best = max(DICTIONARIES, key=lambda name: totals[name])  # the first of equals
+    return {
+        number: [(photo, seen[name, number]) for photo, seen in zip(capture.photos, found, strict=True) if (name, number) in seen]
+        for name, number in sorted(kept)
+        if name == best
+    }
+
+
+def _markers_of(photo: Photo) -> Seen:
+    try:
+        rgb = read_photo(photo.image, MAX_SIDE).rgb
+    except UnreadableImage:  # reported where it is needed
+        return {}
+    if rgb.shape[:2] != (photo.camera.height, photo.camera.width):
+        return {}
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    light = _LINEAR[grey]
+    found: Seen = {}
+    for name in DICTIONARIES:
+        corners, numbers, _ = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))).detectMarkers(grey)
+        for place, number in zip(corners, [] if numbers is None else numbers.ravel().tolist(), strict=True):
+            exact = refined(light, place.reshape(4, 2).astype(np.float64))
+            if exact is not None:
+                found[name, number] = exact + 0.5  # OpenCV's centres are integers
+    return found
+
+
+def refined(light: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+    """(4, 2) corners of a dark square on a light ground where the lines through its edges meet; None where there are no edges.
+
+    light  (H, W) float32, linear; corners (4, 2) clockwise, centres of pixels at integers
+    """
+    for _ in range(3):
+        lines = []
+        for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            length = float(np.linalg.norm(end - start))
+            along = (end - start) / max(length, 1e-9)
+            out = np.array([along[1], -along[0]])
+            reach = float(np.clip(WINDOW * length, NARROWEST, WIDEST))
+            u = np.linspace(0.12, 0.88, int(np.clip(0.8 * length, 8, 200))) * length
+            v = np.linspace(-reach, reach, int(np.ceil(4 * reach)) + 1)
+            at = (start + u[:, None, None] * along + v[None, :, None] * out).astype(np.float32)
+            rise = np.diff(cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR), axis=1)
+            whole = rise.sum(1)
+            weight = np.maximum(whole, 0.0)
+            if np.median(weight) < MIN_CONTRAST:
+                return None
+            edge = np.clip((rise * (v[1:] + v[:-1]) / 2).sum(1) / np.maximum(whole, MIN_CONTRAST), -reach, reach)
+            basis, used = np.stack([np.ones_like(u), u], 1), weight
+            for _ in range(5):
+                line = np.linalg.lstsq(basis * np.sqrt(used)[:, None], edge * np.sqrt(used), rcond=None)[0]
+                off = np.abs(edge - basis @ line)
+                used = weight / (1 + (off / max(2 * float(np.median(off)), 1e-3)) ** 2)
+            lines.append((start + line[0] * out, along + line[1] * out))
+        matrices = np.stack([np.stack([lines[k - 1][1], -lines[k][1]], 1) for k in range(4)])
+        if np.abs(np.linalg.det(matrices)).min() < 0.05:
+            return None
+        corners = np.stack([lines[k - 1][0] + np.linalg.solve(matrices[k], lines[k][0] - lines[k - 1][0])[0] * lines[k - 1][1] for k in range(4)])
+    return corners
+
+
+def _up(capture: Capture, fits: list[SquareFit]) -> np.ndarray | None:
+    """The normal of the markers' plane where nothing states up, and they lie on the ground."""
+    normal = common_normal(fits)
+    if capture.up is not None or normal is None:
+        return None
+    return normal if normal @ estimated_up([photo.camera for photo in capture.photos]) > np.cos(np.radians(TILT)) else None

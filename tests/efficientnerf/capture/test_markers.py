@@ -1,0 +1,90 @@
+"""Edges of square markers by known cameras: exact without noise, within the stated error with it, and no place for what moves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from efficientnerf.capture.markers import SQUARE, common_length, common_normal, fit_square
+from efficientnerf.geometry.cameras import Camera, Similarity, project
+
+
+def cameras_round(count: int, rng: np.random.Generator, model: str = "OPENCV") -> list[Camera]:
+    found = []
+    for index, angle in enumerate(np.linspace(0.0, 2.5, count)):
+        centre = np.array([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(1.5, 2.5)])
+        forward = -centre / np.linalg.norm(centre)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
+        params = (1500.0, 1510.0, 800.0, 600.0, -0.1, 0.02, 1e-3, -1e-3) if model == "OPENCV" else (1500.0, 1500.0, 800.0, 600.0, 0.01, 0.0, 0.0, 0.0)
+        found.append(Camera(f"{index}.png", 1600, 1200, model, params, pose))
+    return found
+
+
+def square_at(place: tuple[float, float, float], edge: float = 0.12, turn: float = 0.3) -> Similarity:
+    cos, sin = np.cos(turn), np.sin(turn)
+    return Similarity(edge, np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array(place))
+
+
+def seen(cameras: list[Camera], square: Similarity, rng: np.random.Generator, noise: float) -> np.ndarray:
+    points = square.points(SQUARE)
+    return np.stack([project(camera, points)[0] for camera in cameras]) + noise * rng.normal(size=(len(cameras), 4, 2))
+
+
+def test_a_square_is_found_exactly_through_any_lens() -> None:
+    rng = np.random.default_rng(0)
+    for model in ("OPENCV", "OPENCV_FISHEYE"):
+        cameras = cameras_round(6, rng, model)
+        square = square_at((0.1, 0.2, 0.0))
+        fit = fit_square(cameras, seen(cameras, square, rng, 0.0))
+        assert fit.still
+        assert abs(fit.square.scale / square.scale - 1) < 1e-6
+        np.testing.assert_allclose(fit.corners, square.points(SQUARE), atol=1e-6)
+
+
+def test_the_true_length_lies_within_the_stated_error() -> None:
+    outside, errors = 0, []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        cameras = cameras_round(int(rng.integers(3, 9)), rng)
+        squares = [square_at((x, rng.uniform(-0.5, 0.5), 0.0), turn=rng.uniform(0, 6)) for x in np.linspace(-0.4, 0.4, int(rng.integers(1, 5)))]
+        length, error, _ = common_length([fit_square(cameras, seen(cameras, square, rng, 0.5)) for square in squares])
+        errors.append(abs(length / 0.12 - 1))
+        outside += errors[-1] > error
+    assert outside < 5, outside
+    assert np.median(errors) < 0.005
+
+
+def test_few_wrong_views_are_left_out_and_what_moves_is_not_still() -> None:
+    rng = np.random.default_rng(1)
+    cameras = cameras_round(10, rng)
+    here, there = (seen(cameras, square_at((x, 0.0, 0.0)), rng, 0.2) for x in (0.0, 0.3))
+    few, half = here.copy(), here.copy()
+    few[[2, 7]], half[5:] = there[[2, 7]], there[5:]
+    fit = fit_square(cameras, few)
+    assert fit.still
+    assert fit.agrees.sum() == 8
+    assert abs(fit.square.scale / 0.12 - 1) < 0.005
+    assert not fit_square(cameras, half).still
+
+
+def test_markers_of_two_sizes_are_farther_apart_than_their_errors() -> None:
+    rng = np.random.default_rng(2)
+    cameras = cameras_round(8, rng)
+    fits = [fit_square(cameras, seen(cameras, square_at((x, 0.0, 0.0), edge), rng, 0.2)) for x, edge in ((-0.3, 0.12), (0.0, 0.12), (0.3, 0.15))]
+    assert common_length(fits)[2] > 10
+    assert common_length(fits[:2])[2] < 3
+
+
+def test_markers_in_a_plane_have_its_normal() -> None:
+    rng = np.random.default_rng(3)
+    cameras = cameras_round(8, rng)
+    places = [(-0.4, -0.3, 0.0), (0.4, -0.3, 0.0), (0.0, 0.4, 0.0)]
+    fits = [fit_square(cameras, seen(cameras, square_at(place), rng, 0.2)) for place in places]
+    normal = common_normal(fits)
+    assert normal is not None
+    assert normal[2] > np.cos(np.radians(1.0))
+    assert common_normal(fits[:2]) is None
+    raised = fit_square(cameras, seen(cameras, square_at((0.3, 0.4, 0.3)), rng, 0.2))
+    assert common_normal([*fits, raised]) is None
