@@ -28,7 +28,7 @@ from stages.io.pictures import MAX_SIDE, UnreadableImage
 from stages.poses.memory import reading_threads
 
 DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "ARUCO_MIP_36h12", "APRILTAG_25h9", "APRILTAG_36h11")
-WINDOW, NARROWEST, WIDEST = 0.08, 2.0, 8.0  # to both sides of an edge: share of its length, and pixels
+WINDOW, NARROWEST, WIDEST = 0.05, 1.5, 8.0  # to both sides of an edge: share of its length, and pixels
 LARGEST_ERROR = 0.03  # of a length: what is less sure is no scale
 TILT = 30.0  # degrees from the upward axis that the cameras suggest, up to which markers are taken to lie on the ground
 MIN_CONTRAST = 0.02  # of linear light between inside and outside of an edge
@@ -99,12 +99,14 @@ def _markers_of(photo: Photo) -> Seen:
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     light = _LINEAR[grey]
     found: Seen = {}
-    for name in DICTIONARIES:
-        corners, numbers, _ = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))).detectMarkers(grey)
-        for place, number in zip(corners, [] if numbers is None else numbers.ravel().tolist(), strict=True):
-            exact = refined(light, place.reshape(4, 2).astype(np.float64))
-            if exact is not None:
-                found[name, number] = exact + 0.5  # OpenCV's centres are integers
+    dictionaries = [cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}")) for name in DICTIONARIES]
+    corners, numbers, _, which = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters()).detectMarkersMultiDict(grey)
+    if numbers is None:
+        return {}
+    for place, number, index in zip(corners, numbers.ravel().tolist(), which.ravel().tolist(), strict=True):
+        exact = refined(light, place.reshape(4, 2).astype(np.float64))
+        if exact is not None:
+            found[DICTIONARIES[index], number] = exact + 0.5  # OpenCV's centres are integers
     return found
 
 
@@ -113,7 +115,7 @@ def refined(light: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
 
     light  (H, W) float32, linear; corners (4, 2) clockwise, centres of pixels at integers
     """
-    for _ in range(3):
+    for _ in range(8):
         lines = []
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             length = float(np.linalg.norm(end - start))

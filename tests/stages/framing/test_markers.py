@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from efficientnerf.rendering.colour import srgb_from_linear
 from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.framing.markers import with_markers
-from stages.io.capture import Capture, Photo
+from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.png import write_png
 from stages.poses.settings import PosesSettings
 
@@ -41,7 +42,9 @@ def cameras() -> list[Camera]:
     return found
 
 
-def capture_of(folder: Path, dictionary: str = "APRILTAG_36h11", moving: tuple[int, ...] = (), sizes: tuple[float, ...] = (1, 1, 1, 1)) -> Capture:
+def capture_of(
+    folder: Path, dictionary: str = "APRILTAG_36h11", moving: tuple[int, ...] = (), sizes: tuple[float, ...] = (1, 1, 1, 1), blur: float = 0.8
+) -> Capture:
     rng = np.random.default_rng(0)
     side = np.cross(TRUE_UP, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
@@ -61,7 +64,7 @@ def capture_of(folder: Path, dictionary: str = "APRILTAG_36h11", moving: tuple[i
             printed = cv2.warpPerspective(drawn, matrix, light.shape[::-1])
             cover = cv2.warpPerspective(np.ones_like(drawn), matrix, light.shape[::-1])
             light = np.where(cover > 0.99, printed, light)
-        light = cv2.GaussianBlur(cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), (0, 0), 0.8)
+        light = cv2.GaussianBlur(cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), (0, 0), blur)
         grey = np.clip(np.rint(255 * srgb_from_linear(light) + rng.normal(0, 2, light.shape)), 0, 255).astype(np.uint8)
         write_png(np.dstack([grey] * 3), folder / camera.name)
         photos.append(Photo(camera, folder / camera.name))
@@ -75,9 +78,11 @@ def measured(folder: Path, capture: Capture) -> tuple[Capture, list[str]]:
     return with_markers(job, capture, EDGE, said.append), said
 
 
-@pytest.mark.parametrize("dictionary", ["APRILTAG_36h11", "4X4_50"])
-def test_markers_give_metres_and_up(tmp_path: Path, dictionary: str) -> None:
-    capture = capture_of(tmp_path, dictionary)
+@pytest.mark.parametrize(("dictionary", "blur"), [("APRILTAG_36h11", 0.5), ("APRILTAG_36h11", 2.0), ("4X4_50", 1.2)])
+def test_markers_give_metres_and_up(tmp_path: Path, dictionary: str, blur: float) -> None:
+    points = SparsePoints(np.ones((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), ())
+    capture = replace(capture_of(tmp_path, dictionary, blur=blur), points=points, bounds=np.array([[-1.0] * 3, [1.0] * 3]))
+    capture = replace(capture, photos=tuple(replace(photo, near=1.0, far=None) for photo in capture.photos))
     found, said = measured(tmp_path, capture)
     facts: Any = found.facts["markers"]
     ratio = np.linalg.norm(found.photos[0].camera.centre) / np.linalg.norm(capture.photos[0].camera.centre) / UNIT
@@ -85,6 +90,9 @@ def test_markers_give_metres_and_up(tmp_path: Path, dictionary: str) -> None:
     assert said == []
     assert facts["used"] == [0, 1, 2, 3]
     assert abs(ratio - 1) < min(0.005, facts["error"])
+    assert found.points is not None
+    assert found.bounds is not None
+    np.testing.assert_allclose([found.points.xyz[0, 0], found.bounds[1, 2], found.photos[0].near], ratio * UNIT, rtol=1e-9)
     assert found.up is not None
     assert found.up @ TRUE_UP > np.cos(np.radians(1.0))
 
