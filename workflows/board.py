@@ -21,7 +21,7 @@ from workflows.destination import check_files, writing
 @force_option
 @common_options
 def board(path: Path, paper: str, marker_size: str, force: bool) -> None:
-    """Write a sheet of markers to print. Photograph the subject beside it, and give `enerf run` the same --marker-size: lengths are in metres then."""
+    """Write a sheet of markers to print. Photograph it next to the subject. `enerf run` with the same --marker-size gives lengths in metres."""
     if path.suffix.lower() not in (".pdf", ".png"):
         raise UsageError(f"--out {path}: expected a file that ends in .pdf or .png.")
     check_files([path], force=force)

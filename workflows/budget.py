@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from efficientnerf.settings import Auto
 from pipeline.errors import PipelineError
 from stages.formats.importers import detect
 from stages.formats.importers.photographs import is_video, photographs
-from stages.formats.importers.source import Source
+from stages.formats.importers.source import ImportSettings, Source
 from stages.io.photo import working_size
 from stages.io.pictures import UnreadableImage, read_header
 
@@ -22,15 +21,11 @@ WITHOUT_SURROUNDINGS = ("blender", "llff")  # formats of objects before a consta
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
 
 
-class PosesSettings(Protocol):
+class PosesSettings(ImportSettings, Protocol):
     """Settings of the stage poses that the share follows."""
 
     @property
     def format(self) -> str: ...
-    @property
-    def allow_outside(self) -> bool: ...
-    @property
-    def llff_factor(self) -> int | Auto: ...
     @property
     def max_image_size(self) -> int: ...
 

@@ -1,4 +1,4 @@
-"""A sheet of markers to print and lay beside the subject, with a ruler that shows whether the printer scaled it."""
+"""A sheet of markers to print and lay next to the subject, with a ruler that shows whether the printer scaled it."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def _draw_foot(draw: ImageDraw.ImageDraw, top: float, size: float) -> None:
         if mm % 10 == 0:
             draw.text((x, _px(top + 6.5)), f"{mm}" if mm < RULER else f"{mm} mm", fill=0, font=font, anchor="ma")
     lines = (
-        f"Print at 100 % (not \"fit to page\"). The ruler shall measure {RULER} mm; if not, measure a black edge and give that length.",
-        "Keep the sheet flat and still beside the subject, and leave it in the pictures from all sides.",
+        f"Print at 100 % (not \"fit to page\"). The ruler must measure {RULER} mm; if not, measure a black edge and give that length.",
+        "Keep the sheet flat and still next to the subject, and leave it in the pictures from all sides.",
         f"enerf run PHOTOS --out RUN --marker-size {size:g}mm          {DICTIONARY}",
     )
     for number, line in enumerate(lines):
