@@ -9,6 +9,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 
+MIN_CONVERGENCE = 0.03  # mean squared sine of the angles between view axes and their mean (10 degrees), below which they do not meet in a point
 WIDEST_GAP, GAP_STEPS = 75.0, 2.5  # degrees between neighbouring cameras, or so many times their mean angle: with a wider gap they do not go round
 
 
@@ -54,11 +55,11 @@ def coverage(centres: np.ndarray, target: np.ndarray) -> Coverage:
 
 
 def meeting_point(cameras: Sequence[Camera]) -> tuple[np.ndarray, bool]:
-    """The point (3,) nearest to all view axes, and whether they meet there, before the cameras and from different sides."""
+    """The point (3,) nearest to all view axes, by robust least squares, and whether they meet there, before the cameras and from different sides."""
     centres, forward = np.array([camera.centre for camera in cameras]), np.array([camera.forward for camera in cameras])
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (C, 3, 3)
     point = centres.mean(axis=0)
-    if np.linalg.eigvalsh(across.mean(axis=0))[0] < 0.03:  # about 10 degrees apart
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] <= MIN_CONVERGENCE:
         return point, False
     weight = np.ones(len(cameras))
     for _ in range(20):

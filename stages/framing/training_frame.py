@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from efficientnerf.capture.coverage import meeting_point
 from efficientnerf.capture.forward_facing import ForwardFacing, detect_forward_facing
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from pipeline.errors import BadInput
@@ -21,7 +22,6 @@ from stages.io.reader import PhotoReader
 from stages.io.scene import Orbit
 
 UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
-MIN_CONVERGENCE = 0.03  # mean squared sine of the angles between view axes and their mean (10 degrees), below which they do not meet in a point
 FRONT_AZIMUTH = -90.0  # degrees, of the mean camera in captures whose frame means nothing: it looks along +y, as front views do
 
 
@@ -165,22 +165,11 @@ def focus_point(capture: Capture) -> tuple[np.ndarray, bool]:
     else at four times the cameras' mean distance from their centre).
     """
     cameras = [photo.camera for photo in capture.photos]
+    point, meeting = meeting_point(cameras)
+    if meeting:
+        return point, True
     centres = np.array([camera.centre for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (C, 3, 3)
-    weight = np.ones(len(cameras))
-    point = centres.mean(0)
-    scatter = np.linalg.eigvalsh(across.mean(0))[0]
-    if scatter > MIN_CONVERGENCE:
-        for _ in range(20):
-            matrix = (weight[:, None, None] * across).sum(0)
-            point = np.linalg.solve(matrix, (weight[:, None, None] * across @ centres[:, :, None]).sum(0)[:, 0])
-            miss = np.linalg.norm((across @ (point - centres)[:, :, None])[:, :, 0], axis=1)
-            weight = 1.0 / (1.0 + (miss / max(float(np.median(miss)), 1e-12)) ** 2)
-        ahead = ((point - centres) * forward).sum(1)
-        close = np.median(miss) < 0.5 * np.median(np.linalg.norm(point - centres, axis=1))
-        if (ahead > 0).mean() >= 0.8 and close:
-            return point, True
     mean_forward = forward.mean(0)
     middle = int(np.argmin(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     if np.linalg.norm(mean_forward) < 0.3:  # looking outwards, all round

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from efficientnerf.capture.coverage import meeting_point
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.geometry.spaces import Space
 from stages.framing.scene_bounds import in_view
@@ -35,6 +36,8 @@ MASK_SIZE = 256  # px, longest side of the masks that are looked at
 BLOCK = 8  # density voxels along a side of the blocks that no view shows
 COARSE = 32  # px, longest side of the masks that find such blocks: a pixel and its neighbours are wider than the points of a block are apart
 CLEARANCE = 0.8  # of the near plane's distance: how far from the cameras' path nothing is. docs/experiments/near-cameras.md
+REACH = 0.5  # of the way to where the cameras' axes meet, that a camera's near plane is taken to lie at most
+STRAY = 0.5  # of the cameras' median distance from there: one that is nearer stands in the subject, or shows a detail of it
 NEIGHBOURS = 8  # of a camera that its path leads to, where they are within twice the near plane's distance
 BEFORE_VIEWS = 2  # that must have a voxel before their near planes, or a quarter of the cameras (rounded up) if that is less
 MAX_CONTRADICTED = 0.03  # of the reliable sparse points, that a rule may declare empty: more refute it. docs/priors.md
@@ -189,8 +192,16 @@ def close_to_path(
     """(N,) bool: which points (N, 3) lie within `clearance` times the near plane's distance of a camera, or of the way to one of its nearest neighbours.
 
     filled  (F, 3) reliable sparse points: a camera that has more than MAX_CONTRADICTED of them so close stands where it cannot, and keeps nothing clear
+
+    Where the cameras' axes meet in a point, none keeps the middle of the others' pictures clear (REACH), and one that strays there nothing (STRAY).
     """
     centres, plane = np.array([camera.centre for camera in cameras]), np.asarray(near, np.float64)
+    middle, meeting = meeting_point(cameras)
+    if meeting:
+        distance = np.linalg.norm(centres - middle, axis=1)
+        plane = np.minimum(plane, REACH * distance)
+        stands = distance >= STRAY * np.median(distance)
+        centres, plane = centres[stands], plane[stands]
     if filled is not None and len(filled):
         within = cKDTree(filled).query_ball_point(centres, clearance * plane, return_length=True)
         stands = within <= MAX_CONTRADICTED * len(filled)
