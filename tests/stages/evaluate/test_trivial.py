@@ -29,7 +29,7 @@ def test_a_blur_is_that_of_a_gaussian(deviation: float) -> None:
         kernel = np.exp(-0.5 * (away / deviation) ** 2)
         return kernel / kernel.sum(1, keepdims=True)
 
-    expected = np.einsum("ik,klc,jl->ijc", matrix(90), reflected, matrix(120))
+    expected = np.einsum("ik,klc,jl->ijc", matrix(90), reflected, matrix(120), optimize=True)
     assert np.abs(blurred(picture, deviation) - expected).max() < 0.02
     assert np.sqrt(np.square(blurred(picture, deviation) - expected).mean()) < 0.004
 

@@ -14,7 +14,7 @@ import pytest
 from efficientnerf.asset.format import FormatError, load, serialize
 from efficientnerf.asset.region import foreground
 from efficientnerf.asset.rendering import render
-from stages.viewer.page import PART, viewer_page
+from stages.viewer.page import viewer_page
 from tests.efficientnerf.hostile import HOSTILE
 from tests.efficientnerf.trees import random_tree
 from tests.stages.viewer import browser
@@ -139,12 +139,19 @@ def test_a_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> No
         assert page.console == []
 
 
-def test_a_large_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> None:
-    """Of several parts of data, cut short or altered anywhere: the asset in it, or the page itself."""
-    good = serialize(random_tree(1, shape=(20, 20, 20), brick=4, degree=2, share=0.6), "compact")
-    assert 2_000_000 < len(good) < 4_000_000
+@pytest.fixture
+def small_parts(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Bytes in a part of the data: so few that a small page has several."""
+    monkeypatch.setattr("stages.viewer.page.PART", 3 * 2**12)
+    return 3 * 2**12
+
+
+def test_a_page_of_parts_refuses_what_verify_refuses(chromium: Any, tmp_path: Path, small_parts: int) -> None:
+    """Cut short or altered anywhere: the asset in it, or the page itself."""
+    good = serialize(random_tree(1, shape=(6, 6, 6), degree=2, share=0.6), "compact")
+    assert len(good) > 3 * small_parts
     start, rng = 8 + int.from_bytes(good[:8], "little"), np.random.default_rng(0)
-    wrong = {f"of {n} bytes": good[:n] for n in (start - 1, start, len(good) // 3, PART, len(good) - 1)} | {"longer": good + b"\0"}
+    wrong = {f"of {n} bytes": good[:n] for n in (start - 1, start, len(good) // 3, small_parts, len(good) - 1)} | {"longer": good + b"\0"}
     for at in [start, *rng.integers(start, len(good), 4).tolist(), len(good) - 1]:
         wrong[f"altered at {at}"] = good[:at] + bytes([good[at] ^ 1 << int(rng.integers(8))]) + good[at + 1 :]
     one, two, three = (start + 4096 * n for n in (1, 2, 3))
@@ -161,8 +168,9 @@ def test_a_large_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path)
         assert page.console == []
 
 
-def test_a_large_page_that_was_damaged_says_so(chromium: Any, tmp_path: Path) -> None:
-    text = viewer_page(serialize(random_tree(1, shape=(20, 20, 20), brick=4, degree=2, share=0.6), "compact")).decode()
+@pytest.mark.usefixtures("small_parts")
+def test_a_page_of_parts_that_was_damaged_says_so(chromium: Any, tmp_path: Path) -> None:
+    text = viewer_page(serialize(random_tree(1, shape=(6, 6, 6), degree=2, share=0.6), "compact")).decode()
     parts = re.findall(r'<script type="text/plain" data-part>.*?</script>\n', text)
     assert len(parts) >= 3
     at = text.index(parts[1]) + len(parts[1]) // 2
