@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import shutil
 import signal
 import sqlite3
@@ -229,13 +230,15 @@ def test_a_database_that_colmap_could_not_bear_is_not_handed_to_it(resumed: tupl
     assert 1 not in found["keypoints"] or not found["matches"]
 
 
-@pytest.mark.parametrize("how", ["cut", "zero", "link"])
-def test_every_scratch_file_of_finding_cameras_may_be_damaged(ten: tuple[list[str], Path, Capture], tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize("first", [0, 1])
+def test_every_scratch_file_of_finding_cameras_may_be_damaged(ten: tuple[list[str], Path, Capture], tmp_path: Path, first: int) -> None:
+    """Every second file each time, in all ways in turn; the database both times."""
     names, work, capture = ten
     shutil.copytree(work, tmp_path / "work")
+    ways = itertools.cycle(SPOILERS.values())
     for k, path in enumerate(sorted(path for path in work.rglob("*") if path.is_file() and path.name != "request.json")):
-        if k % 3 == len(how) % 3 or path.name.startswith("database"):
-            SPOILERS[how](tmp_path / "work" / path.relative_to(work))
+        if k % 2 == first or path.name.startswith("database"):
+            next(ways)(tmp_path / "work" / path.relative_to(work))
     assert numbers(find(STILL_LIFE, names, tmp_path / "work")) == numbers(capture)
 
 
