@@ -5,6 +5,7 @@ from __future__ import annotations
 import traceback
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+import efficientnerf
 from efficientnerf.backends import dispatch, transfer
 from efficientnerf.geometry.spaces import BoundedSpace, space_from
 from efficientnerf.model import Model, model
@@ -26,6 +28,8 @@ from efficientnerf.training.readback import AsyncReadback
 from efficientnerf.training.sparse_depth import SparseDepthRays
 from tests.efficientnerf.balls import BOUNDS, cameras, pixels, settings
 from tests.efficientnerf.device import DEVICE
+
+PACKAGE = str(Path(efficientnerf.__file__).parent)
 
 
 def samples(counts: list[int], tried: int = 50, capacity: int | None = None) -> Samples:
@@ -168,7 +172,7 @@ class Waits(TorchDispatchMode):
         chosen_by = args[1] if name in ("index", "index_put", "index_put_", "_index_put_impl_") else []
         masked = any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in chosen_by)
         if name in self.ALWAYS or masked or (name == "repeat_interleave" and kwargs.get("output_size") is None):
-            ours = [frame for frame in traceback.extract_stack() if "/efficientnerf/" in frame.filename and "/tests/" not in frame.filename]
+            ours = [frame for frame in traceback.extract_stack() if frame.filename.startswith(PACKAGE)]
             self.lines.append(f"{name}: {ours[-1].filename.rpartition('/')[2]}:{ours[-1].lineno}")
         return func(*args, **kwargs)
 
