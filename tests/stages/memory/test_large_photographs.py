@@ -1,4 +1,4 @@
-"""A hundred photographs of 12 megapixels under a limit of the system: their pixels alone are 3.4 GiB, and the process gets 1.6."""
+"""Sixty photographs of 12 megapixels under a limit of the system: their pixels alone are 2 GiB, and the process gets 1.6."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[3]
-COUNT, DIFFERENT, WIDTH = 100, 5, 4000
+COUNT, DIFFERENT, WIDTH = 60, 5, 4000
 LIMIT = int(1.6 * 2**30)
 RUN = """
 import resource, sys
@@ -42,7 +42,7 @@ def write_images(folder: Path, count: int, width: int) -> None:
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A few pictures under a hundred names."""
+    """A few pictures under many names."""
     folder = tmp_path_factory.mktemp("photographs")
     write_images(folder, DIFFERENT, WIDTH)
     described = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
