@@ -1,6 +1,6 @@
 """The run folder: its source and settings, and its layout.
 
-    RUN/run.json     {"format": "enerf-run", "version": 1, "source", "also", "settings", "preset", "seed", "device", "memory", "created"}
+    RUN/run.json     {"format": "enerf-run", "version": 1, "source", "also", "settings", "preset", "seed", "device", "memory", "viewer", "created"}
     RUN/<stage>/     an artifact (artifact.py)
     RUN/.work/       what is being written
     RUN/.cache/      digests of files that have not changed since they were hashed; may be deleted at any time
@@ -36,7 +36,7 @@ NAME = RUN
 FORMAT = "enerf-run"
 VERSION = 1
 MOST_SOURCES = 100
-_CHANGEABLE = ("source", "also", "settings", "preset", "seed", "device", "memory")
+_CHANGEABLE = ("source", "also", "settings", "preset", "seed", "device", "memory", "viewer")
 _ABANDONED = 24 * 3600.0  # seconds after which no process still writes to a temporary file, such as that of a report
 # The fields of an untrusted run.json. Settings are checked by the stages that have them.
 _Path = Annotated[str, msgspec.Meta(max_length=4096)]
@@ -48,6 +48,7 @@ _FIELDS: dict[str, Any] = {
     "seed": Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None,
     "device": Annotated[str, msgspec.Meta(max_length=200)] | None,
     "memory": Annotated[int, msgspec.Meta(ge=1, le=MOST)] | None,
+    "viewer": Annotated[str, msgspec.Meta(max_length=200)] | None,
     "created": Annotated[float, msgspec.Meta(gt=-1e15, lt=1e15)],
 }
 
@@ -84,6 +85,7 @@ class Run:
     also         further sources, absolute: of one scene, together with the first
     settings     stage -> the resolved values of its settings, plain JSON
     memory       bytes that stages may take; None: what the machine has
+    viewer       what its page in a browser shows; None: what there is
     resume_text  how to go on with the run, for messages
     stages       names of the stages that it may have, see `refuse_links`
     """
@@ -95,6 +97,7 @@ class Run:
     seed: int | None = None
     device: str | None = None
     memory: int | None = None
+    viewer: str | None = None
     also: tuple[Path, ...] = ()
     created: float = field(default_factory=time.time)
     resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)
@@ -145,7 +148,7 @@ class Run:
         return cls(path, **_recorded(path), resume_text=resume_text, stages=stages)
 
     def update(self, **changes: Any) -> None:
-        """Change source, further sources, settings (all of them), preset, seed, device or memory, and write run.json if that makes a difference.
+        """Change source, further sources, settings (all of them), preset, seed, device, memory or viewer, and write run.json if that makes a difference.
 
         What is not changed is as another process may have left it. What is read first, and changed for that, is read in `locked`.
         """
@@ -236,6 +239,7 @@ class Run:
             "seed": self.seed,
             "device": self.device,
             "memory": self.memory,
+            **({"viewer": self.viewer} if self.viewer else {}),
             "created": self.created,
         }
 

@@ -185,8 +185,8 @@ function regionOf(meta, minor) {
   return { low: bounds[0], high: bounds[1], radius: found.corner_radius, fade: found.fade, named: found.bricks, bricks: null };
 }
 
-// What the metadata say, checked; tensors are not looked at.
-function structureOf(meta) {
+// What the metadata say, checked; tensors are not looked at. `compact`: whether the asset is of this layout, and is to be read.
+export function structureOf(meta, compact = true) {
   if (meta.format !== "nerftree") refuse(`metadata 'format' is ${shown(meta.format)}; expected nerftree`);
   const version = /^([0-9]{1,5})\.([0-9]{1,5})$/.exec(String(meta.format_version));
   if (!version) refuse(`format version ${shown(meta.format_version)}; expected MAJOR.MINOR`);
@@ -218,6 +218,7 @@ function structureOf(meta) {
   const region = regionOf(meta, minor), ndc = layout[2] === "ndc-" ? ndcOf(meta) : null;
   checkFrame(meta, ndc ? ndc.near : voxel);
   if (ndc && "spiral" in meta) checkSpiral(meta.spiral, ndc.near);
+  if (!compact) return { meta, grids, brick, background, region, ndc };
   if (layout[3] !== "compact") refuse(`layout ${meta.layout}; this page reads compact. 'enerf convert' makes it`);
   const harmonics = (degree + 1) ** 2, groups = meta.sh_groups;
   if (!(Array.isArray(groups) && groups.every((n) => Number.isInteger(n) && n > 0) && groups.reduce((a, b) => a + b, 0) === harmonics - 1)) {

@@ -116,11 +116,12 @@ export class Controls {
     });
     element("about").addEventListener("click", () => this.help());
     element("subject").hidden = !viewer.tree.region;
+    Object.assign(element("other"), { hidden: !page.asset, href: page.asset || "" });
     element("cameras").hidden = page.cameras.length === 0;
     element("scenes").hidden = viewer.tree.environment === null && viewer.tree.background === null;
     this.background(element("scenes").hidden ? "black" : "scene");
     const { tree } = viewer, megabytes = (page.bytes / 1e6).toFixed(page.bytes < 1e7 ? 1 : 0);
-    element("facts-line").textContent = `${tree.count.toLocaleString("en")} voxels, ${megabytes} MB`;
+    element("facts-line").textContent = `${tree.count.toLocaleString("en")} ${tree.splats ? "Gaussians" : "voxels"}, ${megabytes} MB`;
     element("made").textContent = `${element("facts-line").textContent}, harmonics of degree ${tree.degree}. ${madeBy(tree.meta.provenance)}`;
     new MutationObserver(() => this.photograph()).observe(this.canvas, { attributes: true, attributeFilter: ["width", "height"] });
   }

@@ -6,6 +6,7 @@ import { Controls } from "./controls.js";
 import { facts, fromBase64, fromBase64Slow, inflated } from "./payload.js";
 import { Renderer, Unsupported } from "./renderer.js";
 import { sha256Slow } from "./sha256.js";
+import { SplatRenderer, readSplats } from "./splats.js";
 
 const element = (id) => document.getElementById(id);
 const breath = () => new Promise((resolve) => setTimeout(resolve, 0));
@@ -161,7 +162,7 @@ class Viewer {
 async function start() {
   const began = performance.now(), page = facts();
   if (typeof DecompressionStream === "undefined") throw new Unsupported("This browser is too old to unpack the scene (it has no DecompressionStream). Try a recent one.");
-  const renderer = new Renderer(element("scene"));
+  const renderer = new (page.splats ? SplatRenderer : Renderer)(element("scene"));
   let last = performance.now();
   const step = (text, from, to) => async (share) => {
     say(text, from + (to - from) * share);
@@ -171,9 +172,9 @@ async function start() {
   };
   const bytes = await inflated(page.bytes, step("Unpacking …", 0, 0.5));
   const unpacked = performance.now();
-  const tree = await readAsset(bytes, step("Checking …", 0.5, 0.7));
+  const tree = await (page.splats ? readSplats(bytes, page.splats) : readAsset(bytes, step("Checking …", 0.5, 0.7)));
   const checked = performance.now();
-  await step("Bricks …", 0.75, 0.75)(1);
+  await step("Textures …", 0.75, 0.75)(1);
   await breath();
   const graphics = renderer.load(tree, false), viewer = new Viewer(tree, renderer, page.cameras, page.home);
   const controls = new Controls(viewer, page);

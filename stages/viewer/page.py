@@ -1,17 +1,18 @@
-"""A page that shows an asset in a browser: one file, which needs nothing but WebGL2 and sends no request.
+"""A page that shows an asset, or its Gaussians, in a browser: one file, which needs nothing but WebGL2 and sends no request.
 
-The page holds the asset's own bytes in the layout `compact`, compressed, and checks them as `enerf verify` does before it draws. Its scripts are the
-modules next to this one.
+The page holds the asset's own bytes in the layout `compact`, compressed, and checks them as `enerf verify` does before it draws; or those of an SPZ file.
+Its scripts are the modules next to this one.
 """
 
 from __future__ import annotations
 
 import base64
 import functools
+import hashlib
 import json
 import re
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,20 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from efficientnerf.asset.format import contents, load, serialize
+from efficientnerf.asset.format import FormatError, contents, load, serialize
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.files import write_atomically
 from pipeline.text import printable
+from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.splats.spz import MAGIC
+from stages.formats.exporters.writing import source_frame
 from stages.viewer.html import json_for_html, policy_hash
 
 FOLDER = Path(__file__).parent
-MODULES = ("sha256", "asset", "payload", "volume", "shader", "renderer", "camera", "controls", "main")  # each after those that it imports
+MODULES = ("sha256", "asset", "payload", "volume", "shader", "renderer", "camera", "controls", "splats", "main")  # each after those that it imports
 NAME = "viewer.html"
+LARGEST_SPZ = 2**29  # bytes, of millions of Gaussians
 PART = 3 * 2**18  # bytes of compressed data in an element of the page; a multiple of 3
 
 
@@ -55,21 +60,53 @@ def viewer_page(
     cameras      captured cameras, training frame, to jump to; none: those of the asset's captured path
     photographs  JPEG of the image of a camera, by the camera's name; as a pinhole camera of the same lens takes it
     """
+    packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9)
+    packed = packer.compress(asset) + packer.flush()
+    return _page(packed, len(asset), _cameras(cameras, photographs) or _captured_path(asset), title)
+
+
+def splats_page(
+    spz: bytes, metadata: Mapping[str, Any], *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene",
+    asset: str | None = None,
+) -> bytes:  # fmt: skip
+    """The page of Gaussians in the bytes of an SPZ file of ours.
+
+    metadata     of the asset that they were made of
+    cameras ...  as of `viewer_page`
+    asset        the name of a page next to it that shows the asset
+
+    Raises FormatError.
+    """
+    frame = source_frame(metadata)
+    world_from_spz = frame.world_from_capture.matrix() @ Similarity(1.0, gltf_from_capture(frame.up).T, np.zeros(3)).matrix()
+    try:
+        content = zlib.decompressobj(31).decompress(spz, LARGEST_SPZ)
+    except zlib.error as error:
+        raise FormatError(f"{title}: its Gaussians are damaged: {error}") from None
+    if content[:4] != MAGIC:
+        raise FormatError(f"{title}: its Gaussians are no SPZ file")
+    about = {key: value for key, value in metadata.items() if key != "captured_path"}
+    facts = {"sha256": hashlib.sha256(content).hexdigest(), "frame": world_from_spz[:3].tolist(), "meta": about}
+    return _page(spz[10:-8], len(content), _cameras(cameras, photographs), title, splats=facts, asset=asset)  # the stream in the gzip
+
+
+def _page(packed: bytes, size: int, cameras: list[dict[str, Any]], title: str, **more: Any) -> bytes:
+    """The page of a deflate stream of so many bytes."""
     title = printable(title, 200)
-    entries = [_camera(camera, (photographs or {}).get(camera.name)) for camera in cameras] or _captured_path(asset)
-    facts = {"title": title, "bytes": len(asset), "cameras": entries, "home": None}
+    facts = {"title": title, "bytes": size, "cameras": cameras, "home": None, **more}
     script, style = script_text(), (FOLDER / "viewer.css").read_text(encoding="utf-8")
     head = _template().render(title=title, policy=Markup(policy()), style=Markup(style), facts=Markup(json_for_html(facts)))
     parts = [head.encode("utf-8"), b"\n"]
-    for part in _parts(asset):
-        parts += [b'<script type="text/plain" data-part>', part, b"</script>\n"]
+    for begin in range(0, len(packed), PART):
+        parts += [b'<script type="text/plain" data-part>', base64.b64encode(packed[begin : begin + PART]), b"</script>\n"]
     return b"".join([*parts, b"<script>", script.encode("utf-8"), b"</script>\n</body>\n</html>\n"])
 
 
 def policy() -> str:
-    """The page's Content-Security-Policy: its own script and style, and pictures that it holds."""
+    """The page's Content-Security-Policy: its own script and style, a worker that it makes, and pictures that it holds."""
     script, style = policy_hash(script_text()), policy_hash((FOLDER / "viewer.css").read_text(encoding="utf-8"))
-    return f"default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src data: blob:; base-uri 'none'; form-action 'none'"
+    allowed = f"script-src 'sha256-{script}'; worker-src blob:; style-src 'sha256-{style}'; img-src data: blob:"
+    return f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
 
 
 @functools.cache
@@ -88,12 +125,8 @@ def script_text() -> str:
     return '"use strict";\n(() => {\nconst element = (id) => document.getElementById(id);\n' + joined + "})();\n"
 
 
-def _parts(asset: bytes) -> Iterator[bytes]:
-    """The asset's bytes, compressed, in base64."""
-    packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9)
-    packed = packer.compress(asset) + packer.flush()
-    for begin in range(0, len(packed), PART):
-        yield base64.b64encode(packed[begin : begin + PART])
+def _cameras(cameras: Sequence[Camera], photographs: Mapping[str, bytes] | None) -> list[dict[str, Any]]:
+    return [_camera(camera, (photographs or {}).get(camera.name)) for camera in cameras]
 
 
 def _camera(camera: Camera, photograph: bytes | None) -> dict[str, Any]:

@@ -1,12 +1,12 @@
 // Textures and draws. A picture is drawn into a texture, whole or in bands, and copied to the canvas when it is done.
 
-import { programOf } from "./shader.js";
+import { VERTEX, fragmentShader, programOf } from "./shader.js";
 import { volumeOf } from "./volume.js";
 
 export class Unsupported extends Error {}
 
 const LEAST_WEIGHT = 1e-3, ROUGH_WEIGHT = 0.02; // docs/experiments/viewer.md
-const UNITS = ["coarse", "density", "base", "palette", "environment", "codes0", "codes1", "codes2"];
+export const UNITS = ["coarse", "density", "base", "palette", "environment", "codes0", "codes1", "codes2"];
 
 export class Renderer {
   constructor(canvas) {
@@ -87,7 +87,7 @@ export class Renderer {
   _program(tree, volume) {
     const { gl } = this;
     if (this.program) gl.deleteProgram(this.program);
-    const program = programOf(gl, tree, volume.layers), at = new Map(), [tx, ty, tz] = volume.tiles, pad = tree.brick + 2;
+    const program = programOf(gl, VERTEX, fragmentShader(tree, volume.layers)), at = new Map(), [tx, ty, tz] = volume.tiles, pad = tree.brick + 2;
     this.program = program;
     this.at = (name) => {
       if (!at.has(name)) at.set(name, gl.getUniformLocation(program, name));

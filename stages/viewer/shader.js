@@ -1,13 +1,13 @@
 // The fragment shader: a ray for each pixel, marched as FORMAT.md says.
 
-const VERTEX = `#version 300 es
+export const VERTEX = `#version 300 es
 void main() {
   gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
 }`;
 
 // Real spherical harmonics by their numbers, orthonormal, of the unit direction d.
 const S = Math.sqrt, PI = Math.PI;
-const BASIS = [
+export const BASIS = [
   [0.5 * S(1 / PI), "1.0"],
   [-S(3 / (4 * PI)), "d.y"], [S(3 / (4 * PI)), "d.z"], [-S(3 / (4 * PI)), "d.x"],
   [0.5 * S(15 / PI), "d.x*d.y"], [-0.5 * S(15 / PI), "d.y*d.z"], [0.25 * S(5 / PI), "(2.0*zz-xx-yy)"], [-0.5 * S(15 / PI), "d.x*d.z"],
@@ -20,6 +20,13 @@ const BASIS = [
   [(3 / 8) * S(5 / PI), "(xx-yy)*(7.0*zz-1.0)"], [-0.75 * S(35 / (2 * PI)), "d.x*d.z*(xx-3.0*yy)"],
   [(3 / 16) * S(35 / PI), "(xx*(xx-3.0*yy)-yy*(3.0*xx-yy))"],
 ];
+
+// The colour of a depth.
+export const SCALE = `vec3 scale(float x) {
+  vec3 c = mix(vec3(0.99, 0.91, 0.65), vec3(0.96, 0.48, 0.36), smoothstep(0.0, 0.4, x));
+  c = mix(c, vec3(0.51, 0.15, 0.5), smoothstep(0.35, 0.75, x));
+  return mix(c, vec3(0.04, 0.03, 0.16), smoothstep(0.7, 1.0, x));
+}`;
 
 // Statements that add a voxel's harmonics above the base, whose codes are words of `layers`.
 function harmonicsOf(tree, layers) {
@@ -178,11 +185,7 @@ vec3 behind() {
   return textureLod(environment, at, 0.0).rgb;
 }
 
-vec3 scale(float x) {
-  vec3 c = mix(vec3(0.99, 0.91, 0.65), vec3(0.96, 0.48, 0.36), smoothstep(0.0, 0.4, x));
-  c = mix(c, vec3(0.51, 0.15, 0.5), smoothstep(0.35, 0.75, x));
-  return mix(c, vec3(0.04, 0.03, 0.16), smoothstep(0.7, 1.0, x));
-}
+${SCALE}
 
 // Near and far end of the ray in the box of cascade n, units of its frame.
 vec2 boxOf(int n, vec3 p, vec3 d) {
@@ -241,9 +244,9 @@ ${tree.ndc ? `  vec3 d = ndcFromWorld * direction;
 }`;
 }
 
-export function programOf(gl, tree, layers) {
+export function programOf(gl, vertex, fragment) {
   const program = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, fragmentShader(tree, layers)]]) {
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, text);
     gl.compileShader(shader);

@@ -52,6 +52,7 @@ class Options:
     device: str | None = None
     memory: str | None = None
     share: int | None = None
+    viewer: str | None = None
     strict: bool = False
     allow_outside: bool = False
 
@@ -82,13 +83,13 @@ class Plan:
         The settings that the options change are those that run.json holds under the lock, whatever it held before.
         """
         if self.new:
-            facts = {name: getattr(self.run, name) for name in ("preset", "seed", "device", "memory", "also")}
+            facts = {name: getattr(self.run, name) for name in ("preset", "seed", "device", "memory", "viewer", "also")}
             facts["resume_text"] = resume_command
             Run.create(self.run.path, self.run.source, self.run.settings, **facts)
         run = open_run(self.run.path)
         with run.locked():
             now = self.again().run
-            run.update(source=now.source, also=now.also, settings=now.settings, preset=now.preset, seed=now.seed, device=now.device, memory=now.memory)
+            run.update(**{name: getattr(now, name) for name in ("source", "also", "settings", "preset", "seed", "device", "memory", "viewer")})
             yield run
 
 
@@ -143,7 +144,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         preset=preset or (standing.preset if standing else None),
         seed=seed if seed is not None else (standing.seed if standing else None),
         device=device or (standing.device if standing else None) or "auto",
-        memory=memory, also=sources[1:], resume_text=resume_command,
+        memory=memory, viewer=options.viewer or (standing.viewer if standing else None), also=sources[1:], resume_text=resume_command,
     )  # fmt: skip
     return Plan(run, standing is None, run.device or "auto", limit, warnings, lambda: plan_run(path, workflow, options))
 

@@ -65,6 +65,8 @@ GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
 @click.option("--fail-on", type=click.Choice(["poor", "failed"]), help="Exit with code 6 if the result has this grade or worse; all files are still written.")
 @click.option("--jobs", type=click.IntRange(1, 64), metavar="N", help="Stages that run at once, if memory admits it; by default one a core, at most 4.")
+@click.option("--viewer", type=click.Choice(["splats", "asset", "both", "off"]),
+              help="What RUN/viewer.html shows: the Gaussians if there are any (default) or the asset; both: the asset in RUN/viewer_asset.html.")  # fmt: skip
 @click.option("--dry-run", is_flag=True, help="Show what would be done and why, and do nothing.")
 @json_option
 @quiet_option

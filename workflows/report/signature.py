@@ -20,11 +20,11 @@ from efficientnerf.backends.kernel_cache import cache_folder, first_private
 from pipeline import files
 from pipeline.hashes import CHUNK
 from pipeline.run import Run
-from stages.artifacts import BakeOutputs
+from stages.artifacts import BakeOutputs, SplatsOutputs
 from stages.viewer.html import LARGEST
 
-VIEWER = "viewer.html"
-PAGES = ("report.html", VIEWER)  # of a run
+VIEWER, ASSET_VIEWER = "viewer.html", "viewer_asset.html"
+PAGES = ("report.html", VIEWER, ASSET_VIEWER)  # of a run
 KEY = 32  # bytes, as many as a SHA-256 has
 _LINE = re.compile(rb"<!-- enerf ([0-9a-f]{64}) ([0-9a-f]{64}) -->\n")
 _LENGTH = len("<!-- enerf   -->\n") + 2 * 64
@@ -90,10 +90,18 @@ def _key() -> bytes:
         return secrets.token_bytes(KEY)
 
 
+def viewers(run: Run) -> dict[str, Path]:
+    """The pages that show what the run made, and the file of each: as its `viewer` says, by default the Gaussians where there are any, else the asset."""
+    asset, splats = BakeOutputs.of_run(run.path).asset, SplatsOutputs.of_run(run.path).spz
+    sizes = {path: size_of(path) for path in (splats, asset)}
+    known = [path for path, size in sizes.items() if size is not None and size <= LARGEST and sizes[asset] is not None]
+    shown = {"asset": [path for path in known if path == asset], "both": known, "off": []}.get(run.viewer or "splats", known[:1])
+    return dict(zip((VIEWER, ASSET_VIEWER), shown, strict=False))
+
+
 def viewer_is_missing(run: Run) -> bool:
-    """Whether the run has no viewer though its asset is one that gets a page: it could not be read, or the page is not written yet."""
-    size = size_of(BakeOutputs.of_run(run.path).asset)
-    return size is not None and size <= LARGEST and not os.path.lexists(run.path / VIEWER)
+    """Whether a viewer is not there: its file could not be read, or the page is not written yet."""
+    return any(not os.path.lexists(run.path / name) for name in viewers(run))
 
 
 def size_of(path: Path) -> int | None:

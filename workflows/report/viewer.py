@@ -1,4 +1,4 @@
-"""RUN/viewer.html: the page that shows the run's asset in a browser. Like the report it belongs to no stage and can be made again."""
+"""RUN/viewer.html: the page that shows what the run made in a browser. Like the report it belongs to no stage and can be made again."""
 
 from __future__ import annotations
 
@@ -6,45 +6,51 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from efficientnerf.asset.format import FormatError
+from efficientnerf.asset.format import FormatError, contents
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import PipelineError
-from pipeline.run import Run, cannot_write
-from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
+from pipeline.run import NAME, Run, cannot_write
+from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
 from stages.viewer.captured import captured_views
-from stages.viewer.html import LARGEST
-from stages.viewer.page import compact_bytes, viewer_page
-from workflows.report.signature import VIEWER, is_own, size_of, write_page
+from stages.viewer.page import compact_bytes, splats_page, viewer_page
+from workflows.report.signature import ASSET_VIEWER, VIEWER, is_own, viewers, write_page
 
 
 def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
-    """Write RUN/viewer.html atomically, where it is missing, not this program's own or older than what it shows, or `anew`; returns its path.
+    """Write the run's `viewers` atomically, where one is missing, not this program's own or older than what it shows, or `anew`; returns the first one's path.
 
-    None, and no page, for a run without a sound asset, and for one whose asset is too large for a page that is made by itself. Raises DiskFull, and
+    None, and no page, for a run without a sound asset, and for one whose files are too large for a page that is made by itself. Raises DiskFull, and
     BadInput where the folder cannot be written.
     """
-    path, asset = run.path / VIEWER, BakeOutputs.of_run(run.path).asset
-    size = size_of(asset)
-    if size is not None and size <= LARGEST and not anew and _is_newest(run, path):
-        return path
-    try:
-        if size is None or size > LARGEST:
-            path.unlink(missing_ok=True)
-            return None
+    shown, path = viewers(run), run.path / VIEWER
+    for name in (VIEWER, ASSET_VIEWER):
+        page = run.path / name
         try:
-            write_viewer_of(run.path, asset, path)
-        except FormatError:  # `enerf verify` says what is wrong
-            path.unlink(missing_ok=True)
-            return None
-    except OSError as error:
-        raise cannot_write(path, error) from error
-    return path
+            if name not in shown:
+                page.unlink(missing_ok=True)
+            elif anew or not _is_newest(run, page):
+                try:
+                    write_viewer_of(run.path, shown[name], page, ASSET_VIEWER if name == VIEWER and ASSET_VIEWER in shown else None)
+                except FormatError:  # `enerf verify` says what is wrong
+                    page.unlink(missing_ok=True)
+        except OSError as error:
+            raise cannot_write(page, error) from error
+    return path if os.path.lexists(path) else None
 
 
-def write_viewer_of(run: Path, asset: Path, target: Path) -> None:
-    """Write the page of a run's asset, signed. Raises FormatError and OSError."""
+def write_viewer_of(run: Path, shown: Path, target: Path, other: str | None = None) -> None:
+    """Write the page of a run's asset or its Gaussians, signed. Raises FormatError and OSError.
+
+    other  the page of the asset, next to that of the Gaussians
+    """
     cameras, photographs = captured(run)
-    write_page(target, viewer_page(compact_bytes(asset), cameras=cameras, photographs=photographs, title=os.path.basename(os.path.abspath(run))))
+    title = os.path.basename(os.path.abspath(run))
+    if shown == SplatsOutputs.of_run(run).spz:
+        metadata = contents(BakeOutputs.of_run(run).asset)[0]
+        page = splats_page(shown.read_bytes(), metadata, cameras=cameras, photographs=photographs, title=title, asset=other)
+    else:
+        page = viewer_page(compact_bytes(shown), cameras=cameras, photographs=photographs, title=title)
+    write_page(target, page)
 
 
 def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
@@ -58,8 +64,9 @@ def _is_newest(run: Run, path: Path) -> bool:
     """Whether the page is our own, and none of the artifacts that it shows was published after it: that is a rename of its folder, which sets ctime."""
     try:
         status = os.stat(path, follow_symlinks=False)
-        folders = [run.folder(stage) for stage in (BakeOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)]
-        changed = [os.stat(folder, follow_symlinks=False).st_ctime_ns for folder in folders if os.path.lexists(folder)]
+        stages = (BakeOutputs.stage, SplatsOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)
+        shown = [run.path / NAME, *map(run.folder, stages)]  # run.json says what is to be shown
+        changed = [os.stat(each, follow_symlinks=False).st_ctime_ns for each in shown if os.path.lexists(each)]
     except OSError:
         return False
     return all(each <= status.st_mtime_ns for each in changed) and is_own(path)

@@ -9,8 +9,8 @@ from efficientnerf.asset.format import FormatError
 from pipeline.errors import CorruptArtifact
 from pipeline.run import cannot_write
 from stages.viewer.page import NAME, write_viewer
-from workflows.cli.target import is_run
-from workflows.report.signature import is_own
+from workflows.cli.target import is_run, open_run
+from workflows.report.signature import VIEWER, is_own, viewers
 from workflows.report.viewer import write_viewer_of
 
 
@@ -26,13 +26,13 @@ def present_page(what: Path, asset: Path) -> Path | None:
 
 
 def make_page(what: Path, asset: Path, target: Path) -> None:
-    """Write the page of a run's asset, with the cameras and photographs of the run, or of an asset file; atomically.
+    """Write the page of a run, of its Gaussians or its asset, with its cameras and photographs; or that of an asset file; atomically.
 
     Raises CorruptArtifact for a damaged asset, DiskFull, and BadInput where it cannot be written.
     """
     try:
         if is_run(what):
-            write_viewer_of(what, asset, target)
+            write_viewer_of(what, viewers(open_run(what)).get(VIEWER, asset), target)
         else:
             write_viewer(asset, target)
     except FormatError as error:

@@ -11,10 +11,13 @@ import pytest
 
 from efficientnerf.asset.format import save
 from pipeline.run import Run
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.writing import CAPTURE_IS_Z_UP
 from stages.io.pictures import opened
 from stages.viewer.captured import PHOTOGRAPHS, SIDE, captured_views, photograph
 from tests.efficientnerf.trees import random_tree
 from tests.stages.balls import poses
+from tests.stages.formats.gaussians import scattered
 from workflows.report.viewer import write_run_viewer
 
 
@@ -61,7 +64,7 @@ def test_there_is_no_page_of_no_asset_a_damaged_one_or_one_too_large(run: Run, m
     asset = run.path / "bake/asset.nerftree"
     assert write_run_viewer(run) is not None
     with monkeypatch.context() as patch:
-        patch.setattr("workflows.report.viewer.LARGEST", 100)
+        patch.setattr("workflows.report.signature.LARGEST", 100)
         assert write_run_viewer(run, anew=True) is None
     assert not (run.path / "viewer.html").exists()
     assert write_run_viewer(run) is not None
@@ -102,3 +105,25 @@ def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Pat
     expected = 128 + 127 * np.sin(30 * ((np.arange(SIDE) + 0.5) / SIDE - 0.5))
     inner = slice(SIDE // 8, -SIDE // 8)
     assert np.abs(found[inner, inner] - expected[inner]).mean() < 5
+
+
+def test_the_page_shows_gaussians_where_there_are_any_or_what_was_asked_for(run: Run) -> None:
+    def written(viewer: str | None) -> dict[str, bool]:
+        """The pages, and whether each is of Gaussians."""
+        if viewer is not None:
+            run.update(viewer=viewer)
+        write_run_viewer(run)
+        return {page.name: '"splats":{' in page.read_text(encoding="utf-8") for page in sorted(run.path.glob("viewer*.html"))}
+
+    assert written(None) == {"viewer.html": False}
+    (run.path / "splats").mkdir()
+    SPLAT_EXPORTERS[".spz"](scattered(), run.path / "splats/splats.spz", CAPTURE_IS_Z_UP)
+    assert written(None) == {"viewer.html": True}
+    assert written("asset") == {"viewer.html": False}
+    assert written("both") == {"viewer.html": True, "viewer_asset.html": False}
+    assert written("off") == {}
+    assert Run.open(run.path).viewer == "off"
+    assert written("splats") == {"viewer.html": True}
+    (run.path / "splats/splats.spz").write_bytes(b"damaged")
+    os.utime(run.path / "splats")
+    assert written(None) == {}
