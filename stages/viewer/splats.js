@@ -1,5 +1,5 @@
 // 3D Gaussians of an SPZ file, drawn as `efficientnerf.splats.rendering` does: sorted and projected once a picture, into textures, then blended from back to
-// front, a triangle each: software renderers draw instances one by one.
+// front, a square each, without instances: software renderers draw those one by one.
 
 import { FormatError, structureOf } from "./asset.js";
 import { Renderer, UNITS } from "./renderer.js";
@@ -7,6 +7,9 @@ import { BASIS, SCALE, VERTEX, programOf } from "./shader.js";
 import { sha256 } from "./sha256.js";
 
 const NEAR = 0.05, BESIDE = 0.15, LOW_PASS = "0.3"; // as the CPU has them
+const SLANT = 1.3, SOFT = 2; // how much longer a Gaussian off the axis is drawn than it is; pixels that LOW_PASS adds
+const ROUGH = 0.3; // pixels, the size of Gaussians that are left out while the eye moves
+const SQUARE = [0, 1, 2, 2, 1, 3]; // its corners, of two triangles
 const HEADER = 16, ROW = 512, HARMONICS = 23; // bytes of the file's header; Gaussians in a row of the texture; where their codes begin in one's texels
 
 // What the page carries, checked: the tree of its asset's metadata, and a texture's rows: place (3 x int32), opacity, colour, rotation, scales, harmonics.
@@ -22,22 +25,30 @@ export async function readSplats(bytes, { sha256: digest, meta, frame }) {
   }
   let from = HEADER + 9 * count;
   for (const [to, size] of sections) for (let n = 0; n < count; n++) for (let k = 0; k < size; k++) rows[16 * texels * n + to + k] = bytes[from++];
-  return { ...structureOf(meta, false), environment: null, count, degree, splats: { frame, texels, rows, places, unit: 2 ** -bytes[13] } };
+  const extents = new Float32Array(2 * count);
+  for (let n = 0; n < count; n++) {
+    const at = 16 * texels * n, [, middle, most] = rows.slice(at + 20, at + 23).sort(), opacity = rows[at + 12] / 255;
+    extents[2 * n] = SLANT * Math.exp(most / 16 - 10) * Math.sqrt(2 * Math.log(Math.max(255 * opacity, 1)));
+    extents[2 * n + 1] = Math.exp((middle + most) / 32 - 10) * Math.sqrt(opacity);
+  }
+  return { ...structureOf(meta, false), environment: null, count, degree, splats: { frame, texels, rows, places, extents, unit: 2 ** -bytes[13] } };
 }
 
-// The numbers of the Gaussians before the eye, the farthest first: a counting sort of the bits of their depths a x + b y + c z + d. A worker runs its text.
-function backToFront(places, [a, b, c, d], near) {
-  const count = places.length / 3, depths = new Float32Array(count), keys = new Uint32Array(depths.buffer), starts = new Uint32Array(65537);
-  let low = 2 ** 32, high = 0, before = 0;
+// The numbers of the Gaussians that may show, the farthest first: a counting sort of the bits of their depths. A worker runs its text.
+// planes: rows [a, b, c, d] in the file's frame, to the inside; the first gives depths. extents: how far a Gaussian reaches over a side plane, and its size.
+// least: size at a depth of 1.
+function backToFront(places, extents, [[a, b, c, d], ...sides], near, least) {
+  const count = extents.length / 2, depths = new Float32Array(count), keys = new Uint32Array(depths.buffer), starts = new Uint32Array(65537);
+  let low = 2 ** 32, high = 0, shown = 0;
   for (let n = 0; n < count; n++) {
-    const z = a * places[3 * n] + b * places[3 * n + 1] + c * places[3 * n + 2] + d;
-    if (!(z > near)) continue;
-    depths[n] = z;
+    const x = places[3 * n], y = places[3 * n + 1], z = places[3 * n + 2], depth = a * x + b * y + c * z + d;
+    if (!(depth > near) || extents[2 * n + 1] < least * depth || sides.some(([a, b, c, d]) => a * x + b * y + c * z + d < -extents[2 * n])) continue;
+    depths[n] = depth;
     if (keys[n] < low) low = keys[n];
     if (keys[n] > high) high = keys[n];
-    before++;
+    shown++;
   }
-  const order = new Uint32Array(before), scale = 65535 / Math.max(1, high - low);
+  const order = new Uint32Array(shown), scale = 65535 / Math.max(1, high - low);
   for (let n = 0; n < count; n++) if (keys[n]) starts[(keys[n] = 65535 - Math.floor((keys[n] - low) * scale) + 1)]++;
   for (let n = 1; n < 65537; n++) starts[n] += starts[n - 1];
   for (let n = count - 1; n >= 0; n--) if (keys[n]) order[--starts[keys[n]]] = n;
@@ -45,10 +56,10 @@ function backToFront(places, [a, b, c, d], near) {
 }
 
 const WORKER = `${backToFront}
-let places;
+let places, extents;
 onmessage = ({ data }) => {
-  if (data.places) places = data.places;
-  else postMessage(backToFront(places, data.row, ${NEAR}));
+  if (data.places) ({ places, extents } = data);
+  else postMessage(backToFront(places, extents, data.planes, ${NEAR}, data.least));
 };`;
 
 function projection({ degree, splats: { texels, unit }, region }) {
@@ -110,7 +121,7 @@ ${BASIS.slice(1, (degree + 1) ** 2).map((basis, k) => term(basis, k + 1)).join("
 }`;
 }
 
-const TRIANGLE = `#version 300 es
+const SQUARES = `#version 300 es
 precision highp float;
 precision highp int; precision highp usampler2D;
 uniform usampler2D places, paints;
@@ -118,12 +129,12 @@ uniform vec2 size;
 out vec2 at;
 flat out vec4 colour;
 void main() {
-  int number = gl_VertexID / 3, corner = gl_VertexID % 3;
+  int number = gl_VertexID / 4, corner = gl_VertexID % 4;
   ivec2 from = ivec2(number % ${ROW}, number / ${ROW});
   vec4 place = uintBitsToFloat(texelFetch(places, from, 0));
   uvec3 paint = texelFetch(paints, from, 0).xyz;
   colour = vec4(unpackHalf2x16(paint.y), unpackHalf2x16(paint.z));
-  at = vec2(${Math.sqrt(3)} * float(corner - 1), corner == 1 ? 2.0 : -1.0) * sqrt(max(0.0, 2.0 * log(255.0 * colour.a)));
+  at = vec2(2 * (corner & 1) - 1, (corner & 2) - 1) * sqrt(max(0.0, 2.0 * log(255.0 * colour.a)));
   vec2 pixel = place.xy + vec2(place.z * at.x, place.w * at.x + uintBitsToFloat(paint.x) * at.y);
   gl_Position = vec4((2.0 * pixel / size - 1.0) * vec2(1, -1), 0, 1);
 }`;
@@ -143,8 +154,8 @@ export class SplatRenderer extends Renderer {
   load(tree, subject) {
     this.subject = subject;
     if (this.tree) return 0;
-    const { gl } = this, { texels, rows, places } = tree.splats;
-    const height = rows.length / (16 * texels * ROW), first = programOf(gl, VERTEX, projection(tree)), program = programOf(gl, TRIANGLE, PAINT);
+    const { gl } = this, { texels, rows, places, extents } = tree.splats;
+    const height = rows.length / (16 * texels * ROW), first = programOf(gl, VERTEX, projection(tree)), program = programOf(gl, SQUARES, PAINT);
     Object.assign(this, { tree, first, program, projected: gl.createFramebuffer(), numbers: new Uint32Array(ROW * height) });
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projected);
     ["gaussians", "order", "places", "paints"].forEach((name, n) => {
@@ -155,13 +166,16 @@ export class SplatRenderer extends Renderer {
       gl.useProgram(user);
       gl.uniform1i(gl.getUniformLocation(user, name), n);
     });
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint32Array.from({ length: 6 * tree.count }, (_, n) => 4 * Math.floor(n / 6) + SQUARE[n % 6]), gl.STATIC_DRAW);
     gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
     gl.activeTexture(gl.TEXTURE0);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW * texels, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, new Uint32Array(rows.buffer));
     try {
       this.worker = new Worker(URL.createObjectURL(new Blob([WORKER], { type: "text/javascript" })));
       this.worker.onmessage = ({ data }) => Object.assign(this, { order: data, sorting: false });
-      this.worker.postMessage({ places });
+      this.worker.onerror = () => Object.assign(this, { worker: null });
+      this.worker.postMessage({ places, extents });
     } catch {
       this.worker = null; // sorted here
     }
@@ -170,16 +184,24 @@ export class SplatRenderer extends Renderer {
 
   // At rest Gaussians are sorted for the view at once; while the eye moves as the worker last had them.
   begin(view, options, width, height) {
-    const { gl, tree } = this, { rotation: r, eye } = view, { frame, places } = tree.splats, [fx, fy, cx, cy] = view.lens;
+    const { gl, tree } = this, { rotation: r, eye } = view, { frame, places, extents } = tree.splats, [fx, fy, cx, cy] = view.lens;
     if (!this.target || this.target.width !== width || this.target.height !== height) this._resize(width, height);
     const axes = [0, 1, 2], away = frame.map((row, axis) => row[3] - eye[axis]), camera = (column, of) => axes.reduce((sum, axis) => sum + r[axis][column] * of(axis), 0);
     const turn = axes.map((row) => axes.map((column) => camera(row, (axis) => frame[axis][column]))), shift = axes.map((row) => camera(row, (axis) => away[axis]));
     const square = axes.reduce((sum, axis) => sum + frame[axis][0] ** 2, 0), own = axes.map((column) => axes.reduce((sum, axis) => sum - (frame[axis][column] * away[axis]) / square, 0));
-    const row = [...turn[2], shift[2]], rough = options.rough && this.order && this.worker;
-    if (!rough) this.order = backToFront(places, row, NEAR);
+    const rough = options.rough && this.order && this.worker, size = Math.sqrt(square), least = (options.rough ? ROUGH : 0) / (fx * size);
+    const spare = options.rough ? 0.1 * width : SOFT; // the eye goes on while they are sorted
+    // What is between a side of the picture and its middle, in the units of the file.
+    const inside = (axis, sign, slope) => {
+      const scale = sign / size / Math.hypot(1, slope), [one, z] = [turn[axis], turn[2]];
+      return [...one.map((x, column) => (x - slope * z[column]) * scale), (shift[axis] - slope * shift[2]) * scale];
+    };
+    const across = [inside(0, 1, (-cx - spare) / fx), inside(0, -1, (width - cx + spare) / fx)];
+    const planes = [[...turn[2], shift[2]], ...across, inside(1, 1, (-cy - spare) / fy), inside(1, -1, (height - cy + spare) / fy)];
+    if (!rough) this.order = backToFront(places, extents, planes, NEAR, least);
     else if (!this.sorting) {
       this.sorting = true;
-      this.worker.postMessage({ row });
+      this.worker.postMessage({ planes, least });
     }
     gl.useProgram(this.first);
     const at = (name, program = this.first) => gl.getUniformLocation(program, name), columns = (rows) => axes.flatMap((column) => axes.map((axis) => rows[axis][column]));
@@ -195,11 +217,12 @@ export class SplatRenderer extends Renderer {
     gl.uniform1i(at("mode"), options.mode);
     gl.uniform1i(at("subject"), this.subject ? 1 : 0);
     gl.uniform1i(at("count"), this.order.length);
+    const used = Math.ceil(this.order.length / ROW);
     this.numbers.set(this.order);
     gl.activeTexture(gl.TEXTURE1);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, this.numbers.length / ROW, gl.RED_INTEGER, gl.UNSIGNED_INT, this.numbers);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, used, gl.RED_INTEGER, gl.UNSIGNED_INT, this.numbers);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projected);
-    gl.viewport(0, 0, ROW, this.numbers.length / ROW);
+    gl.viewport(0, 0, ROW, used);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.useProgram(this.program);
     gl.uniform2f(at("size", this.program), width, height);
@@ -215,7 +238,7 @@ export class SplatRenderer extends Renderer {
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.drawArrays(gl.TRIANGLES, 0, 3 * this.order.length);
+    gl.drawElements(gl.TRIANGLES, 6 * this.order.length, gl.UNSIGNED_INT, 0);
     gl.disable(gl.BLEND);
     return true;
   }

@@ -87,8 +87,9 @@ def view(what: Path, no_browser: bool, port: int | None, address: str | None, fo
     """Open the viewer page of RUN or ASSET, which works offline. For a run it is RUN/viewer.html, rewritten if it is missing, out of date or of another
     version. For an asset file it is a new page in a temporary folder.
 
-    With --serve, the page shows the stages, curves and previews of a RUN while it trains, and the viewer once there is an asset. From another machine:
-    'ssh -L 8000:localhost:PORT HOST', then http://localhost:8000/. The server only reads files, and serves only these pages.
+    With --serve, the page shows the stages, curves and previews of a RUN while it trains, and the viewer once there is an asset, then that of its
+    Gaussians. From another machine: 'ssh -L 8000:localhost:PORT HOST', then http://localhost:8000/. The server only reads files, and serves only these
+    pages.
     """
     loopback = check_address(address, port)
     if port is None:

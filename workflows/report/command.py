@@ -18,8 +18,8 @@ from workflows.report.viewer import write_run_viewer
 @json_option
 @common_options
 def report(run_folder: Path, as_json: bool) -> None:
-    """Write RUN/report.html: files, renders, metrics and settings of RUN; and RUN/viewer.html, which shows its asset in a browser. 'enerf run' writes
-    both when it is done."""
+    """Write RUN/report.html: files, renders, metrics and settings of RUN; and RUN/viewer.html, which shows its 3D Gaussians in a
+    browser, or its asset ('enerf run --viewer'). 'enerf run' writes both when it is done."""
     run = open_run(run_folder)
     viewer = write_run_viewer(run, anew=True)
     path = write_report(run, workflow().stages)

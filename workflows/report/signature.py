@@ -18,9 +18,11 @@ from pathlib import Path
 
 from efficientnerf.backends.kernel_cache import cache_folder, first_private
 from pipeline import files
+from pipeline.errors import CorruptArtifact
 from pipeline.hashes import CHUNK
+from pipeline.manifest import read_manifest
 from pipeline.run import Run
-from stages.artifacts import BakeOutputs, SplatsOutputs
+from stages.artifacts import BakeOutputs, SplatsInputs, SplatsOutputs, needs_of
 from stages.viewer.html import LARGEST
 
 VIEWER, ASSET_VIEWER = "viewer.html", "viewer_asset.html"
@@ -91,12 +93,24 @@ def _key() -> bytes:
 
 
 def viewers(run: Run) -> dict[str, Path]:
-    """The pages that show what the run made, and the file of each: as its `viewer` says, by default the Gaussians where there are any, else the asset."""
+    """The pages that show what the run made, and the file of each: as its `viewer` says, by default the Gaussians where there are any of the present
+    asset, else the asset."""
     asset, splats = BakeOutputs.of_run(run.path).asset, SplatsOutputs.of_run(run.path).spz
     sizes = {path: size_of(path) for path in (splats, asset)}
     known = [path for path, size in sizes.items() if size is not None and size <= LARGEST and sizes[asset] is not None]
+    if splats in known and not _splats_are_current(run):
+        known.remove(splats)
     shown = {"asset": [path for path in known if path == asset], "both": known, "off": []}.get(run.viewer or "splats", known[:1])
     return dict(zip((VIEWER, ASSET_VIEWER), shown, strict=False))
+
+
+def _splats_are_current(run: Run) -> bool:
+    """Whether the Gaussians were made of the artifacts that the run holds now."""
+    try:
+        inputs = read_manifest(run.folder(SplatsOutputs.stage)).request.inputs
+        return all(read_manifest(run.folder(need)).digest == inputs.get(need) for need in needs_of(SplatsInputs))
+    except (CorruptArtifact, OSError):
+        return False
 
 
 def viewer_is_missing(run: Run) -> bool:

@@ -28,7 +28,7 @@ def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
         try:
             if name not in shown:
                 page.unlink(missing_ok=True)
-            elif anew or not _is_newest(run, page):
+            elif anew or not is_newest(run, page):
                 try:
                     write_viewer_of(run.path, shown[name], page, ASSET_VIEWER if name == VIEWER and ASSET_VIEWER in shown else None)
                 except FormatError:  # `enerf verify` says what is wrong
@@ -60,7 +60,7 @@ def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
     return [], {}
 
 
-def _is_newest(run: Run, path: Path) -> bool:
+def is_newest(run: Run, path: Path) -> bool:
     """Whether the page is our own, and none of the artifacts that it shows was published after it: that is a rename of its folder, which sets ctime."""
     try:
         status = os.stat(path, follow_symlinks=False)

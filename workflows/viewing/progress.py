@@ -24,6 +24,7 @@ from stages.artifacts import BakeOutputs, TrainOutputs
 from stages.scratch import opened
 from workflows.cli.target import open_run
 from workflows.inspection.status import run_status
+from workflows.report.signature import VIEWER, viewers
 
 TRAINED = (TrainOutputs, BakeOutputs)  # the stages that have a log and previews
 PREVIEW = re.compile(r"preview_([0-9]{6,12})\.png")
@@ -55,7 +56,7 @@ class Progress:
         self._due = -float("inf")
 
     def state(self) -> dict[str, Any]:
-        """As `enerf status --json` gives, with `training`: steps, curves and previews by stage; `asset`: what tells the present asset from another, or None;
+        """As `enerf status --json` gives, with `training`: steps, curves and previews by stage; `asset`: an identifier of what the viewer shows, or None;
         `error`: why the run could not be read now, or None. Where it is too early to read again, the last state is returned."""
         with self._lock:
             began = self.clock()
@@ -76,13 +77,13 @@ class Progress:
         previews: dict[tuple[str, str], str] = {}
         training = {outputs.stage: _training(run, each, previews) for outputs in TRAINED for each in decisions if each.stage == outputs.stage}
         self.previews = previews
-        return {**run_status(run, decisions), "name": run.path.name, "training": training, "asset": asset_identity(run.path)}
+        return {**run_status(run, decisions), "name": run.path.name, "training": training, "asset": shown_identity(run)}
 
 
-def asset_identity(run: Path) -> str | None:
-    """An identifier of a run's asset, which changes when it is replaced; None: no asset."""
+def shown_identity(run: Run) -> str | None:
+    """An identifier of what a run's viewer shows, Gaussians or the asset, which changes when it is replaced; None: no asset."""
     try:
-        status = os.lstat(BakeOutputs.of_run(run).asset)
+        status = os.lstat(viewers(run).get(VIEWER, BakeOutputs.of_run(run.path).asset))
     except OSError:
         return None
     return f"{status.st_ino}-{status.st_size}-{status.st_mtime_ns}" if stat.S_ISREG(status.st_mode) else None

@@ -13,9 +13,9 @@ from pipeline.errors import PipelineError
 from pipeline.stage import Stage
 from stages.viewer.page import NAME, policy
 from workflows.cli.output import plain
-from workflows.cli.target import asset_of
+from workflows.cli.target import asset_of, open_run
 from workflows.viewing.page import make_page
-from workflows.viewing.progress import PREVIEW, Progress, asset_identity
+from workflows.viewing.progress import PREVIEW, Progress, shown_identity
 from workflows.viewing.server import Answer, open_inside
 
 HTML, JSON, PNG = "text/html; charset=utf-8", "application/json", "image/png"
@@ -48,7 +48,7 @@ class RunSite:
         self.run, self.folder = run, folder
         self.progress = Progress(run, stages)
         self._making = threading.Lock()
-        self._made: str | None = None  # of which asset the page in the folder is
+        self._made: str | None = None  # of what the page in the folder is
 
     def __call__(self, path: str) -> Answer | None:
         if path in LIVE:
@@ -70,11 +70,11 @@ class RunSite:
         return None if file is None else Answer(PNG, file=file)
 
     def _viewer(self) -> Answer | None:
-        """Of the present asset, made on the first request for it."""
+        """Of what the run shows now, made on the first request for it."""
         with self._making:
             try:
                 asset = asset_of(self.run)
-                identity, page = asset_identity(self.run), self.folder / NAME
+                identity, page = shown_identity(open_run(self.run)), self.folder / NAME
                 if identity is None:
                     return None
                 if identity != self._made:

@@ -18,6 +18,7 @@ from stages.viewer.captured import PHOTOGRAPHS, SIDE, captured_views, photograph
 from tests.efficientnerf.trees import random_tree
 from tests.stages.balls import poses
 from tests.stages.formats.gaussians import scattered
+from tests.workflows.report.records import record, record_splats
 from workflows.report.viewer import write_run_viewer
 
 
@@ -118,12 +119,18 @@ def test_the_page_shows_gaussians_where_there_are_any_or_what_was_asked_for(run:
     assert written(None) == {"viewer.html": False}
     (run.path / "splats").mkdir()
     SPLAT_EXPORTERS[".spz"](scattered(), run.path / "splats/splats.spz", CAPTURE_IS_Z_UP)
+    assert written(None) == {"viewer.html": False}, "nobody says of what these are"
+    record_splats(run.path)
     assert written(None) == {"viewer.html": True}
     assert written("asset") == {"viewer.html": False}
     assert written("both") == {"viewer.html": True, "viewer_asset.html": False}
     assert written("off") == {}
     assert Run.open(run.path).viewer == "off"
     assert written("splats") == {"viewer.html": True}
+    record(run.path, "bake", sha256="1" * 64)
+    assert written(None) == {"viewer.html": False}, "of another asset"
+    record_splats(run.path)
+    assert written(None) == {"viewer.html": True}
     (run.path / "splats/splats.spz").write_bytes(b"damaged")
     os.utime(run.path / "splats")
     assert written(None) == {}

@@ -15,15 +15,19 @@ import pytest
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from pipeline.run import Run
-from stages.artifacts import BakeOutputs
+from stages.artifacts import BakeOutputs, SplatsOutputs
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.writing import CAPTURE_IS_Z_UP
 from stages.viewer.html import policy_hash
 from stages.viewer.page import script_text
+from tests.stages.formats.gaussians import scattered
+from tests.workflows.report.records import record, record_splats
 from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
 from workflows.asset import STAGES
 from workflows.cli.main import main
 from workflows.report.signature import write_page
 from workflows.viewing import progress, sites
-from workflows.viewing.page import present_page
+from workflows.viewing.page import make_page, present_page
 from workflows.viewing.progress import MOST_POINTS, MOST_PREVIEWS, Progress
 from workflows.viewing.server import Answer
 from workflows.viewing.sites import LIVE_POLICY, AssetSite, RunSite
@@ -222,6 +226,39 @@ def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path:
     (run.path / "viewer.html").unlink()
     (run.path / "viewer.html").symlink_to(run.path / "run.json")
     assert present_page(run.path, file) is None
+
+
+def test_the_viewer_is_of_the_gaussians_once_they_are_there_and_of_a_newer_asset(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "PAUSE", 0.0)
+    monkeypatch.setattr(progress, "SHARE", 1e9)
+    site = site_of(run, tmp_path)
+    bake = BakeOutputs.of_run(run.path)
+    record(run.path, bake.stage)
+    asset(bake.asset)
+
+    def shown() -> tuple[str, bool]:
+        """What tells it from another, and whether it is of Gaussians."""
+        return json.loads(site.status())["asset"], b'"splats":{' in (body(site("/viewer.html")) or b"")
+
+    first, of_gaussians = shown()
+    assert not of_gaussians
+    splats = SplatsOutputs.of_run(run.path)
+    splats.folder.mkdir()
+    SPLAT_EXPORTERS[".spz"](scattered(), splats.spz, CAPTURE_IS_Z_UP)
+    record_splats(run.path)
+    second, of_gaussians = shown()
+    assert second != first
+    assert of_gaussians
+    splats.spz.unlink()
+    SPLAT_EXPORTERS[".spz"](scattered(300), splats.spz, CAPTURE_IS_Z_UP)
+    third, of_gaussians = shown()
+    assert third not in (first, second)
+    assert of_gaussians
+    make_page(run.path, bake.asset, run.path / "viewer.html")
+    assert present_page(run.path, bake.asset) is not None
+    record(run.path, bake.stage, sha256="1" * 64)
+    assert shown() == (first, False)
+    assert present_page(run.path, bake.asset) is None
 
 
 def test_the_viewer_is_served_with_its_own_scripts_alone_and_without_an_origin(tmp_path: Path) -> None:
