@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.format import contents, save, serialize
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
-from stages.viewer.page import viewer_page
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.writing import source_frame
+from stages.viewer.page import splats_page, viewer_page
 from tests.efficientnerf.trees import looking, random_cascades, random_tree
+from tests.stages.formats.gaussians import scattered
 
 SIDE = 64
 ORBIT = {"centre": [0.0, 1.0, -0.4], "radius": 3.0, "elevation": 20.0, "heading": 40.0, "forward_facing": False}
@@ -60,4 +64,15 @@ def decibels(found: np.ndarray, expected: np.ndarray) -> float:
 def written(folder: Path, asset: bytes, **options: Any) -> Path:
     path = folder / "viewer.html"
     path.write_bytes(viewer_page(asset, **options))
+    return path
+
+
+def page_of(kind: str, folder: Path, tree: NerfTree, **options: Any) -> Path:
+    """The page of an asset, or of Gaussians that were scattered in its frame."""
+    if kind == "asset":
+        return written(folder, serialize(tree, "compact"), **options)
+    save(tree, folder / "a.nerftree", "sparse")
+    SPLAT_EXPORTERS[".spz"](scattered(60), folder / "a.spz", source_frame(tree.metadata))
+    path = folder / "viewer.html"
+    path.write_bytes(splats_page((folder / "a.spz").read_bytes(), contents(folder / "a.nerftree")[0], **options))
     return path

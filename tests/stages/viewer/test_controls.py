@@ -13,7 +13,7 @@ from efficientnerf.asset.format import serialize
 from efficientnerf.asset.rendering import render
 from efficientnerf.geometry.cameras import Camera, project
 from tests.stages.viewer import browser
-from tests.stages.viewer.scenes import ORBIT, TREES, cameras_at, decibels, written
+from tests.stages.viewer.scenes import ORBIT, TREES, cameras_at, decibels, page_of, written
 
 pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
 
@@ -31,11 +31,11 @@ BOXES = "[...document.querySelectorAll('header, nav, nav *:not(option), main, di
 WIDE = {"viewport": {"width": 640, "height": 480}}
 
 
-@pytest.fixture
-def page_file(tmp_path: Path) -> Path:
+@pytest.fixture(params=["asset", "Gaussians"])
+def page_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Of a tree that keeps its orbit and five captured cameras."""
     tree = TREES["bounded"]().with_metadata(orbit=ORBIT)
-    return written(tmp_path, serialize(tree, "compact"), cameras=cameras_at(tree), title="a scene")
+    return page_of(request.param, tmp_path, tree, cameras=cameras_at(tree), title="a scene")
 
 
 def state(page: browser.Page) -> Any:

@@ -18,7 +18,7 @@ from stages.viewer.page import viewer_page
 from tests.efficientnerf.hostile import HOSTILE
 from tests.efficientnerf.trees import random_tree
 from tests.stages.viewer import browser
-from tests.stages.viewer.scenes import ORBIT, TREES, cameras_at, decibels, written
+from tests.stages.viewer.scenes import ORBIT, TREES, cameras_at, decibels, page_of, written
 
 pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
 
@@ -64,10 +64,10 @@ def test_the_subject_alone_is_what_the_region_says(chromium: Any, tmp_path: Path
         assert decibels(page.rendered(camera, background=(1, 1, 1), surroundings=False), expected) > 45
 
 
-def test_hands_on_the_page_move_the_picture(chromium: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["asset", "Gaussians"])
+def test_hands_on_the_page_move_the_picture(kind: str, chromium: Any, tmp_path: Path) -> None:
     tree = TREES["bounded"]().with_metadata(orbit=ORBIT)
-    poses = cameras_at(tree)
-    path = written(tmp_path, serialize(tree, "compact"), cameras=poses, photographs={"0": base64.b64decode(JPEG)}, title="a scene")
+    path = page_of(kind, tmp_path, tree, cameras=cameras_at(tree), photographs={"0": base64.b64decode(JPEG)}, title="a scene")
     with browser.opened(chromium, path, has_touch=True) as page:
         page.ready()
         mouse, keyboard = page.page.mouse, page.page.keyboard
@@ -92,11 +92,11 @@ def test_hands_on_the_page_move_the_picture(chromium: Any, tmp_path: Path) -> No
         page.page.select_option("#mode", "0")
         page.page.select_option("#background", "black")
         changed("a background")
-        for kind, places in (("touchStart", [(100, 100), (200, 100)]), ("touchMove", [(80, 100), (220, 100)]), ("touchEnd", [])):
+        for touch, places in (("touchStart", [(100, 100), (200, 100)]), ("touchMove", [(80, 100), (220, 100)]), ("touchEnd", [])):
             points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(places)]
-            if kind == "touchStart":
+            if touch == "touchStart":
                 session = page.page.context.new_cdp_session(page.page)
-            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+            session.send("Input.dispatchTouchEvent", {"type": touch, "touchPoints": points})
         changed("a pinch")
         page.page.click("#next")
         assert page.page.inner_text("#camera") == "0"
