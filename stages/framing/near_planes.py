@@ -5,6 +5,9 @@ bound its content: on a plain subject its only sparse points may be those of the
 that a fourth has in its picture, the fourth shows it or something nearer. The neighbours of a camera, and what all cameras look at, are two more bounds.
 The nearest of the three counts. See docs/priors.md.
 
+Rays have no far plane but where the source states one: nearly all points of a picture may lie on a table, and the room behind it would be painted on a shell
+before its walls. docs/experiments/near-cameras.md
+
 C photos, P points.
 """
 
@@ -24,6 +27,7 @@ MIN_POINTS = 10  # in a picture, of which its content is judged
 NEAREST, MOST_NEARER = 0.01, 10  # share, and number, of the reliable points in a picture that may lie nearer than its content begins: outliers
 RATIO = 0.5  # near plane over the depth of the nearest content; over that of the point that all cameras look at, at most
 NEIGHBOURS = 8  # cameras, nearest in place, among those whose axes are within 60 degrees
+END = 100.0  # far plane, over half of the box's longest side: contracted space ends at 64
 MAX_OVER_NEIGHBOURS = 1.5  # near plane over the median of theirs
 
 
@@ -35,14 +39,14 @@ def near_far_planes(capture: Capture, placed: Sequence[Camera], world: Similarit
     focus   (3,) what the cameras look at, there; None where their axes do not meet
 
     A constant background: the depths of the box. Surroundings: from the near plane that the source states, or before the content, to beyond everything;
-    without either, from a twentieth of the way to the box.
+    where neither is known, from a twentieth of the way to the box.
     """
     boxes = np.array([_box_depths(camera, bounds) for camera in placed]).reshape(-1, 2)
     if capture.background is not None:
         return boxes
     content = content_depths(capture, placed, world)
     stated = np.array([bool(photo.near and photo.far) for photo in capture.photos])
-    near, far = np.where(stated, 0.9, RATIO) * content[:, 0], np.fmax(boxes[:, 1], np.where(stated, 1.1, 1.5) * content[:, 1])
+    near, far = np.where(stated, 0.9, RATIO) * content[:, 0], np.fmax(boxes[:, 1], np.where(stated, 1.1 * content[:, 1], END))
     caps = [MAX_OVER_NEIGHBOURS * of_neighbours(near, placed)]
     if focus is not None:
         caps.append(RATIO * depths_in_picture(focus, placed))

@@ -58,7 +58,7 @@ class PosesSettings:
         "auto",
         "How silhouettes are made where photographs have no masks: the subject is found by a short first training (foreground), the background stands still"
         " while the object turns (static), the background has one colour (green, white, #rrggbb), or not at all (off); auto: static where cameras found from"
-        " the object alone show that it turned.",
+        " the object alone show that it turned, white where a white backdrop holds no feature.",
         advanced=True,
     )
     mask_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
@@ -126,7 +126,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="poses",
-    version=14,
+    version=15,
     settings=PosesSettings,
     needs=(),
     run=ByName("stages.poses.run:run"),

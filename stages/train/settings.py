@@ -33,7 +33,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="train",
-    version=12,
+    version=13,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=ByName("stages.train.run:run"),
