@@ -116,31 +116,30 @@ def compactness(kept: np.ndarray) -> str | None:
     return None
 
 
-def overlaps(pictures: Sequence[np.ndarray], cameras: Sequence[Camera], hull: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """(C,) intersection over union of each silhouette and the projection of the visual hull.
+def finer_hull(pictures: Sequence[np.ndarray], cameras: Sequence[Camera], hull: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (N, 3) and sides (3,) of the voxels of a hull, split, without those whose centre is outside of a silhouette.
 
     pictures   (h, w) bool each
-    hull, step centres (N, 3) of the voxels of a hull that leaves nothing out, and their sides (3,): the voxels are split, and those whose centre is outside
-               of a silhouette are left out
+    hull, step centres (N, 3) of the voxels of a hull that leaves nothing out, and their sides (3,)
     """
-    cameras = [resized(camera, picture.shape[1], picture.shape[0]) for picture, camera in zip(pictures, cameras, strict=True)]
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     xyz, step = (hull[:, None] + corners * step / 4).reshape(-1, 3), step / 2
     against = np.zeros(len(xyz), int)
     for picture, camera in zip(pictures, cameras, strict=True):
-        index, column, row = _pixels(xyz, camera)
+        index, column, row = _pixels(xyz, resized(camera, picture.shape[1], picture.shape[0]))
         against[index] += ~picture[row, column]
-    xyz = xyz[against <= len(pictures) // 50]
-    found = []
-    for picture, camera in zip(pictures, cameras, strict=True):
-        index, column, row = _pixels(xyz, camera)
-        drawn = np.zeros(picture.shape, np.uint8)
-        drawn[row, column] = 1
-        depth = float(np.median(project(camera, xyz[index])[1])) if len(index) else 1.0
-        reach = max(1, round(float(step.max()) * camera.intrinsics["fx"] / depth))  # of a voxel, px
-        shown = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
-        found.append((shown & picture).sum() / max(int((shown | picture).sum()), 1))
-    return np.array(found)
+    return xyz[against <= len(pictures) // 50], step
+
+
+def projection(xyz: np.ndarray, step: np.ndarray, camera: Camera, shape: tuple[int, ...]) -> np.ndarray:
+    """(h, w) bool: where voxels with centres (N, 3) and sides (3,) are shown in a camera's picture of this shape."""
+    camera = resized(camera, shape[1], shape[0])
+    index, column, row = _pixels(xyz, camera)
+    drawn = np.zeros(shape, np.uint8)
+    drawn[row, column] = 1
+    depth = float(np.median(project(camera, xyz[index])[1])) if len(index) else 1.0
+    reach = max(1, round(float(step.max()) * camera.intrinsics["fx"] / depth))  # of a voxel, px
+    return np.asarray(cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8)) > 0)
 
 
 def _pixels(xyz: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -206,13 +205,21 @@ def _of_photographs(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray
     return True, why, [photo.camera.name for (photo, _), fit in zip(good, fits, strict=True) if not fit]
 
 
-def hull_overlaps(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray]]) -> np.ndarray:
-    """(C,) `overlaps` of silhouettes, (h, w) bool each, with their own visual hull; 0 where that is empty."""
+def hull_of(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray]]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Centres (N, 3) and sides (3,) of the voxels of the visual hull of silhouettes, (h, w) bool each; None where it is empty."""
     cameras, masks = [photo.camera for photo, _ in pictures], [picture for _, picture in pictures]
     focus, converging = focus_point(capture)
-    ranges = [(photo.near, photo.far) for photo, _ in pictures]
-    hull = scene_bounds.whole_visual_hull(masks, cameras, ranges, focus, converging)
-    return np.zeros(len(pictures)) if hull is None else overlaps(masks, cameras, *hull)
+    hull = scene_bounds.whole_visual_hull(masks, cameras, [(photo.near, photo.far) for photo, _ in pictures], focus, converging)
+    return None if hull is None else finer_hull(masks, cameras, *hull)
+
+
+def hull_overlaps(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray]]) -> np.ndarray:
+    """(C,) intersection over union of silhouettes, (h, w) bool each, and the projection of their own visual hull; 0 where that is empty."""
+    hull = hull_of(capture, pictures)
+    if hull is None:
+        return np.zeros(len(pictures))
+    shown = [projection(*hull, photo.camera, picture.shape) for photo, picture in pictures]
+    return np.array([(one & other).sum() / max(int((one | other).sum()), 1) for one, (_, other) in zip(shown, pictures, strict=True)])
 
 
 def share_that_fits(capture: Capture, kind: Silhouettes, reader: PhotoReader) -> float:

@@ -68,6 +68,11 @@ class SparsePoints:
     error: np.ndarray
     tracks: tuple[tuple[int, ...], ...]
 
+    def only(self, kept: np.ndarray) -> SparsePoints:
+        """The points of these indices."""
+        tracks = tuple(self.tracks[index] for index in kept.tolist()) if self.tracks else ()
+        return SparsePoints(self.xyz[kept], self.rgb[kept], self.error[kept], tracks)
+
 
 class Alignment(Struct, frozen=True, omit_defaults=True, kw_only=True):
     """Cameras that were found, against positions that are known of so many photographs."""
@@ -94,7 +99,7 @@ class Provenance(Struct, frozen=True, omit_defaults=True):
     lens: Lens | None = None  # photographs that were zoomed have a focal length each, cropped ones a principal point
     own_intrinsics: str | UnsetType | None = UNSET  # which each photograph has of its own (`stages.sfm.intrinsics.own`), if any
     moving_parts: dict[str, float] = {}  # name of a photograph -> share of it that moves
-    background: Literal["left out", "stands still"] | None = None  # of a subject that turns
+    background: Literal["left out", "stands still", "white"] | None = None  # of a subject that turns; or a white one that is left out
     stated_cameras: Alignment | None = None
     gps: Alignment | None = None
 

@@ -21,6 +21,7 @@ from stages.io.capture import FOREGROUND, Capture, Provenance, Silhouettes
 from stages.io.material import photographs_of
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.reader import PhotoReader
+from stages.masking.backdrop import without_white_backdrop
 from stages.masking.background import silhouettes_with_surroundings
 from stages.masking.made import made_masks, masks_by_network
 from stages.masking.polarity import INVERTED_NOTICE, kept_white
@@ -41,12 +42,12 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     find = _search(job, paths, reader, warn)
     given = kept_white(job, paths, found.masks, reader)
     masks = {**given.masks, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
-    if not masks and settings.mask_from == "auto" and settings.masks != "ignore":
-        capture, seen = _of_turning_subject(job, find, paths, reader)
-    else:
-        capture, seen = None, False
+    guessed = not masks and settings.mask_from == "auto" and settings.masks != "ignore"
+    capture, seen = _of_turning_subject(job, find, paths, reader) if guessed else (None, False)
     if capture is None:
         capture = _by_masks(job, find, paths, masks, given.inverted, reader)
+        if guessed and not seen:
+            capture = without_white_backdrop(job, capture, paths, reader, warn)
     if seen:
         capture = replace(capture, provenance=structs.replace(capture.provenance, background="stands still"))
     capture, sentences = _in_known_frame(job, capture, paths)
@@ -119,7 +120,7 @@ def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, 
 
 def mask_choice(settings: Any, provenance: Provenance) -> str:
     """The meaning of masks: those made of a background, or by a network, are silhouettes."""
-    made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or provenance.background == "left out"
+    made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or provenance.background in ("left out", "white")
     return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
 
 

@@ -30,7 +30,7 @@ from stages.framing import training_frame
 from stages.framing.markers import with_markers
 from stages.framing.mask_use import MaskUse, doubts, find_mask_use, points_of_object, without_silhouette
 from stages.io import working_images
-from stages.io.capture import FOREGROUND, Capture, Photo, SparsePoints, without
+from stages.io.capture import FOREGROUND, Capture, Photo, without
 from stages.io.pictures import UnreadableImage
 from stages.io.reader import PhotoReader
 from stages.io.scene import SPLITS, Scene, View, save, save_points
@@ -175,7 +175,7 @@ def with_points_of_object(capture: Capture, reader: PhotoReader) -> Capture:
     """Without the sparse points that lie outside of silhouettes."""
     if not capture.silhouettes or capture.points is None:
         return capture
-    return replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, reader))))
+    return replace(capture, points=capture.points.only(np.flatnonzero(points_of_object(capture, reader))))
 
 
 def _may_be_renders(capture: Capture) -> bool:
@@ -216,11 +216,6 @@ def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[
     for sentence in [*remarks[:3], *([f"... and {len(remarks) - 3} more like these."] if len(remarks) > 3 else [])]:
         warn(sentence)
     return without(capture, kept, failed), written
-
-
-def only(points: SparsePoints, kept: np.ndarray) -> SparsePoints:
-    """The points of these indices."""
-    return SparsePoints(points.xyz[kept], points.rgb[kept], points.error[kept], tuple(points.tracks[index] for index in kept.tolist()) if points.tracks else ())
 
 
 def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: None) -> list[str]:

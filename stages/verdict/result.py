@@ -223,7 +223,7 @@ def _cause(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: Came
     train = figures["train_psnr"]
     if train is not None and train - figures["psnr"] > OVERFIT:
         cause = f"Views that training saw are right ({train:.1f} dB), and others not: too few photographs, cameras that are off, or something that moved."
-        return cause, "Take more photographs between those that are there; try train.camera_refinement=on.", SHEET
+        return cause, "Take more photographs between those that are there; where the subject was turned, leave its background out (--mask).", SHEET
     if points is not None and points["farther"] > MISSING:
         return (*_missing(points["farther"]), DEPTH)
     if points is not None and points["nearer"] > MISSING:

@@ -189,7 +189,7 @@ def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
         sentence = f"In {planar:.0%} of the pairs one homography explains all matches: the camera only turned on the spot, or all is one flat thing."
         found.append(Problem("one place", "poor", sentence, "Move round the subject between photographs; turning the camera alone shows no depth."))
     if background is not None:
-        found.append(_of_background(background == "left out"))
+        found.append(_of_background(background))
     return found
 
 
@@ -248,10 +248,13 @@ def zooms(focal_lengths: Mapping[str, float]) -> list[tuple[float, list[str]]]:
     return sorted(groups, key=lambda group: (-len(group[1]), group[0]))
 
 
-def _of_background(left_out: bool) -> Problem:
-    """Of a subject that turned before a background that stands still."""
+def _of_background(background: str) -> Problem:
+    """Of a subject that turned before a background that stands still, or that stands before white."""
+    if background == "white":
+        sentence = "The subject stands before a white backdrop without a feature: it is left out, and the subject alone is made."
+        return Problem("background", "good", sentence, "To make both, give the backdrop texture, and use --mask off.")
     sentence = "The background stands still while the subject turns"
-    if left_out:
+    if background == "left out":
         return Problem("background", "good", f"{sentence}: it is left out, and the subject alone is made.", "To make both, walk round the subject.")
     remedy = "Turn it by less between photographs, give it texture, or take it before a background without any."
     return Problem("background", "poor", f"{sentence}, and the subject alone shows too little to find cameras by.", remedy)
