@@ -14,6 +14,7 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.reader import PhotoReader
 
 MIN_POINTS = 50  # sparse points
+AROUND = 1.5  # of the median distance of cameras from where their axes meet: points farther away from there are background, whoever has them in view
 MIN_VIEW_RATIO = 0.65  # views of a point over those of the points with most: below, it is background
 MAX_CAMERAS = 48  # evenly spaced over the capture
 GRID_SIZE = 32  # voxels along a side of the region searched
@@ -62,7 +63,7 @@ def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, c
                 cut = tuple(photo.camera.name for photo, share in zip(photos, shares, strict=True) if share > MAX_OUTSIDE)
                 return SceneBounds(low, high, way, cut if len(cut) >= MIN_VIEWS else ())
         elif capture.points is not None and len(capture.points.xyz) >= MIN_POINTS:
-            found = bounds_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, converging)
+            found = bounds_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, focus if converging else None)
             if found is not None:
                 return SceneBounds(*found, way)
     return SceneBounds(*bounds_of_frusta(cameras, ranges, focus, converging), "camera frusta")
@@ -74,14 +75,17 @@ def chosen_photos(photos: Sequence[Photo]) -> list[Photo]:
     return usable[:: max(1, -(-len(usable) // MAX_CAMERAS))]
 
 
-def bounds_of_points(points: SparsePoints, cameras: Sequence[Camera], converging: bool) -> tuple[np.ndarray, np.ndarray] | None:
+def bounds_of_points(points: SparsePoints, cameras: Sequence[Camera], focus: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
     """A box round the points that most cameras have in view; None if too few remain.
 
-    Points with few views are background. In forward-facing captures all cameras have the background in view: there, depth is limited instead. Where
-    the cameras pass through the scene, as along a street, no point is in view of most, and the box holds what is near their path.
+    focus  (3,) where the cameras' axes meet; None where they do not
+
+    Points with few views are background. From one side all cameras have the background in view: there, the distance from the focus is limited, in
+    forward-facing captures the depth. Where the cameras pass through the scene, as along a street, no point is in view of most, and the box holds what is near
+    their path.
     """
     centres = np.array([camera.centre for camera in cameras])
-    if not converging and _cameras_pass_through(points.xyz, cameras, centres):
+    if focus is None and _cameras_pass_through(points.xyz, cameras, centres):
         return _bounds_of_path(points.xyz, centres)
     share = in_view(points.xyz, cameras).mean(0)
     keep = share >= MIN_VIEW_RATIO * np.quantile(share, 0.95)
@@ -93,8 +97,11 @@ def bounds_of_points(points: SparsePoints, cameras: Sequence[Camera], converging
     keep &= depth > 0
     if keep.sum() < MIN_POINTS:
         return None
-    if not converging:
+    if focus is None:
         keep &= depth < 2.5 * np.median(depth[keep])
+    else:
+        near = keep & (np.linalg.norm(points.xyz - focus, axis=1) <= AROUND * np.median(np.linalg.norm(centres - focus, axis=1)))
+        keep = near if near.sum() >= MIN_POINTS else keep
     kept = points.xyz[keep]
     kept = kept[~outliers(kept)]
     if len(kept) < MIN_POINTS:
