@@ -22,6 +22,16 @@ class Rejected(Struct, frozen=True):
     reason: str = ""
 
 
+class MarkersFound(Struct, frozen=True):
+    """Markers that give the scale: its error as a share (99 %)."""
+
+    error: float | None = None
+
+
+class CaptureFacts(Struct, frozen=True):
+    markers: MarkersFound = MarkersFound()
+
+
 class PosesReport(Struct, frozen=True):
     """`registered` are the views of the scene."""
 
@@ -30,6 +40,7 @@ class PosesReport(Struct, frozen=True):
     rejected: list[Rejected] | None = None
     warnings: list[str] | None = None
     framing: Framing = Framing()
+    facts: CaptureFacts = CaptureFacts()
 
 
 class CameraProblem(Struct, frozen=True):

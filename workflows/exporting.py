@@ -12,7 +12,7 @@ import numpy as np
 
 from efficientnerf.asset.format import FormatError, describe, serialize
 from efficientnerf.asset.tree import NerfTree, Region
-from efficientnerf.surface.mesh import Mesh
+from efficientnerf.surface.mesh import Mesh, moved
 from pipeline.decide import decide
 from pipeline.errors import BadInput, CorruptArtifact, UsageError
 from pipeline.executors.memory import Limit
@@ -22,6 +22,7 @@ from stages.artifacts import BakeOutputs, MeshInputs, MeshOutputs, PosesOutputs,
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format, cameras
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
+from stages.framing.true_frame import load_frame
 from stages.io import scene
 from stages.memory.need import Need, libraries, refuse_more_than
 from stages.memory.tree import tree_bytes
@@ -162,6 +163,10 @@ def export_cameras(export: Export) -> list[Written]:
         if not poses.scene.is_file():
             raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
         found = scene.load(poses.folder)
+        true = load_frame(what) if is_run(what) else None
+        if true is not None:
+            moved_to = true.from_capture
+            found = replace(found, views=tuple(replace(view, source_camera=moved_to.camera(view.source_camera)) for view in found.views))
         with writing(path, force=export.force):
             cameras.write(found, path)
         written.append({"path": str(path.absolute()), "cameras": len(found.views)})
@@ -219,7 +224,7 @@ def export_viewers(export: Export) -> list[Written]:
     if not export.viewers:
         return []
     try:
-        if export.region is None and export.crop is None:
+        if export.region is None and export.crop is None and not (is_run(export.what) and load_frame(export.what)):
             asset = compact_bytes(asset_of(export.what))
         else:
             asset = serialize(restricted(load_asset(export.what), export.region or "all", export.crop), "compact")
@@ -254,7 +259,10 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
     mesh = read_mesh(MeshOutputs.of_run(what))
     if mesh.texture is not None and not wanted.normal_map:
         mesh = replace(mesh, texture=replace(mesh.texture, normals=None))
-    frame = source_frame(describe(BakeOutputs.of_run(what).asset))
+    metadata, true = describe(BakeOutputs.of_run(what).asset), load_frame(what)
+    frame = source_frame(metadata) if true is None else true.source_frame(metadata)
+    if true is not None:
+        mesh = moved(mesh, true.from_capture.scale, true.from_capture.rotation, true.from_capture.translation)
     return mesh if wanted.texture != "off" or not keeps_textures else replace(mesh, texture=None), frame
 
 

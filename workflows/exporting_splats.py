@@ -11,10 +11,11 @@ from efficientnerf.splats.gaussians import Gaussians
 from pipeline.decide import decide
 from pipeline.stage import settings_from
 from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
-from stages.formats.exporters.splats.frames import in_capture
+from stages.formats.exporters.splats.frames import in_capture, moved
 from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
+from stages.framing.true_frame import load_frame
 from stages.memory.need import refuse_more_than
 from stages.splats.memory import needed
 from stages.splats.run import gaussians_of
@@ -62,4 +63,7 @@ def _made_by_the_stage(what: Path, wanted: SplatsSettings) -> tuple[Gaussians, S
     made: Any = settings_from(SplatsSettings, decision.manifest.request.settings, where=STAGE.name)
     if made != wanted:
         return None
-    return read_splats(SplatsOutputs.of_run(what).ply), source_frame(describe(BakeOutputs.of_run(what).asset))
+    gaussians, metadata, true = read_splats(SplatsOutputs.of_run(what).ply), describe(BakeOutputs.of_run(what).asset), load_frame(what)
+    if true is None:
+        return gaussians, source_frame(metadata)
+    return moved(gaussians, true.from_capture), true.source_frame(metadata)

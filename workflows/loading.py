@@ -7,16 +7,19 @@ from pathlib import Path
 from efficientnerf.asset.format import FormatError, describe, load
 from efficientnerf.asset.tree import NerfTree
 from pipeline.errors import CorruptArtifact
-from workflows.cli.target import asset_of
+from stages.framing.true_frame import load_frame
+from workflows.cli.target import asset_of, is_run
 
 
 def load_asset(path: Path) -> NerfTree:
-    """The asset of a run or of a file, read and checked. Raises BadInput and CorruptArtifact."""
+    """The asset of a run or of a file, read and checked; of a run in the frame that `enerf measure` found. Raises BadInput and CorruptArtifact."""
     found = asset_of(path)
     try:
-        return load(found)
+        tree = load(found)
     except FormatError as error:
         raise CorruptArtifact(_with_folder(found, error), (str(found),)) from error
+    frame = load_frame(path) if is_run(path) else None
+    return tree if frame is None else tree.with_metadata(**frame.metadata(tree.metadata))
 
 
 def describe_asset(path: Path) -> dict[str, object]:

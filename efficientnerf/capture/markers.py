@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from efficientnerf.capture.triangulation import across_rays, meeting, offsets_from_rays
 from efficientnerf.geometry.cameras import Camera, Similarity, closest_similarity, rays
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])  # seen from +z: clockwise from the top left, as OpenCV has them
@@ -51,9 +52,7 @@ def fit_square(cameras: Sequence[Camera], corners: np.ndarray) -> SquareFit:
     views = len(cameras)
     seen = [rays(camera, places) for camera, places in zip(cameras, corners, strict=True)]
     origin, along = np.stack([each[0] for each in seen]), np.stack([each[1] for each in seen])  # (V, 4, 3)
-    side = np.cross(along, np.where(np.abs(along[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
-    side /= np.linalg.norm(side, axis=-1, keepdims=True)
-    across = np.stack([side, np.cross(along, side)], -2)  # (V, 4, 2, 3)
+    across = across_rays(along)  # (V, 4, 2, 3)
     focal = np.array([camera.intrinsics["fx"] for camera in cameras])
     limit = STILL * np.array([max(camera.width, camera.height) for camera in cameras])
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(1)  # (V,) px
@@ -62,7 +61,7 @@ def fit_square(cameras: Sequence[Camera], corners: np.ndarray) -> SquareFit:
     square, inverse, miss = Similarity.identity(), np.full((7, 7), np.inf), np.zeros(views)
     for turn in range(ROUNDS):
         if turn < ROUNDS // 3:  # while the corners are free, few wrong views do no harm
-            square = closest_similarity(SQUARE, _meeting(origin, across, weight))
+            square = closest_similarity(SQUARE, meeting(origin, across, weight))
         off, slope = _offsets(square, origin, along, across, focal)  # (V, 4, 2), (V, 4, 2, 7)
         miss = np.sqrt((off**2).sum((1, 2)) / 4)
         weight = 1 / (1 + (miss / max(2 * float(np.median(miss)), 1e-9)) ** 2)
@@ -80,10 +79,15 @@ def fit_square(cameras: Sequence[Camera], corners: np.ndarray) -> SquareFit:
 
 def common_length(fits: Sequence[SquareFit]) -> tuple[float, float, float]:
     """The length of an edge by all of M fits, its relative error (99 %), and how many times as far apart the lengths are as their own errors explain."""
-    logs, spread = np.log([fit.square.scale for fit in fits]), np.array([fit.spread for fit in fits])
+    return common_ratio(np.array([fit.square.scale for fit in fits]), np.array([fit.spread for fit in fits]))
+
+
+def common_ratio(ratios: np.ndarray, spread: np.ndarray) -> tuple[float, float, float]:
+    """The mean of (M,) measures of one ratio, with standard deviations (M,) of their logarithms; its error and how far apart they are as of `common_length`."""
+    logs = np.log(ratios)
     weight = spread**-2 / (spread**-2).sum()
     mean = float(weight @ logs)
-    excess = float(np.sqrt((((logs - mean) / spread) ** 2).sum() / max(len(fits) - 1, 1)))
+    excess = float(np.sqrt((((logs - mean) / spread) ** 2).sum() / max(len(logs) - 1, 1)))
     return float(np.exp(mean)), SURE * float((spread**-2).sum() ** -0.5) * max(1.0, excess), excess
 
 
@@ -99,22 +103,13 @@ def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> np.ndarray |
     return np.asarray(axes[2] * np.sign((faces @ axes[2]).sum()))
 
 
-def _meeting(origin: np.ndarray, across: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(4, 3) the points nearest to the rays of each corner."""
-    matrix = np.einsum("v,vcki,vckj->cij", weight, across, across)
-    return np.asarray(np.linalg.solve(matrix + 1e-12 * np.eye(3), np.einsum("v,vcki,vckj,vcj->ci", weight, across, across, origin)[..., None])[..., 0])
-
-
 def _offsets(square: Similarity, origin: np.ndarray, along: np.ndarray, across: np.ndarray, focal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(V, 4, 2) pixels from the rays to the corners, and (V, 4, 2, 7) their derivatives by turn, place and u."""
     arm = square.scale * SQUARE @ square.rotation.T  # (4, 3)
-    to = arm + square.translation - origin  # (V, 4, 3)
-    depth = (to * along).sum(-1)[..., None]  # (V, 4, 1)
-    tangent = (across @ to[..., None])[..., 0] / depth
-    by_point = focal[:, None, None, None] * (across - tangent[..., None] * along[:, :, None]) / depth[..., None]  # (V, 4, 2, 3)
+    off, by_point = offsets_from_rays(arm + square.translation, origin, along, across, focal)  # (V, 4, 2), (V, 4, 2, 3)
     turning = np.cross(arm[None, :, None], by_point)  # a . (w x arm) = w . (arm x a)
     growing = by_point @ arm[None, :, :, None]  # (V, 4, 2, 1)
-    return focal[:, None, None] * tangent, np.concatenate([turning, by_point, growing], -1)
+    return off, np.concatenate([turning, by_point, growing], -1)
 
 
 def _moved(square: Similarity, step: np.ndarray) -> Similarity:

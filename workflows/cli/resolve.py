@@ -165,11 +165,11 @@ def seconds_of(text: str) -> float:
     return 3600 * hours + 60 * minutes + seconds
 
 
-def metres_of(text: str) -> float:
-    """Metres in `50mm`, `5cm`, `0.05m` or `2in`. Raises UsageError."""
+def metres_of(text: str, option: str = "--marker-size") -> float:
+    """Metres in `50mm`, `5cm`, `0.05m` or `2in`, above zero. Raises UsageError."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?) ?(mm|cm|m|in)", text.strip())
-    if found is None:
-        raise UsageError(f"--marker-size {printable(text, MAX_SHOWN)}: expected a length with its unit, as in 50mm, 5cm, 0.05m or 2in.")
+    if found is None or not float(found[1]):
+        raise UsageError(f"{option} {printable(text, MAX_SHOWN)}: expected a length with its unit, as in 50mm, 5cm, 0.05m or 2in.")
     return float(found[1]) * {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}[found[2]]
 
 

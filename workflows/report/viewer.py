@@ -6,11 +6,12 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from efficientnerf.asset.format import FormatError, contents
+from efficientnerf.asset.format import FormatError, contents, load, serialize
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import PipelineError
 from pipeline.run import NAME, Run, cannot_write
 from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
+from stages.framing import true_frame
 from stages.viewer.captured import captured_views
 from stages.viewer.page import compact_bytes, splats_page, viewer_page
 from workflows.report.signature import ASSET_VIEWER, VIEWER, is_own, viewers, write_page
@@ -45,12 +46,24 @@ def write_viewer_of(run: Path, shown: Path, target: Path, other: str | None = No
     """
     cameras, photographs = captured(run)
     title = os.path.basename(os.path.abspath(run))
-    if shown == SplatsOutputs.of_run(run).spz:
+    if shown == SplatsOutputs.of_run(run).spz:  # in the capture's frame, whatever `enerf measure` found
         metadata = contents(BakeOutputs.of_run(run).asset)[0]
         page = splats_page(shown.read_bytes(), metadata, cameras=cameras, photographs=photographs, title=title, asset=other)
     else:
-        page = viewer_page(compact_bytes(shown), cameras=cameras, photographs=photographs, title=title)
+        page = viewer_page(page_bytes(run, shown), cameras=cameras, photographs=photographs, title=title)
     write_page(target, page)
+
+
+def page_bytes(run: Path, asset: Path) -> bytes:
+    """The bytes of a run's asset that its page holds, in the frame that `enerf measure` found. Raises FormatError."""
+    try:
+        frame = true_frame.load_frame(run)
+    except PipelineError:  # the page shows the scene even so
+        frame = None
+    if frame is None:
+        return compact_bytes(asset)
+    tree = load(asset)
+    return serialize(tree.with_metadata(**frame.metadata(tree.metadata)), "compact")
 
 
 def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
@@ -65,7 +78,7 @@ def is_newest(run: Run, path: Path) -> bool:
     try:
         status = os.stat(path, follow_symlinks=False)
         stages = (BakeOutputs.stage, SplatsOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)
-        shown = [run.path / NAME, *map(run.folder, stages)]  # run.json says what is to be shown
+        shown = [run.path / NAME, run.path / true_frame.NAME, *map(run.folder, stages)]  # run.json says what is to be shown
         changed = [os.stat(each, follow_symlinks=False).st_ctime_ns for each in shown if os.path.lexists(each)]
     except OSError:
         return False

@@ -1,0 +1,145 @@
+"""`enerf measure`: lengths by places and by pixels, metres by known lengths that exports follow, and one line for each mistake."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset import format
+from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.geometry.cameras import Camera, project
+from pipeline.run import Run
+from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.framing.true_frame import NAME
+from stages.io.scene import Scene, View, save, similarity_to_json
+from tests.efficientnerf.capture.rings import cameras_round
+from tests.stages.balls import ORBIT, SIMILARITY
+from tests.workflows.command import Enerf
+from workflows.loading import load_asset
+
+A, B = np.array([0.3, -0.2, 0.1]), np.array([-0.25, 0.3, 0.2])
+LENGTH = float(np.linalg.norm(B - A))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """Six photographs of unknown unit, and an asset of them."""
+    path = tmp_path / "run"
+    Run.create(path, Path("/photographs"))
+    for outputs in (PosesOutputs.of_run(path), BakeOutputs.of_run(path)):
+        outputs.folder.mkdir()
+    views = [View(f"images/{c.name}", None, "train", SIMILARITY.camera(c), c, 1.0, 5.0) for c in cameras()]
+    save(Scene("photographs", tuple(views), np.array([[-1.0] * 3, [1.0] * 3]), None, SIMILARITY, ORBIT), PosesOutputs.of_run(path).folder)
+    metadata = {"world_from_capture": similarity_to_json(SIMILARITY), "metric": False}
+    index = np.argwhere(np.ones((4, 4, 4), bool))
+    tree = tree_from_voxels((1, 1, 1), 0.001, np.full(3, -0.002), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), brick=4, metadata=metadata)
+    format.save(tree, BakeOutputs.of_run(path).asset)
+    return path
+
+
+def cameras() -> list[Camera]:
+    return [replace(camera, name=f"side/{camera.name}") for camera in cameras_round(6, np.random.default_rng(0))]
+
+
+def by_pixels(point: np.ndarray, *numbers: int) -> str:
+    seen = [(cameras()[n], project(cameras()[n], point[None])[0][0]) for n in numbers]
+    return "+".join(f"{camera.name}:{x:.4f},{y:.4f}" for camera, (x, y) in seen)
+
+
+def by_numbers(point: np.ndarray) -> str:
+    return ",".join(f"{x:.9g}" for x in point)
+
+
+def test_pixels_and_places_of_the_same_points_have_one_length(enerf: Enerf, run: Path) -> None:
+    found = [enerf("measure", run, a, b, "--json") for a, b in ((by_numbers(A), by_numbers(B)), (by_pixels(A, 0, 2, 4), by_pixels(B, 1, 5)))]
+    assert [each.code for each in found] == [0, 0], found
+    for each in found:
+        assert each.object["unit"] == "unknown"
+        (leg,) = each.object["lengths"]
+        assert leg["length"] == pytest.approx(LENGTH, rel=1e-5)
+        assert 0 < leg["error"] < 0.1
+    text = enerf("measure", run, by_numbers(A), by_numbers(B), by_numbers(A)).out
+    assert f"in all: {2 * LENGTH:.5g}" in text
+    assert "--known-length" in text
+
+
+def test_known_lengths_give_metres_to_exports_and_are_forgotten(enerf: Enerf, run: Path, tmp_path: Path) -> None:
+    before = {path: path.read_bytes() for stage in ("poses", "bake") for path in (run / stage).iterdir()}
+    known = ("--known-length", by_pixels(A, 0, 1, 2, 3, 4, 5), by_pixels(B, 0, 1, 2, 3, 4, 5))
+    found = enerf("measure", run, *known, "30cm", by_pixels(A, 0, 3), by_pixels(B, 0, 3), "--json")
+    assert found.code == 0, found.err
+    factor = 0.3 / LENGTH
+    assert found.object["unit"] == "metre"
+    assert found.object["metres_per_unit_of_capture"] == pytest.approx(factor, rel=1e-5)
+    assert found.object["lengths"][0]["length"] == pytest.approx(0.3, rel=1e-5)
+    again = enerf("measure", run, by_numbers(factor * A), by_numbers(factor * B), "--json")  # places are in the frame of exports
+    assert again.object["lengths"][0]["length"] == pytest.approx(0.3, rel=1e-5)
+
+    metadata = load_asset(run).metadata
+    assert metadata["metric"] is True
+    assert metadata["world_from_capture"]["scale"] == pytest.approx(SIMILARITY.scale / factor, rel=1e-5)
+    assert enerf("export", run, "--to", tmp_path / "cameras.json").code == 0
+    first = np.array(json.loads((tmp_path / "cameras.json").read_text())["frames"][0]["transform_matrix"])
+    np.testing.assert_allclose(first[:3, 3], factor * cameras()[0].centre, rtol=1e-5)
+    assert {path: path.read_bytes() for path in before} == before
+
+    half = enerf("measure", run, "--known-length", by_numbers(factor * A), by_numbers(factor * B), "15cm", "--json")  # replaces, does not multiply
+    assert half.object["metres_per_unit_of_capture"] == pytest.approx(factor / 2, rel=1e-5)
+    assert enerf("measure", run, "--forget").code == 0
+    assert not (run / NAME).exists()
+    assert load_asset(run).metadata["metric"] is False
+
+
+def test_lengths_that_do_not_agree_or_are_not_sure_are_refused(enerf: Enerf, run: Path) -> None:
+    a, b, c = by_pixels(A, 0, 1, 2, 3, 4, 5), by_pixels(B, 0, 1, 2, 3, 4, 5), by_pixels(np.zeros(3), 0, 1, 2, 3, 4, 5)
+    two = enerf("measure", run, "--known-length", a, b, "1m", "--known-length", a, c, "1m")
+    assert two.code == 2
+    assert "do not agree" in two.err
+    near = enerf("measure", run, "--known-length", by_pixels(A, 0, 1), by_pixels(A + 0.003, 0, 1), "1m")
+    assert near.code == 2
+    assert "Give a longer one" in near.err
+    assert not (run / NAME).exists()
+
+
+def test_a_frame_of_other_cameras_is_not_applied(enerf: Enerf, run: Path) -> None:
+    known = ("--known-length", by_pixels(A, 0, 1, 2, 3), by_pixels(B, 0, 1, 2, 3), "1m")
+    assert enerf("measure", run, *known).code == 0
+    scene = PosesOutputs.of_run(run).scene
+    scene.write_bytes(scene.read_bytes() + b"\n")
+    stale = enerf("measure", run, by_numbers(A), by_numbers(B))
+    assert stale.code == 2
+    assert "other cameras" in stale.err
+    assert enerf("measure", run, *known).code == 0  # given again
+    assert enerf("measure", run, by_numbers(A), by_numbers(B)).code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["1,2,3"], "two places"),
+        (["1,2,3", "4,5"], "no place"),
+        (["1,2,3", "side/7.png:1,2+side/0.png:3,4"], "no such photograph. Nearest: side/"),
+        (["1,2,3", "side/1.png:1,2"], "two or more"),
+        (["1,2,3", "1.png:1,2+0.png:9999,4"], "outside of side/0.png"),
+        (["1,2,3", "1.png:10,20+0.png:1500,1100"], "the"),
+        (["1,2,1e300", "1,2,3"], "too far"),
+        (["--known-length", "1,2,3", "-4,5,6", "0m"], "--known-length 0m"),
+        (["--known-length", "1,2,3", "1,2,3", "1m"], "one place"),
+        (["--forget", "--known-length", "1,2,3", "-4,5,6", "1m"], "one of the two"),
+    ],
+)
+def test_a_mistake_is_told_in_a_line_or_two(enerf: Enerf, run: Path, arguments: list[str], words: str) -> None:
+    found = enerf("measure", run, *arguments)
+    assert found.code == 2, found
+    assert words in found.err
+    assert "Traceback" not in found.err
+    assert len(found.err.splitlines()) <= 2
+
+
+def test_what_is_no_run_cannot_be_measured(enerf: Enerf, tmp_path: Path) -> None:
+    found = enerf("measure", tmp_path, "1,2,3", "4,5,6")
+    assert (found.code, "run" in found.err) == (2, True)

@@ -1,0 +1,173 @@
+"""Lengths between places of a run, and its unit by lengths that are known.
+
+A place is `X,Y,Z` in the frame of the run's exports, as the viewer copies it, or a pixel in two or more photographs, `PHOTO:x,y+PHOTO:x,y`: x and y are pixels
+of the photograph at full size and upright, from its upper left corner. All is computed in the capture's frame, and scaled at the end.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.capture.markers import SURE, common_ratio
+from efficientnerf.capture.triangulation import Place, length_between, triangulated
+from efficientnerf.geometry.cameras import Camera, Similarity
+from pipeline.errors import BadInput, UsageError
+from pipeline.text import printable
+from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.framing.true_frame import KnownLength, TrueFrame, load_frame
+from stages.io import scene
+from stages.reports import poses_report
+from workflows.cli.resolve import nearest
+from workflows.cli.target import is_run, open_run
+from workflows.loading import describe_asset
+
+LARGEST_ERROR = 0.03  # of a length: what is less sure is no unit, as of markers
+LARGEST_MISS = 0.01  # of a picture's longest side: beyond it the pixels are not of one point
+LARGEST_PLACE = 1e12
+SHOWN = 200  # characters of a place in a message
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_POINT = re.compile(rf"\s*({NUMBER})\s*,\s*({NUMBER})\s*,\s*({NUMBER})\s*")
+_PIXEL = re.compile(rf"(.+?):({NUMBER}),({NUMBER})(?:\+|$)")
+_EXPECTED = "expected X,Y,Z, or pixels of two photographs or more: a.jpg:120,340+b.jpg:98,310"
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What can be measured in.
+
+    frame  in which places are given, from the capture's: that of exports
+    error  of the scale, as a share (99 %); None: not known
+    grain  the standard deviation of a place X,Y,Z that someone picked, in the capture's unit: half a voxel
+    """
+
+    cameras: Mapping[str, Camera]
+    frame: Similarity
+    metric: bool
+    error: float | None
+    grain: float
+
+    @property
+    def unit(self) -> str:
+        return "metre" if self.metric else "unknown"
+
+    def place(self, text: str) -> Place:
+        """The place in the capture's frame. Raises UsageError and BadInput."""
+        shown = printable(text, SHOWN)
+        point = _POINT.fullmatch(text)
+        if point is not None:
+            numbers = np.array([float(each) for each in point.groups()])
+            if not (np.abs(numbers) < LARGEST_PLACE).all():
+                raise UsageError(f"{shown}: too far away to be measured.")
+            return Place(self.frame.inverse().points(numbers), self.grain**2 * np.eye(3))
+        matches = [*_PIXEL.finditer(text)]
+        if not matches or matches[-1].end() != len(text):
+            raise UsageError(f"{shown}: no place; {_EXPECTED}.")
+        names = [self._name(match[1]) for match in matches]
+        if len(set(names)) < 2:
+            raise UsageError(f"{shown}: one photograph; a place needs its pixel in two or more.")
+        cameras = [self.cameras[name] for name in names]
+        places = np.array([[float(match[2]), float(match[3])] for match in matches])
+        for camera, (x, y) in zip(cameras, places, strict=True):
+            if not (0 <= x <= camera.width and 0 <= y <= camera.height):
+                raise UsageError(f"{shown}: {x:g},{y:g} lies outside of {printable(camera.name, SHOWN)}, which has {camera.width} x {camera.height} pixels.")
+        try:
+            found = triangulated(cameras, places)
+        except ValueError as error:
+            raise BadInput(f"{shown}: no place: {error}. Pick it in photographs from different sides.") from error
+        if found.miss > LARGEST_MISS * max(max(camera.width, camera.height) for camera in cameras):
+            raise BadInput(f"{shown}: the pixels are not of one point: their rays miss it by {found.miss:.0f} pixels. Pick the same point in each photograph.")
+        return found
+
+    def _name(self, given: str) -> str:
+        """The photograph of this name, or the only one whose name ends in it."""
+        ending = [name for name in self.cameras if name == given] or [name for name in self.cameras if name.rpartition("/")[2] == given]
+        if len(ending) == 1:
+            return ending[0]
+        if ending:
+            raise UsageError(f"{printable(given, SHOWN)}: {len(ending)} photographs have this name. Give its folder, too: {printable(ending[0], SHOWN)}")
+        raise UsageError(f"{printable(given, SHOWN)}: the run has no such photograph.{printable(nearest(given, self.cameras), SHOWN)}")
+
+    def length(self, a: Place, b: Place) -> tuple[float, float]:
+        """The length between two places in the frame of exports, and its error (99 %)."""
+        length, spread = length_between(a, b)
+        return self.frame.scale * length, self.frame.scale * float(np.hypot(SURE * spread, (self.error or 0.0) * length))
+
+
+def measured(run: Path, *, captured: bool = False) -> Measured:
+    """What a run can be measured in; `captured`: in the capture's frame, whatever was found since. Raises BadInput and CorruptArtifact."""
+    if not is_run(run):
+        raise BadInput(f"{run}: not a run. Give the folder of a run.")
+    poses, asset = PosesOutputs(open_run(run).folder("poses")), BakeOutputs.of_run(run).asset
+    if not poses.scene.is_file():
+        raise BadInput(f"{run}: has no cameras yet. Make them first: enerf run --out {run} --until poses")
+    found, true = scene.load(poses.folder), None if captured else load_frame(run)
+    grain = float(describe_asset(asset)["voxel_side"]) / 2 / found.world_from_capture.scale if asset.is_file() else 0.0  # type: ignore[arg-type]
+    cameras = {view.name: view.source_camera for view in found.views}
+    if true is not None:
+        return Measured(cameras, true.from_capture, True, true.error, grain)
+    return Measured(cameras, Similarity.identity(), found.metric, poses_report(poses.folder).facts.markers.error if found.metric else None, grain)
+
+
+def measure(inside: Measured, places: Sequence[str]) -> dict[str, Any]:
+    """Lengths along places, from each to the next: the facts that `enerf measure --json` prints."""
+    found = [inside.place(text) for text in places]
+    legs = []
+    for n, (a, b) in enumerate(itertools.pairwise(found)):
+        length, error = inside.length(a, b)
+        legs.append({"from": places[n], "to": places[n + 1], "length": length, "error": error})
+    shown = [
+        {
+            "place": text, "position": inside.frame.points(place.position).tolist(), "error": inside.frame.scale * SURE * place.spread,
+            "photographs": place.views, "miss": place.miss,
+        }
+        for text, place in zip(places, found, strict=True)
+    ]  # fmt: skip
+    return {"unit": inside.unit, "scale_error": inside.error, "places": shown, "lengths": legs, "total": sum(each["length"] for each in legs)}
+
+
+def frame_by_lengths(inside: Measured, run: Path, known: Sequence[tuple[str, str, float]]) -> TrueFrame:
+    """The frame whose unit is a metre, by known lengths (place, place, metres). Raises BadInput where they are not sure, or do not agree."""
+    ratios, spreads = [], []
+    for begin, end, metres in known:
+        length, spread = length_between(inside.place(begin), inside.place(end))
+        if not length > 0:
+            raise BadInput(f"{printable(begin, SHOWN)} and {printable(end, SHOWN)} are one place, which has no length.")
+        ratios.append(metres / length)
+        spreads.append(max(spread / length, 1e-6))
+    ratio, error, excess = common_ratio(np.array(ratios), np.array(spreads))
+    residuals = [float(ratio / each - 1) for each in ratios]
+    if len(known) > 1 and excess > 3 and max(map(abs, residuals)) > LARGEST_ERROR:
+        listed = ", ".join(f"{metres:g} m: {residual:+.1%}" for (_, _, metres), residual in zip(known, residuals, strict=True))
+        raise BadInput(f"{run}: the known lengths do not agree ({listed}): one is wrong, or a place is not where it was meant.")
+    if error > LARGEST_ERROR:
+        raise BadInput(f"{run}: lengths would be known within {error:.0%} only. Give a longer one, or pick its ends in more photographs, from different sides.")
+    lengths = tuple(KnownLength(begin, end, metres, off) for (begin, end, metres), off in zip(known, residuals, strict=True))
+    return TrueFrame(Similarity(ratio, np.eye(3), np.zeros(3)), error, lengths)
+
+
+def in_words(found: Mapping[str, Any]) -> list[str]:
+    """The facts of `measure` as lines."""
+    unit = " m" if found["unit"] == "metre" else ""
+    lines = [f"{each['from']} to {each['to']}: {with_error(each['length'], each['error'], unit)}" for each in found["lengths"]]
+    if len(lines) > 1:
+        lines.append(f"in all: {found['total']:.5g}{unit}")
+    if not unit:
+        lines.append("In the capture's unit, which is not known. Give a length that you know (--known-length A B 0.30m), or markers (enerf run --marker-size).")
+    elif found["scale_error"] is None:
+        lines.append("How sure the scale is is not known: it was given with the cameras, or by GPS.")
+    return lines
+
+
+def with_error(length: float, error: float, unit: str) -> str:
+    """`0.3021 m, within 0.0013 m (99 %)`."""
+    if not error > 0:
+        return f"{length:.5g}{unit}"
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
+    return f"{length:.{digits}f}{unit}, within {error:.{digits}f}{unit} (99 %)"
