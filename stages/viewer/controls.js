@@ -1,6 +1,7 @@
 // Mouse, touch, keyboard, buttons; the captured cameras drawn over the picture; the photograph beside the rendering.
 
 import { projected } from "./camera.js";
+import { Measure } from "./measure.js";
 
 const element = (id) => document.getElementById(id);
 const MODES = ["colour", "depth", "normals", "colour without view dependence"];
@@ -25,6 +26,7 @@ export class Controls {
     this.canvas = viewer.canvas;
     this.pointers = new Map();
     this.frusta = false;
+    this.measure = new Measure(viewer, page.title);
     viewer.drawn = (whole, milliseconds) => this.drawn(whole, milliseconds);
     this.pointing();
     this.keys();
@@ -74,7 +76,7 @@ export class Controls {
       eye.approach(Math.exp(Math.max(-200, Math.min(200, event.deltaY * (event.deltaMode ? 30 : 1))) * 0.0015));
       this.changed();
     }, { passive: false });
-    canvas.addEventListener("dblclick", () => this.reset());
+    canvas.addEventListener("dblclick", () => { if (!this.measure.on) this.reset(); });
   }
 
   keys() {
@@ -83,11 +85,11 @@ export class Controls {
       "+": () => this.eye.approach(0.9), "=": () => this.eye.approach(0.9), "-": () => this.eye.approach(1 / 0.9),
       a: () => this.eye.pan(0.05, 0), d: () => this.eye.pan(-0.05, 0), w: () => this.eye.pan(0, 0.05), s: () => this.eye.pan(0, -0.05),
       ",": () => this.step(-1), ".": () => this.step(1), " ": () => this.spin(!this.viewer.spin), r: () => this.reset(), c: () => this.showFrusta(!this.frusta),
-      p: () => this.save(), "?": () => this.help(),
+      p: () => this.save(), m: () => this.measure.show(!this.measure.on), "?": () => this.help(),
       1: () => this.mode(0), 2: () => this.mode(1), 3: () => this.mode(2), 4: () => this.mode(3),
     };
     document.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || /^(SELECT|INPUT)$/.test(event.target.tagName)) return;
+      if (event.ctrlKey || event.metaKey || event.altKey || /^(SELECT|INPUT|TEXTAREA)$/.test(event.target.tagName)) return;
       if (event.key === " " && event.target.tagName === "BUTTON") return;
       const action = Object.hasOwn(actions, event.key) ? actions[event.key] : null;
       if (!action || element("help").open) return;
@@ -208,9 +210,10 @@ export class Controls {
   }
 
   click(event) {
-    if (!this.frusta || !this.marks) return;
     const box = this.canvas.getBoundingClientRect(), ratio = this.canvas.width / box.width;
     const x = (event.clientX - box.left) * ratio, y = (event.clientY - box.top) * ratio;
+    if (this.measure.on && event.button === 0) this.measure.click(x, y);
+    if (this.measure.on || !this.frusta || !this.marks) return;
     const near = this.marks.map(([a, b, index]) => [Math.hypot(a - x, b - y), index]).sort((a, b) => a[0] - b[0])[0];
     if (near && near[0] < 22 * ratio) this.jump(near[1]);
   }
@@ -230,6 +233,7 @@ export class Controls {
 
   drawn(whole, milliseconds) {
     this.drawFrusta();
+    this.measure.draw(element("over").getContext("2d"));
     const { frames } = this.viewer, [width, height] = [this.viewer.renderer.target.width, this.viewer.renderer.target.height];
     element("rate").textContent = whole ? `${width} × ${height}` : `${frames.length} frames/s, ${width} × ${height}, ${milliseconds.toFixed(0)} ms`;
   }

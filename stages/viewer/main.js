@@ -147,6 +147,16 @@ class Viewer {
     return out;
   }
 
+  // Along the view axis to the surface that the only pixel of a view shows; below zero where there is none.
+  depth(view) {
+    if (this.fence !== null) this.renderer.gl.deleteSync(this.fence);
+    this.fence = null;
+    this.renderer.begin(view, { ...this.settings(false), mode: 4 }, 1, 1);
+    this.renderer.band(1);
+    this.touch();
+    return new DataView(this.renderer.pixels().buffer).getFloat32(0, true);
+  }
+
   async show(subject) {
     if (subject === this.subject) return;
     this.subject = subject;

@@ -31,7 +31,9 @@ from stages.formats.exporters.writing import source_frame
 from stages.viewer.html import json_for_html, policy_hash
 
 FOLDER = Path(__file__).parent
-MODULES = ("sha256", "asset", "payload", "volume", "shader", "renderer", "camera", "controls", "splats", "main")  # each after those that it imports
+MODULES = (
+    "sha256", "asset", "payload", "volume", "shader", "renderer", "camera", "measure", "controls", "splats", "main",
+)  # each after those that it imports  # fmt: skip
 NAME = "viewer.html"
 LARGEST_SPZ = 2**29  # bytes, of millions of Gaussians
 PART = 3 * 2**18  # bytes of compressed data in an element of the page; a multiple of 3

@@ -67,7 +67,7 @@ uniform mat3 ndcFromWorld;              // rotation to the reference camera
 uniform vec3 ndcEye;
 uniform vec3 ndcLens;                   // slopes along x and y, near plane
 uniform vec4 background;                // a: whether it takes the place of the environment
-uniform int mode;                       // 0 colour, 1 depth, 2 normal, 3 harmonics of degree 0
+uniform int mode;                       // 0 colour, 1 depth, 2 normal, 3 harmonics of degree 0, 4 the depth's own bytes
 uniform vec2 range;                     // least and greatest depth shown
 uniform bool rough;                     // colours of one voxel in place of eight
 uniform float least;                    // weight below which no colour is looked up; it is added to that of the next sample
@@ -233,6 +233,11 @@ ${tree.ndc ? `  vec3 d = ndcFromWorld * direction;
     if (part.x < part.y) march(n, start[n], direction, part.x / side[n], part.y / side[n]);
   }
   if (halfway >= 0.0) depth = halfway * local.z;`}
+  if (mode == 4) {
+    uint bits = floatBitsToUint(depth);
+    result = vec4(bits & 255u, (bits >> 8u) & 255u, (bits >> 16u) & 255u, bits >> 24u) / 255.0;
+    return;
+  }
   float opacity = 1.0 - transmittance;
   if (mode == 1) colour = depth < 0.0 ? background.rgb : scale(clamp((1.0 / range.x - 1.0 / max(depth, range.x)) / (1.0 / range.x - 1.0 / range.y), 0.0, 1.0));
   else if (mode == 2) colour = depth < 0.0 || dot(facing, facing) == 0.0 ? background.rgb : 0.5 + 0.5 * normalize(facing);

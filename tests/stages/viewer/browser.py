@@ -23,6 +23,9 @@ RENDER = """async ([pose, lens, width, height, options]) => {
   return btoa(Array.from(found, (x) => String.fromCharCode(x)).join(""));
 }"""
 
+VIEW = "async () => { const { viewer } = await enerf.ready, { width, height } = viewer.canvas; return [viewer.eye.view(width, height), width, height]; }"
+WIDE = {"viewport": {"width": 640, "height": 480}}
+
 RESTED = """async () => {
   const { viewer } = await enerf.ready, frame = () => new Promise((done) => requestAnimationFrame(done));
   for (let still = 0; still < 3; await frame()) still = viewer.state === "done" ? still + 1 : 0;

@@ -13,6 +13,7 @@ from efficientnerf.asset.format import serialize
 from efficientnerf.asset.rendering import render
 from efficientnerf.geometry.cameras import Camera, project
 from tests.stages.viewer import browser
+from tests.stages.viewer.browser import VIEW, WIDE
 from tests.stages.viewer.scenes import ORBIT, TREES, cameras_at, decibels, page_of, written
 
 pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
@@ -21,14 +22,12 @@ STATE = """async () => {
   const { viewer, controls } = await enerf.ready, { eye } = viewer, { azimuth, elevation, distance, target, held } = eye;
   return { azimuth, elevation, distance, target, held: held && held.name, mode: viewer.options.mode, spin: viewer.spin, frusta: controls.frusta };
 }"""
-VIEW = "async () => { const { viewer } = await enerf.ready, { width, height } = viewer.canvas; return [viewer.eye.view(width, height), width, height]; }"
 INKED = """([x, y]) => {
   const copy = new OffscreenCanvas(9, 9).getContext("2d");
   copy.drawImage(document.getElementById("over"), x - 4, y - 4, 9, 9, 0, 0, 9, 9);
   return copy.getImageData(0, 0, 9, 9).data.filter((_, n) => n % 4 === 3).some((alpha) => alpha > 0);
 }"""
 BOXES = "[...document.querySelectorAll('header, nav, nav *:not(option), main, dialog[open]')].map((x) => x.getBoundingClientRect())"
-WIDE = {"viewport": {"width": 640, "height": 480}}
 
 
 @pytest.fixture(params=["asset", "Gaussians"])
