@@ -164,9 +164,7 @@ def export_cameras(export: Export) -> list[Written]:
             raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
         found = scene.load(poses.folder)
         true = load_frame(what) if is_run(what) else None
-        if true is not None:
-            moved_to = true.from_capture
-            found = replace(found, views=tuple(replace(view, source_camera=moved_to.camera(view.source_camera)) for view in found.views))
+        found = found if true is None else true.scene(found)
         with writing(path, force=export.force):
             cameras.write(found, path)
         written.append({"path": str(path.absolute()), "cameras": len(found.views)})

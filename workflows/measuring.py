@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from efficientnerf.capture.markers import SURE, common_ratio
@@ -20,9 +21,12 @@ from efficientnerf.capture.triangulation import Place, length_between, triangula
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput, UsageError
 from pipeline.text import printable
-from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
+from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.writing import SourceFrame
 from stages.framing.true_frame import KnownLength, TrueFrame, load_frame
 from stages.io import scene
+from stages.mesh.files import read_vertices
 from stages.reports import poses_report
 from workflows.cli.resolve import nearest
 from workflows.cli.target import is_run, open_run
@@ -44,6 +48,7 @@ class Measured:
 
     frame  in which places are given, from the capture's: that of exports
     error  of the scale, as a share (99 %); None: not known
+    up     (3,) unit, in the capture's frame
     grain  the standard deviation of a place X,Y,Z that someone picked, in the capture's unit: half a voxel
     """
 
@@ -51,6 +56,7 @@ class Measured:
     frame: Similarity
     metric: bool
     error: float | None
+    up: np.ndarray
     grain: float
 
     @property
@@ -110,9 +116,32 @@ def measured(run: Path, *, captured: bool = False) -> Measured:
     found, true = scene.load(poses.folder), None if captured else load_frame(run)
     grain = float(describe_asset(asset)["voxel_side"]) / 2 / found.world_from_capture.scale if asset.is_file() else 0.0  # type: ignore[arg-type]
     cameras = {view.name: view.source_camera for view in found.views}
+    up = SourceFrame(found.world_from_capture).up
     if true is not None:
-        return Measured(cameras, true.from_capture, True, true.error, grain)
-    return Measured(cameras, Similarity.identity(), found.metric, poses_report(poses.folder).facts.markers.error if found.metric else None, grain)
+        return Measured(cameras, true.from_capture, True, true.error, up, grain)
+    return Measured(cameras, Similarity.identity(), found.metric, poses_report(poses.folder).facts.markers.error if found.metric else None, up, grain)
+
+
+def sides_of(run: Path) -> dict[str, Any] | None:
+    """The upright box of least area round the run's mesh: its longer side, its shorter one and its height, and their errors; None without a mesh."""
+    outputs = MeshOutputs.of_run(run)
+    vertices = read_vertices(outputs) if outputs.ply.is_file() else np.zeros((0, 3))
+    if not len(vertices):
+        return None
+    inside = measured(run)
+    turned = vertices @ gltf_from_capture(inside.up).T  # y up
+    longer, shorter = sorted(cv2.minAreaRect((turned[:, [0, 2]] - turned[0, [0, 2]]).astype(np.float32))[1], reverse=True)
+    sides = inside.frame.scale * np.array([longer, shorter, np.ptp(turned[:, 1])])
+    errors = np.hypot(SURE * np.sqrt(2) * inside.grain * inside.frame.scale, (inside.error or 0.0) * sides)
+    return {"unit": inside.unit, "scale_error": inside.error, "sides": sides.tolist(), "errors": errors.tolist()}
+
+
+def sides_in_words(found: Mapping[str, Any]) -> str:
+    """`0.42 m by 0.31 m, 0.60 m high, within 0.004 m (99 %)`."""
+    error, unit = max(found["errors"]), " m" if found["unit"] == "metre" else ""
+    longer, shorter, height = (with_error(side, error, unit).partition(",")[0] for side in found["sides"])
+    within = with_error(0.0, error, unit).partition(",")[2]
+    return f"{longer} by {shorter}, {height} high" + (f",{within}" if within else "")
 
 
 def measure(inside: Measured, places: Sequence[str]) -> dict[str, Any]:
@@ -158,11 +187,14 @@ def in_words(found: Mapping[str, Any]) -> list[str]:
     lines = [f"{each['from']} to {each['to']}: {with_error(each['length'], each['error'], unit)}" for each in found["lengths"]]
     if len(lines) > 1:
         lines.append(f"in all: {found['total']:.5g}{unit}")
-    if not unit:
-        lines.append("In the capture's unit, which is not known. Give a length that you know (--known-length A B 0.30m), or markers (enerf run --marker-size).")
-    elif found["scale_error"] is None:
-        lines.append("How sure the scale is is not known: it was given with the cameras, or by GPS.")
-    return lines
+    return lines + unit_in_words(found)
+
+
+def unit_in_words(found: Mapping[str, Any]) -> list[str]:
+    """What there is to say about the unit, and how to get it where it is not known."""
+    if found["unit"] != "metre":
+        return ["In the capture's unit, which is not known. For metres: enerf measure RUN --known-length A B 0.30m, or markers (enerf run --marker-size 50mm)."]
+    return ["How sure the scale is is not known: it was given with the cameras, or by GPS."] if found["scale_error"] is None else []
 
 
 def with_error(length: float, error: float, unit: str) -> str:

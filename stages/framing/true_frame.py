@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +21,7 @@ from pipeline.hashes import sha256_of
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.formats.exporters.writing import SourceFrame, source_frame
-from stages.io.scene import similarity_to_json
+from stages.io.scene import Scene, similarity_to_json
 from stages.io.scene_schema import Positive, SimilarityDocument, decoded, json_of_run
 
 NAME = "frame.json"
@@ -58,6 +58,11 @@ class TrueFrame:
     from_capture: Similarity
     error: float
     lengths: tuple[KnownLength, ...]
+
+    def scene(self, found: Scene) -> Scene:
+        """The scene, its photographs' cameras in this frame."""
+        views = tuple(replace(view, source_camera=self.from_capture.camera(view.source_camera)) for view in found.views)
+        return replace(found, views=views, world_from_capture=then(found.world_from_capture, self.from_capture.inverse()), metric=True)
 
     def metadata(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
         """What of an asset's metadata differs in this frame."""

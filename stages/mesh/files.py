@@ -33,6 +33,12 @@ def read_mesh(outputs: MeshOutputs) -> Mesh:
     return Mesh(positions, faces, normals, colours, texture=_read_texture(outputs, faces, positions) if len(faces) else None)
 
 
+def read_vertices(outputs: MeshOutputs) -> np.ndarray:
+    """(N, 3) in the capture's frame. Raises CorruptArtifact."""
+    vertices, _ = _read_ply(outputs.ply)
+    return np.stack([vertices[name] for name in ("x", "y", "z")], 1).astype(np.float64)
+
+
 def write_empty_meshes(outputs: MeshOutputs, frame: SourceFrame) -> None:
     """PLY, GLB and OBJ without vertices and faces; the GLB, in which no mesh may be empty, without a mesh."""
     write_parts(outputs.ply, [ply_header(0, 0, frame).encode("ascii")])

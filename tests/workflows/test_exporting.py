@@ -16,6 +16,7 @@ import pytest
 
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Texture
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.run import Run
@@ -23,7 +24,8 @@ from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
-from stages.mesh.files import read_mesh
+from stages.framing.true_frame import TrueFrame, save_frame
+from stages.mesh.files import read_mesh, read_vertices
 from stages.mesh.settings import MeshSettings
 from stages.points.settings import PointsSettings
 from tests.stages.io.meshes import block
@@ -74,6 +76,16 @@ def test_what_the_stage_has_made_is_written_as_it_made_it(run: Path) -> None:
     outputs = MeshOutputs.of_run(run)
     for path in (outputs.glb, outputs.ply, outputs.texture, outputs.material):
         assert (run.parent / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(run: Path) -> None:
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    save_frame(TrueFrame(Similarity(3.0, np.eye(3), np.zeros(3)), 0.01, ()), run)
+    export(run, "mesh.obj", "mesh.ply", "mesh.glb")
+    before, after = (read_vertices(SimpleNamespace(ply=path)) for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
+    np.testing.assert_allclose(after, 3 * before, rtol=1e-6)
+    assert b"unit metre" in (run.parent / "mesh.obj").read_bytes()[:200]
 
 
 def test_a_texture_may_be_left_out_of_it(run: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, project
 from pipeline.run import Run
-from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
+from stages.formats.exporters import MESH_EXPORTERS
 from stages.framing.true_frame import NAME
 from stages.io.scene import Scene, View, save, similarity_to_json
 from tests.efficientnerf.capture.rings import cameras_round
 from tests.stages.balls import ORBIT, SIMILARITY
+from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Enerf
 from workflows.loading import load_asset
 
@@ -84,6 +87,7 @@ def test_known_lengths_give_metres_to_exports_and_are_forgotten(enerf: Enerf, ru
     assert metadata["world_from_capture"]["scale"] == pytest.approx(SIMILARITY.scale / factor, rel=1e-5)
     assert enerf("export", run, "--to", tmp_path / "cameras.json").code == 0
     first = np.array(json.loads((tmp_path / "cameras.json").read_text())["frames"][0]["transform_matrix"])
+    assert json.loads((tmp_path / "cameras.json").read_text())["unit"] == "metre"
     np.testing.assert_allclose(first[:3, 3], factor * cameras()[0].centre, rtol=1e-5)
     assert {path: path.read_bytes() for path in before} == before
 
@@ -92,6 +96,27 @@ def test_known_lengths_give_metres_to_exports_and_are_forgotten(enerf: Enerf, ru
     assert enerf("measure", run, "--forget").code == 0
     assert not (run / NAME).exists()
     assert load_asset(run).metadata["metric"] is False
+
+
+def test_the_size_of_the_mesh_is_told_with_its_error_and_in_the_report(enerf: Enerf, run: Path) -> None:
+    outputs, corners = MeshOutputs.of_run(run), block()
+    outputs.folder.mkdir()
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    flat = (corners.vertices - corners.vertices.min(0)) / np.ptp(corners.vertices, axis=0)
+    MESH_EXPORTERS[".ply"](replace(corners, vertices=flat * [2.0, 0.5, 1.5] @ turn.T), outputs.ply, Z_UP)
+    outputs.report.write_text('{"faces": 12}', encoding="utf-8")
+    found = enerf("measure", run, "--json")
+    np.testing.assert_allclose(found.object["sides"], [2.0, 0.5, 1.5], rtol=1e-5)
+    assert found.object["unit"] == "unknown"
+    assert enerf("report", run).code == 0
+    unsized = (run / "report.html").read_text(encoding="utf-8")
+    assert "2.0000 by 0.5000, 1.5000 high" in unsized
+    assert "For metres: enerf measure RUN --known-length" in unsized
+    assert enerf("measure", run, "--known-length", by_numbers(A), by_numbers(B), f"{3 * LENGTH:.6f}m").code == 0
+    np.testing.assert_allclose(enerf("measure", run, "--json").object["sides"], [6.0, 1.5, 4.5], rtol=1e-5)
+    sized = (run / "report.html").read_text(encoding="utf-8")  # written again by the command
+    assert re.search(r"6\.0+ m by 1\.50+ m, 4\.50+ m high, within 0\.\d+ m \(99 %\)", sized)
+    assert "For metres" not in sized
 
 
 def test_lengths_that_do_not_agree_or_are_not_sure_are_refused(enerf: Enerf, run: Path) -> None:
@@ -115,6 +140,31 @@ def test_a_frame_of_other_cameras_is_not_applied(enerf: Enerf, run: Path) -> Non
     assert "other cameras" in stale.err
     assert enerf("measure", run, *known).code == 0  # given again
     assert enerf("measure", run, by_numbers(A), by_numbers(B)).code == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format": 2}, {"cameras": 3}, {"error": -1}, {"error": "x"}, {"lengths": [{"begin": "a"}]},
+        {"frame_from_capture": {"scale": 0, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0]}},
+        {"frame_from_capture": {"scale": 1, "rotation": np.zeros((3, 3)).tolist(), "translation": [0, 0, 0]}},
+    ],
+)  # fmt: skip
+def test_a_damaged_frame_is_told_and_forgotten(enerf: Enerf, run: Path, change: dict[str, object]) -> None:
+    assert enerf("measure", run, "--known-length", by_pixels(A, 0, 1, 2, 3), by_pixels(B, 0, 1, 2, 3), "1m").code == 0
+    document = json.loads((run / NAME).read_text(encoding="utf-8"))
+    (run / NAME).write_text(json.dumps(document | change), encoding="utf-8")
+    found = enerf("measure", run, by_numbers(A), by_numbers(B))
+    assert (found.code, "frame.json" in found.err, len(found.err.splitlines())) == (4, True, 1), found.err
+    assert enerf("measure", run, "--forget").code == 0
+    assert enerf("measure", run, by_numbers(A), by_numbers(B)).code == 0
+
+
+def test_a_frame_that_is_a_link_is_not_followed(enerf: Enerf, run: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text("{}", encoding="utf-8")
+    (run / NAME).symlink_to(tmp_path / "other.json")
+    found = enerf("measure", run, by_numbers(A), by_numbers(B))
+    assert (found.code, "frame.json" in found.err) == (4, True)
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,14 @@ import jinja2
 from markupsafe import Markup
 
 from pipeline.decide import Decision, survey
+from pipeline.errors import PipelineError
 from pipeline.run import Run, cannot_write
 from pipeline.stage import Stage
 from pipeline.text import printable
 from stages.reports import CameraVerdict, PosesReport
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
+from workflows.measuring import sides_in_words, sides_of, unit_in_words
 from workflows.report import documents
 from workflows.report.documents import Damaged, Metrics, Quality, ResultVerdict
 from workflows.report.signature import write_page
@@ -132,6 +134,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         asset_report=_facts(folder, BAKE.report, damaged),
         mesh_report=_facts(folder, MESH.report, damaged),
         splats_report=_facts(folder, SPLATS.report, damaged),
+        sides=_sides(folder),
         mesh_seconds=_facts(folder, MESH.timings, damaged),
         previews=_previews(folder, TRAIN.previews),
         asset_previews=_previews(folder, BAKE.previews),
@@ -193,6 +196,15 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
     if report.reprojection_error is not None:
         text += f", mean reprojection error {report.reprojection_error:.2f} px"
     return {"text": text, "rejected": [(each.name, each.reason) for each in report.rejected or []], "warnings": report.warnings or []}
+
+
+def _sides(folder: Path) -> list[str]:
+    """How large the mesh is and in which unit, or how to get one."""
+    with suppress(PipelineError):
+        found = sides_of(folder)
+        if found is not None:
+            return [f"{sides_in_words(found)}.", *unit_in_words(found)]
+    return []
 
 
 def _result(folder: Path, damaged: list[str]) -> dict[str, Any] | None:

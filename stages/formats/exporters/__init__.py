@@ -73,7 +73,7 @@ _MESHES = (
            "Blender, OpenUSD; should: iOS and macOS, Houdini, Omniverse", "usd", "write_usdz", textures=True, extra="usd"),
     Format(".usdc", "the same, its image next to it", "the capture's axes (kept as a matrix)",
            "OpenUSD; should: Blender, Houdini, Omniverse, Maya", "usd", "write_usdc", textures=True, extra="usd", beside=True),
-    Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices, the unit", "trimesh; should: slicers for 3D printing, CAD",
+    Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices", "trimesh; should: slicers for 3D printing, CAD",
            "stl", "write_mesh", coloured=False),
 )  # fmt: skip
 _POINTS = (

@@ -11,6 +11,7 @@ from typing import Any
 
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose
 from pipeline.files import write_json
+from stages.formats.exporters.writing import SourceFrame
 from stages.io.scene import SPLITS, Scene, views_of
 
 # nerfstudio knows these; any other is written as the one that contains it.
@@ -32,7 +33,9 @@ def transforms_from_scene(scene: Scene) -> dict[str, Any]:
         frame["transform_matrix"] = opengl_from_pose(view.source_camera.world_from_camera).tolist()
         frames.append(frame)
     splits = {f"{split}_filenames": [view.name for view in views_of(scene, split)] for split in SPLITS}
-    return shared | {name: names for name, names in splits.items() if names} | {"frames": frames}
+    of_capture = SourceFrame(scene.world_from_capture, scene.metric)
+    stated = {"unit": of_capture.unit, "up": (of_capture.up + 0.0).tolist()}  # which nerfstudio passes over
+    return shared | stated | {name: names for name, names in splits.items() if names} | {"frames": frames}
 
 
 def write(scene: Scene, path: Path) -> None:

@@ -1,5 +1,5 @@
 """LAS 1.4 and LAZ, its compressed form, of points: the capture's frame, colours sRGB of 16 bits, normals as the extra dimensions NormalX, NormalY, NormalZ,
-which CloudCompare and PDAL take as such.
+which CloudCompare and PDAL take as such. Where the unit is known to be a metre, a local coordinate system in WKT states it.
 
 Coordinates are integers of a step that is a power of ten: at most a millionth of the points' reach, so that 32 bits hold them.
 """
@@ -17,6 +17,7 @@ from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, bytes
 
 POINT_FORMAT = 7  # with colours
 NORMALS = ("NormalX", "NormalY", "NormalZ")
+METRES = 'LOCAL_CS["frame of the capture",LOCAL_DATUM["frame of the capture",0],UNIT["metre",1]]'
 FINENESS = 1e-6  # of the points' reach
 
 
@@ -31,6 +32,9 @@ def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS
     header.system_identifier, header.generating_software = "efficientnerf", "efficientnerf"
     header.scales = np.full(3, step_of(float((high - low).max()), float(np.abs([low, high]).max())))
     header.offsets = np.floor((low + high) / 2 / header.scales[0]) * header.scales[0]
+    if frame.metric:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(METRES))
+        header.global_encoding.wkt = True
     header.add_extra_dims([laspy.ExtraBytesParams(name, "float32", "of the surface") for name in NORMALS])
     record = laspy.LasData(header)
     record.x, record.y, record.z = points.positions.T

@@ -1,4 +1,4 @@
-"""STL, binary: the faces alone, each with its normal, float32. No colours, no unit. The capture's frame."""
+"""STL, binary: the faces alone, each with its normal, float32. No colours. The capture's frame, whose unit the header states."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from efficientnerf.surface.mesh import Mesh, face_vectors
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _FACE = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_HEADER = b"binary STL of efficientnerf; frame of the capture"  # must not begin with "solid", as text does
+_HEADER = "binary STL of efficientnerf; frame of the capture; unit {unit}"  # must not begin with "solid", as text does
 
 
 def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
@@ -21,4 +21,4 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> 
     faces = np.zeros(len(mesh.faces), _FACE)
     faces["normal"] = vectors / np.where(length > 0, length, 1)
     faces["corners"] = mesh.vertices[mesh.faces]
-    write_parts(path, [_HEADER.ljust(80, b" "), np.uint32(len(faces)).astype("<u4").tobytes(), faces.tobytes()])
+    write_parts(path, [_HEADER.format(unit=frame.unit).encode("ascii").ljust(80), np.uint32(len(faces)).astype("<u4").tobytes(), faces.tobytes()])

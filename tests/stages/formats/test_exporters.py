@@ -166,6 +166,19 @@ def test_broken_meshes_are_refused(extension: str, tmp_path: Path) -> None:
 
 
 @NEEDS_LAS
+@pytest.mark.parametrize("frame", [Z_UP, Y_DOWN])
+def test_las_and_stl_state_the_unit_that_is_known(frame: SourceFrame, tmp_path: Path) -> None:
+    import laspy
+
+    points = PointCloud(np.eye(3), np.eye(3), np.eye(3))
+    POINT_EXPORTERS[".las"](points, tmp_path / "a.las", frame)
+    MESH_EXPORTERS[".stl"](block(), tmp_path / "a.stl", frame)
+    stated = [each.string for each in laspy.read(tmp_path / "a.las").header.vlrs.get("WktCoordinateSystemVlr")]
+    assert [text.endswith('UNIT["metre",1]]') for text in stated] == ([True] if frame.metric else [])
+    assert (tmp_path / "a.stl").read_bytes()[:80].rstrip().endswith(f"unit {frame.unit}".encode("ascii"))
+
+
+@NEEDS_LAS
 @pytest.mark.parametrize(("extension", "size", "at"), [(".las", 1e-4, 0.0), (".laz", 3e5, 0.0), (".laz", 20.0, 5e6)])
 def test_las_coordinates_are_fine_wherever_the_points_lie(extension: str, size: float, at: float, tmp_path: Path) -> None:
     """To a millionth of their reach, as far as doubles go; and the same points are the same bytes."""
