@@ -159,6 +159,32 @@ def test_whatever_a_file_may_hold_is_rendered_without_harm(far: float, wide: flo
     assert image.opacity.max() <= 1
 
 
+def test_pairs_name_the_blocks_that_a_gaussian_touches_and_few_others() -> None:
+    """Needles along diagonals too, whose boxes are nearly empty."""
+    gaussians = some(count=200, degree=0)
+    scales = gaussians.scales * np.array([8, 1, 0.1], np.float32)
+    values = values_of(Gaussians(gaussians.means, scales, gaussians.rotations, gaussians.opacities, gaussians.harmonics))
+    records = np.zeros((LANES * len(values), RECORD), np.float32)
+    project(values, lens_of(camera()), 0, records)
+    pairs = pairs_of(records, WIDTH, HEIGHT)
+    y, x = np.mgrid[: 16 * -(-HEIGHT // 16), : 16 * pairs.columns] + 0.5
+    named = touched = boxed = 0
+    for tile in range(len(pairs.begin) - 1):
+        row, column = divmod(tile, pairs.columns)
+        part = np.s_[16 * row : 16 * row + 16, 16 * column : 16 * column + 16]
+        for pair in range(pairs.begin[tile], pairs.begin[tile + 1]):
+            at = records[pairs.gaussian[pair]].astype(np.float64)
+            dx, dy = x[part] - at[0], y[part] - at[1]
+            strength = at[5] * np.exp(-0.5 * (at[2] * dx * dx + 2 * at[3] * dx * dy + at[4] * dy * dy))
+            meets = (strength >= 1 / 255).reshape(4, 4, 4, 4).any(axis=(1, 3)).reshape(16)
+            bits = (int(pairs.mask[pair]) >> np.arange(16) & 1).astype(bool)
+            assert (bits | ~meets).all()
+            boxed += int(((np.abs(dx) < at[9]) & (np.abs(dy) < at[10])).reshape(4, 4, 4, 4).any(axis=(1, 3)).sum())
+            named, touched = named + int(bits.sum()), touched + int(meets.sum())
+    assert 500 < touched <= named < 1.2 * touched
+    assert named < 0.8 * boxed
+
+
 def test_tiles_rendered_in_pieces_are_the_whole_and_ties_keep_their_order() -> None:
     gaussians = some(count=40)
     twice = gaussians.subset(np.tile(np.arange(40), 2))

@@ -1,7 +1,7 @@
 """Which Gaussians a tile of an image shows, nearest first (numba).
 
 A tile is TILE x TILE pixels, of sixteen blocks of 4 x 4. A pair is a Gaussian in a tile: its mask has a bit for each block, row by row, that the Gaussian may
-touch. The pairs of a tile follow each other by depth; Gaussians of one depth by number.
+touch: those that its ellipse meets, by rows of blocks. The pairs of a tile follow each other by depth; Gaussians of one depth by number.
 
 P pairs, N Gaussians, T tiles.
 """
@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.splats.projection import DEPTH, HEIGHT, WIDTH, X, Y
+from efficientnerf.backends.numba.splats.projection import CONIC_A, CONIC_B, CONIC_C, DEPTH, HEIGHT, REACH, WIDTH, X, Y
 
 TILE, BLOCK = 16, 4
+GAUSSIANS_A_TASK = 1024
 DIGITS, DIGIT = 3, 11  # of the depths' bits, that they are sorted by
 
 
@@ -84,26 +85,69 @@ def _count(records, columns, rows, begin, first):  # type: ignore[no-untyped-def
         begin[tile] += begin[tile - 1]
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _ellipse(record):  # type: ignore[no-untyped-def]
+    """What `_across` needs of a Gaussian, float64: its place, 1 / a and b of its conic, determinant, squared reach times a, and how far down its
+    rightmost point is."""
+    a, b, c = float(record[CONIC_A]), float(record[CONIC_B]), float(record[CONIC_C])
+    # `raster` finds q in float32, from terms that cancel in a needle: its error is a share of them.
+    square = 1.001 * float(record[REACH]) + 1e-6 * (a * float(record[WIDTH]) ** 2 + c * float(record[HEIGHT]) ** 2)
+    determinant = a * c - b * b
+    return float(record[X]), float(record[Y]), 1 / a, b, determinant, a * square, -b * np.sqrt(square / (c * determinant))
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _across(ellipse, row, begin, end):  # type: ignore[no-untyped-def]
+    """Of the blocks `begin` to `end` of a row of blocks, the first with the centre of a pixel in the ellipse, and the one after the last."""
+    x, y, per_a, b, determinant, square, down = ellipse
+    if not determinant > 0:  # float32 holds no such ellipse
+        return begin, end
+    above, below = BLOCK * row + 0.5 - y, BLOCK * row + BLOCK - 0.5 - y
+    right, left = min(max(down, above), below), min(max(-down, above), below)
+    to_right, to_left = square - determinant * right * right, square - determinant * left * left
+    if to_right < 0 or to_left < 0:
+        return end, end
+    first, last = x - (b * left + np.sqrt(to_left)) * per_a - 0.5, x - (b * right - np.sqrt(to_right)) * per_a - 0.5
+    if first >= BLOCK * begin:
+        begin = int(min(first / BLOCK, float(end)))
+    if last < BLOCK * end:
+        end = int(np.floor(max(last / BLOCK, begin - 1.0))) + 1
+    return begin, end
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _masks(records, columns, rows, first, masks):  # type: ignore[no-untyped-def]
+    """Blocks of each pair, (P,) by slot."""
+    for task in numba.prange((len(records) + GAUSSIANS_A_TASK - 1) // GAUSSIANS_A_TASK):
+        side, block = np.float32(TILE), np.float32(BLOCK)
+        for n in range(task * GAUSSIANS_A_TASK, min(len(records), (task + 1) * GAUSSIANS_A_TASK)):
+            if first[n + 1] > first[n]:
+                masks[first[n] : first[n + 1]] = 0
+                left, right = _range(records[n, X], records[n, WIDTH], side, columns)
+                begin, end = _range(records[n, X], records[n, WIDTH], block, 4 * columns)
+                top, bottom = _range(records[n, Y], records[n, HEIGHT], block, 4 * rows)
+                ellipse = _ellipse(records[n])
+                for row in range(top, bottom):
+                    low, high = _across(ellipse, row, begin, end)
+                    slot = first[n] + (row // 4 - top // 4) * (right - left)
+                    for column in range(low // 4, (high + 3) // 4):
+                        bits = ((1 << min(high - 4 * column, 4)) - 1) & ~((1 << max(low - 4 * column, 0)) - 1)
+                        masks[slot + column - left] |= bits << 4 * (row % 4)
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _fill(records, order, columns, rows, begin, first, gaussian, mask, slot):  # type: ignore[no-untyped-def]
-    next_of, side, block = begin.copy(), np.float32(TILE), np.float32(BLOCK)
+def _fill(records, order, columns, rows, begin, first, masks, gaussian, mask, slot):  # type: ignore[no-untyped-def]
+    next_of, side = begin.copy(), np.float32(TILE)
     for m in range(len(order)):
         n = order[m]
         left, right = _range(records[n, X], records[n, WIDTH], side, columns)
         top, bottom = _range(records[n, Y], records[n, HEIGHT], side, rows)
-        block_left, block_right = _range(records[n, X], records[n, WIDTH], block, 4 * columns)
-        block_top, block_bottom = _range(records[n, Y], records[n, HEIGHT], block, 4 * rows)
         number = first[n]
         for row in range(top, bottom):
-            low, high = max(block_top - 4 * row, 0), min(block_bottom - 4 * row, 4)
-            lines = ((1 << (4 * high)) - 1) & ~((1 << (4 * low)) - 1)
             for column in range(left, right):
-                low, high = max(block_left - 4 * column, 0), min(block_right - 4 * column, 4)
-                across = ((1 << high) - 1) & ~((1 << low) - 1)
                 at = next_of[row * columns + column]
                 next_of[row * columns + column] += 1
-                gaussian[at], slot[at] = n, number
-                mask[at] = lines & (across * 0x1111)
+                gaussian[at], slot[at], mask[at] = n, number, masks[number]
                 number += 1
 
 
@@ -113,8 +157,10 @@ def _pairs(records, columns, rows):  # type: ignore[no-untyped-def]
     begin, first = np.zeros(columns * rows + 1, np.int64), np.zeros(count + 1, np.int64)
     _count(records, columns, rows, begin, first)
     order = _by_depth(records, np.empty(count, np.int32), np.empty(count, np.int32), np.empty((1 << DIGIT) + 1, np.int64))
+    masks = np.empty(begin[-1], np.int32)
+    _masks(records, columns, rows, first, masks)
     gaussian, mask, slot = np.empty(begin[-1], np.int32), np.empty(begin[-1], np.int32), np.empty(begin[-1], np.int32)
-    _fill(records, order, columns, rows, begin, first, gaussian, mask, slot)
+    _fill(records, order, columns, rows, begin, first, masks, gaussian, mask, slot)
     return begin, gaussian, mask, slot, first
 
 

@@ -20,7 +20,7 @@ from efficientnerf.backends.numba.vector.memory import load, pointer, store
 
 LANES = 16  # Gaussians of a group
 MEAN, SCALE, ROTATION, OPACITY, HARMONICS = 0, 3, 6, 10, 11  # rows of values: logarithms of scales, logit of the opacity
-X, Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, WIDTH, HEIGHT, DEPTH = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11  # of a projected Gaussian
+X, Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, WIDTH, HEIGHT, DEPTH, REACH = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 12  # of a projected Gaussian
 RECORD = 16  # numbers of one
 LOW_PASS = np.float32(0.3)
 LEAST_ALPHA, MOST_ALPHA = np.float32(1 / 255), np.float32(0.99)
@@ -192,8 +192,9 @@ def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore
     store(row, 16 * WIDTH, select(seen, wide, _NONE))
     store(row, 16 * HEIGHT, select(seen, high, _NONE))
     store(row, 16 * DEPTH, depth)
+    store(row, 16 * REACH, reach)
     for lane in range(LANES):
-        for n in range(12):
+        for n in range(REACH + 1):
             out[first + lane, n] = row[16 * n + lane]
 
 
