@@ -28,6 +28,9 @@ LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
 LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS
 SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the error is, up to the most allowed
+# Of so many steps and more: when that is done, and the share, of the most transparent, that is left out for it each time. 3DGS-MCMC relocates dead ones.
+MANY_STEPS = 900
+RELOCATE_AT, RELOCATED = (0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.64), 0.05
 SPLIT_APART, SPLIT_SHARE = 0.5, 0.7  # of the longest standard deviation: distance of the halves from the middle, and their own
 
 
@@ -67,13 +70,14 @@ def refitted(
     count, sums = len(gaussians), np.zeros((0, raster.SUMS), np.float32)
     moments = np.zeros((len(values), fitting.GRADIENTS + values.shape[1], LANES), np.float32)
     records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
-    splits = {int(share * steps) for share in SPLIT_AT} - {0} if most else set()
+    shares, relocated = (RELOCATE_AT, RELOCATED) if steps >= MANY_STEPS else (SPLIT_AT, 0.0)
+    splits = {int(share * steps) for share in shares} - {0} if most else set()
     order: list[int] = []
     for number in range(steps):
         if not order:
             order = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 5, number])).permutation(len(views)).tolist()
         if number in splits:
-            values, moments, count = _divided(values, moments, errors[:count], most)
+            values, moments, count = _divided(values, moments, errors[:count], most, relocated)
             records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
         whole = views[order.pop()]
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
@@ -92,13 +96,15 @@ def refitted(
     return fitted.subset(fitted.opacities >= LEAST_OPACITY)
 
 
-def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Values, moments and number of the Gaussians without those that hide nothing any more; those with the greatest part in the errors (N,) are split.
+def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: int, relocated: float = 0.0) -> tuple[np.ndarray, np.ndarray, int]:
+    """Values, moments and number of the Gaussians without those that hide nothing any more, and without a share `relocated` that hides least; those with the
+    greatest part in the errors (N,) are split.
 
     The halves lie along the longest axis, next to each other in memory, and begin without momentum.
     """
     rows, state = ungrouped(values, len(errors)), ungrouped(moments, len(errors))
     alive = rows[:, OPACITY] > np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
+    alive[np.argsort(rows[:, OPACITY], kind="stable")[: int(relocated * len(rows))]] = False
     copies = alive.astype(np.int64)
     worst = np.argsort(np.where(alive, -errors, 0), kind="stable")[: max(0, most - int(alive.sum()))]
     copies[worst[alive[worst] & (errors[worst] > 0)]] = 2

@@ -228,3 +228,17 @@ def test_gaussians_are_divided_by_error_and_faint_ones_go() -> None:
     np.testing.assert_allclose(after.scales.max(axis=1)[[15, 26]], np.maximum(refit.SPLIT_SHARE * longest, next_to), rtol=1e-4)
     kept = np.setdiff1d(np.arange(5, count), [20, 30])
     np.testing.assert_allclose(after.means[np.setdiff1d(np.arange(found), halves)], begun.means[kept], atol=1e-7)
+
+
+def test_the_most_transparent_give_way_to_halves_where_the_error_is() -> None:
+    begun = merging.merged(ball(16, 0), ring(3), 100, 0)
+    count = len(begun)
+    begun = replace(begun, opacities=np.linspace(0.9, 0.1, count, dtype=np.float32))
+    errors = np.zeros(count, np.float32)
+    errors[:20] = errors[-1] = 1  # that of one that is left out does not count
+    moments = np.ones((len(values_of(begun)), 30, 16), np.float32)
+    values, state, found = refit._divided(values_of(begun), moments, errors, count, 0.1)
+    gone = int(0.1 * count)
+    assert found == count
+    assert (ungrouped(state, found) == 0).all(axis=1).sum() == 2 * gone
+    np.testing.assert_allclose(gaussians_from(values, found).means[2 * gone :], begun.means[gone : count - gone], atol=1e-7)
