@@ -95,7 +95,9 @@ def not_found(folder: Path, paths: Mapping[str, Path], search: Search, rejected:
     fewest = max(mapping.MIN_MODEL_SIZE, -(-len(images) // 2))
     what = f"cameras found for {registered} of {len(images)} photographs; at least {fewest} are needed."
     looks = look_at_all({image.name: search.base / "images" / image.file for image in images}, paths)
-    verdict = failed(what, "; ".join(hints), registered, rejected, looks, provenance_of(search, matching), _overlaps(search.work, images))
+    provenance, overlaps = provenance_of(search, matching), _overlaps(search.work, images)
+    capture = Capture(kind="photographs", photos=(), background=None, rejected=tuple(rejected), provenance=provenance, overlaps=overlaps)
+    verdict = failed(what, "; ".join(hints), registered, capture, looks)
     write_json(search.base / VERDICT, {"source": str(folder), **verdict.document()})
     also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")
     return BadInput(

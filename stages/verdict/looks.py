@@ -177,26 +177,6 @@ def of_other_exposure(looks: Mapping[str, Look]) -> list[str]:
     return sorted(name for name, each in stops.items() if abs(each - middle) > STEP)
 
 
-def dark(looks: Mapping[str, Look]) -> list[str]:
-    """The names of those that are too dark to show much, whatever the others are."""
-    return sorted(name for name, each in looks.items() if each.brightness < DARK)
-
-
-def noisy(looks: Mapping[str, Look]) -> list[str]:
-    """The names of those with so much noise that weak features are lost in it."""
-    return sorted(name for name, each in looks.items() if each.noise > NOISY)
-
-
-def compressed(looks: Mapping[str, Look]) -> list[str]:
-    """The names of those that were compressed so strongly that their blocks show."""
-    return sorted(name for name, each in looks.items() if each.compressed)
-
-
-def clipped(looks: Mapping[str, Look]) -> list[str]:
-    """The names of those of which much is black or white."""
-    return sorted(name for name, each in looks.items() if each.clipped > MOST_CLIPPED)
-
-
 def duplicates(looks: Mapping[str, Look]) -> dict[str, str]:
     """Name -> name of the first photograph that is the same picture."""
     names = sorted(looks)

@@ -82,8 +82,7 @@ def lost_places(names: Sequence[str], centres: np.ndarray, lost: Sequence[str], 
     for name in lost:
         near = [(place[b if a == name else a], count) for a, b, count in overlaps if name in (a, b) and (b if a == name else a) in place]
         if near:
-            weights = np.array([count for _, count in near], np.float64)
-            found.append((centres[[index for index, _ in near]] * weights[:, None]).sum(0) / weights.sum())
+            found.append(np.average(centres[[index for index, _ in near]], axis=0, weights=[count for _, count in near]))
     return np.array(found).reshape(-1, 3)
 
 
@@ -95,8 +94,7 @@ def match_picture(names: Sequence[str], lost: Sequence[str], overlaps: Sequence[
         if a in place and b in place:
             counts[place[a], place[b]] = counts[place[b], place[a]] = count
     shade = np.clip(np.log2(np.maximum(counts, 1.0)) / 9.0, 0.0, 1.0)[..., None]
-    ink = np.tile(np.array(GOOD, np.float64), (len(names), len(names), 1))
-    paper = np.tile(np.array(PAPER, np.float64), (len(names), len(names), 1))
+    ink, paper = (np.full((len(names), len(names), 3), colour, np.float64) for colour in (GOOD, PAPER))
     for name in lost:
         if name in place:
             for rows in (np.s_[place[name], :], np.s_[:, place[name]]):

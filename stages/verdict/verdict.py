@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -17,7 +17,7 @@ from msgspec import to_builtins
 
 from efficientnerf.geometry.cameras import Camera
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
-from stages.io.capture import Capture, Provenance
+from stages.io.capture import Capture
 from stages.verdict import looks as looks_of
 from stages.verdict.grades import GRADES
 from stages.verdict.looks import Look
@@ -139,20 +139,11 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
     return Verdict(ordered[0].grade if ordered else "good", ordered, figures, rows)
 
 
-def failed(
-    sentence: str,
-    remedy: str,
-    registered: int,
-    rejected: Sequence[tuple[str, str]],
-    looks: Mapping[str, Look],
-    provenance: Provenance,
-    overlaps: tuple[tuple[str, str, int], ...],
-) -> Verdict:
-    """The verdict on photographs that no cameras were found of."""
-    capture = Capture(kind="photographs", photos=(), background=None, rejected=tuple(rejected), provenance=provenance, overlaps=overlaps)
+def failed(sentence: str, remedy: str, registered: int, capture: Capture, looks: Mapping[str, Look]) -> Verdict:
+    """The verdict on a capture of photographs that no cameras were found of."""
     others = [*_of_matches(capture, flat=True), *_of_parts(capture), *of_looks(looks), *of_sizes(looks)]
-    problems = (Problem("failed", "failed", sentence, remedy, tuple(name for name, _ in rejected)), *others)
-    return Verdict("failed", problems, {"photographs": len(looks), "registered": registered, **to_builtins(provenance)}, _rows(capture, looks, None))
+    problems = (Problem("failed", "failed", sentence, remedy, tuple(name for name, _ in capture.rejected)), *others)
+    return Verdict("failed", problems, {"photographs": len(looks), "registered": registered, **to_builtins(capture.provenance)}, _rows(capture, looks, None))
 
 
 def _of_registration(capture: Capture, registered: int, total: int, in_folder: int | None) -> list[Problem]:
@@ -315,19 +306,25 @@ def _of_gps(capture: Capture) -> list[Problem]:
 
 def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
     """Problems of the pictures themselves."""
+
+    def those(shows: Callable[[Look], bool]) -> list[str]:
+        return sorted(name for name, each in looks.items() if shows(each))
+
+    dark, noisy = those(lambda each: each.brightness < looks_of.DARK), those(lambda each: each.noise > looks_of.NOISY)
+    compressed, clipped = those(lambda each: each.compressed), those(lambda each: each.clipped > looks_of.MOST_CLIPPED)
     found = []
     for what, names, words, remedy in (
         ("blurred", looks_of.blurred(looks), "blurred", "Move slower, give more light, or film at a faster shutter speed."),
         ("exposure", looks_of.of_other_exposure(looks), "brighter or darker than the others by more than 0.75 stops", "Lock exposure and white balance."),
-        ("dark", looks_of.dark(looks), "so dark that little but noise is left", "Give more light, or expose longer with the camera on a stand."),
-        ("noise", looks_of.noisy(looks), "so noisy that weak features are lost", "Give more light, or expose longer at a lower ISO, with a stand."),
+        ("dark", dark, "so dark that little but noise is left", "Give more light, or expose longer with the camera on a stand."),
+        ("noise", noisy, "so noisy that weak features are lost", "Give more light, or expose longer at a lower ISO, with a stand."),
         (
             "compression",
-            looks_of.compressed(looks),
+            compressed,
             "compressed so strongly that blocks of 8 pixels show",
             "Give the originals, not what a messenger or a web page has made of them, or save them at quality 75 or more.",
         ),
-        ("clipped", looks_of.clipped(looks), "black or white in more than 40 % of the pixels", "Expose for the subject; black and white hold no detail."),
+        ("clipped", clipped, "black or white in more than 40 % of the pixels", "Expose for the subject; black and white hold no detail."),
     ):
         if names:
             share = len(names) / len(looks)

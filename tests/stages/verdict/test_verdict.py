@@ -159,7 +159,7 @@ def test_noise_is_measured_whatever_the_picture_shows(deviation: float) -> None:
     for picture in (PICTURE, np.full(PICTURE.shape, 120, np.uint8), cv2.GaussianBlur(PICTURE, (0, 0), 4.0)):
         seen = look(np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8))
         assert seen.noise == pytest.approx(deviation, rel=0.12, abs=1.5)
-        assert bool(looks.noisy({"a": seen})) == (deviation > looks.NOISY)
+        assert (seen.noise > looks.NOISY) == (deviation > looks.NOISY)
 
 
 STILL_LIFE = Path(__file__).resolve().parents[3] / "examples" / "still_life"
@@ -247,11 +247,11 @@ def test_cameras_that_only_turned_and_photographs_without_texture_are_named() ->
         return [problem.what for problem in found.problems]
 
     flat = Provenance(planar_pairs=0.95)
-    assert "one place" in words(failed("none.", "try.", 0, LOST, {}, flat, ()))
+    assert "one place" in words(failed("none.", "try.", 0, capture(0, rejected=LOST, provenance=flat), {}))
     assert "one place" in words(verdict_on(capture(radius=0.05, provenance=flat), sharp(NAMES)))
     assert words(verdict_on(capture(provenance=flat), sharp(NAMES))) == []  # a wall seen from all sides has depth all the same
-    assert "one place" not in words(failed("none.", "try.", 0, LOST, {}, Provenance(planar_pairs=0.3), ()))
-    bare = failed("none.", "try.", 0, BARE, {}, Provenance(), ())
+    assert "one place" not in words(failed("none.", "try.", 0, capture(0, rejected=LOST, provenance=Provenance(planar_pairs=0.3)), {}))
+    bare = failed("none.", "try.", 0, capture(0, rejected=BARE), {})
     assert "without texture" in words(bare)
     assert bare.problems[1].images == tuple(name for name, _ in BARE)
     assert "without texture" not in words(verdict_on(capture(rejected=BARE[:1]), sharp(NAMES)))
