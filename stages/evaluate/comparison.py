@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from efficientnerf.evaluation.lpips import SMALLEST, Lpips
-from efficientnerf.evaluation.metrics import colour_fitted, psnr, ssim
+from efficientnerf.evaluation.metrics import colour_fitted
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.errors import BadInput
@@ -33,9 +33,9 @@ from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.evaluate.asset import EvaluatedAsset, over_field, render_asset
 from stages.evaluate.lpips_weights import find_weights
-from stages.evaluate.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
+from stages.evaluate.mesh import EvaluatedMesh, mesh_image, mesh_metrics
 from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
-from stages.evaluate.splats import EvaluatedSplats, splats_image, splats_metrics
+from stages.evaluate.splats import EvaluatedSplats, splats_image
 from stages.evaluate.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluate.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.figures.plots import error_map, to_uint8
@@ -84,7 +84,8 @@ def evaluate_view(
     drawn, plain, covered = mesh_image(mesh, asset, scene, view, seen, stride)
     metrics["mesh"] = mesh_metrics(shown(drawn, "the mesh"), shown(plain, "the mesh"), covered, image, truth)
     if splats is not None:
-        metrics["splats"] = splats_metrics(shown(splats_image(splats, asset, scene, view), "the Gaussians"), truth)
+        drawn = shown(splats_image(splats, asset, scene, view), "the Gaussians")
+        metrics["splats"] = {"psnr": truth.psnr(drawn), "ssim": truth.ssim(drawn)}
     if with_field and seen is not None:
         small = truth.subsampled(stride)
         render = shown(seen.colour, "the field", stride)
@@ -114,7 +115,7 @@ def differences(
     """
     own = compare(image, truth, None)
     gap = {name: own[name] - network[name] if own[name] is not None and network[name] is not None else None for name in GAP}
-    used = np.ones(opacity.shape, bool) if truth.mask is None else truth.mask
+    used = truth.used
     excess = squared_error(image, truth) - squared_error(seen.colour, truth)
     open_ = (opacity < HOLE) & (seen.within > SOLID)
     holes, of_holes = (float(open_[used].mean()), float((open_ * excess)[used].mean())) if used.any() else (None, None)
@@ -124,15 +125,14 @@ def differences(
 
 def trivial(truth: GroundTruth) -> dict[str, Any] | None:
     """The scores of pictures of its mean colour and of its blurs; None where no pixel counts."""
-    if truth.mask is not None and not truth.mask.any():
+    if not truth.used.any():
         return None
     return {"mean_colour": mean_colour_psnr(truth.colour, truth.mask), "blurred": blurred_psnrs(truth.colour, truth.mask)}
 
 
 def counting(truth: GroundTruth) -> np.ndarray:
     """(H, W) bool: pixels of the photograph in which there is something to be hit."""
-    used = np.ones(truth.colour.shape[:2], bool) if truth.mask is None else truth.mask
-    return used if truth.inside is None else used & truth.inside
+    return truth.used if truth.inside is None else truth.used & truth.inside
 
 
 def against_points(points: ReliablePoints, scene: Scene, view: View, depth: np.ndarray, truth: GroundTruth) -> dict[str, int]:
@@ -188,14 +188,11 @@ def sample_shares(counts: Any) -> dict[str, float]:
 
 def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) -> dict[str, float | None]:
     """The figures of QUALITY; None where no pixel, or no whole SSIM window, can be compared."""
-    used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
-    boxed = None if inside is None else used & inside
-    windows = used[5:-5, 5:-5]
     return {
-        "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,
-        "ssim": ssim(image, truth.colour, truth.mask) if windows.any() else None,
-        "psnr_in_box": min(MAX_PSNR, psnr(image, truth.colour, boxed)) if boxed is not None and boxed.any() else None,
-        "psnr_colour_fitted": min(MAX_PSNR, psnr(colour_fitted(image, truth.colour, truth.mask), truth.colour, truth.mask)) if used.any() else None,
+        "psnr": truth.psnr(image),
+        "ssim": truth.ssim(image),
+        "psnr_in_box": None if inside is None else truth.psnr(image, inside),
+        "psnr_colour_fitted": truth.psnr(colour_fitted(image, truth.colour, truth.mask)) if truth.used.any() else None,
     }
 
 

@@ -20,7 +20,6 @@ import numpy as np
 from efficientnerf.asset.region import surroundings
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.surface.mesh import Mesh, moved
 from efficientnerf.surface.shading import ColouredImage, Shader
 from stages.artifacts import MeshOutputs
@@ -33,7 +32,6 @@ from stages.mesh.files import read_mesh
 
 FIGURES = ("psnr", "ssim", "psnr_covered", "psnr_vertex_colours", "ssim_vertex_colours", "asset_psnr_covered", "covered")
 MARGIN = 0.03  # of the depth, that surroundings have to be nearer to hide the mesh: it ends where they begin
-MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,21 +108,13 @@ def mesh_metrics(image: np.ndarray, plain: np.ndarray, covered: np.ndarray, asse
     image, plain, covered  of `mesh_image`, clipped
     asset                  its image of the view, clipped
     """
-    used = np.ones(covered.shape, bool) if truth.mask is None else truth.mask
-    on_mesh = used & (covered >= 0.5)
-
-    def decibels(picture: np.ndarray, where: np.ndarray) -> float | None:
-        return min(MAX_PSNR, psnr(picture, truth.colour, where)) if where.any() else None
-
-    def similarity(picture: np.ndarray) -> float | None:
-        return ssim(picture, truth.colour, truth.mask) if used[5:-5, 5:-5].any() else None
-
+    on_mesh = covered >= 0.5
     return {
-        "psnr": decibels(image, used),
-        "ssim": similarity(image),
-        "psnr_covered": decibels(image, on_mesh),
-        "psnr_vertex_colours": decibels(plain, used),
-        "ssim_vertex_colours": similarity(plain),
-        "asset_psnr_covered": decibels(asset, on_mesh),
-        "covered": float(on_mesh.sum() / used.sum()) if used.any() else None,
+        "psnr": truth.psnr(image),
+        "ssim": truth.ssim(image),
+        "psnr_covered": truth.psnr(image, on_mesh),
+        "psnr_vertex_colours": truth.psnr(plain),
+        "ssim_vertex_colours": truth.ssim(plain),
+        "asset_psnr_covered": truth.psnr(asset, on_mesh),
+        "covered": float((truth.used & on_mesh).sum() / truth.used.sum()) if truth.used.any() else None,
     }

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.rendering import render
 from stages.artifacts import SplatsOutputs
 from stages.evaluate.asset import EvaluatedAsset
-from stages.evaluate.mesh import MAX_PSNR
-from stages.evaluate.views import GroundTruth, constant_background
+from stages.evaluate.views import constant_background
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import source_frame
@@ -49,15 +47,3 @@ def load_splats(outputs: SplatsOutputs, tree: NerfTree) -> EvaluatedSplats | Non
 def splats_image(splats: EvaluatedSplats, asset: EvaluatedAsset, scene: Scene, view: View) -> np.ndarray:
     """(H, W, 3), on what is behind the asset; on black where its environment map is, which the Gaussians have as their own."""
     return splats.draw(view.camera, constant_background(scene) or asset.behind)
-
-
-def splats_metrics(image: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
-    """FIGURES of a view; None where no pixel, or no whole window, can be compared.
-
-    image  clipped
-    """
-    used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
-    return {
-        "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,
-        "ssim": ssim(image, truth.colour, truth.mask) if used[5:-5, 5:-5].any() else None,
-    }

@@ -64,10 +64,10 @@ def summary(
         "asset_with_network_background": {**means(composited), "views": len(composited), "background_scale": 1.0 / stride} if composited else None,
         "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
         **means(drawn, AGAINST_NETWORK),
-        "train": None if train is None else dict(train),
+        "train": train,
         "trivial": {"mean_colour": means(plain, ("mean_colour",))["mean_colour"], "blurs": list(BLURS), "blurred": _columns(plain)},
         "sparse_points": agreement([view["sparse_points"] for view in figures]),
-        "refinement": None if refinement is None else dict(refinement),
+        "refinement": refinement,
         "strips": list(strips),
         "views": list(figures),
     }

@@ -10,9 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import MODELS, Camera
 from efficientnerf.model import UNSEEN
 from stages.io.scene import Scene, View, read_image, read_mask, views_of
+
+MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,20 @@ class GroundTruth:
     colour: np.ndarray
     mask: np.ndarray | None
     inside: np.ndarray | None
+
+    @property
+    def used(self) -> np.ndarray:
+        """(H, W) bool: pixels that are compared."""
+        return np.ones(self.colour.shape[:2], bool) if self.mask is None else self.mask
+
+    def psnr(self, image: np.ndarray, among: np.ndarray | None = None) -> float | None:
+        """Over the pixels that are compared, of those `among` (H, W): at most MAX_PSNR; None where there are none."""
+        used = self.used if among is None else self.used & among
+        return min(MAX_PSNR, psnr(image, self.colour, used)) if used.any() else None
+
+    def ssim(self, image: np.ndarray) -> float | None:
+        """None where no whole window can be compared."""
+        return ssim(image, self.colour, self.mask) if self.used[5:-5, 5:-5].any() else None
 
     def subsampled(self, stride: int) -> GroundTruth:
         """That of the pixels that `subsample` keeps."""
