@@ -32,6 +32,7 @@ from pipeline.text import printable
 
 Event = dict[str, Any]
 Report = Callable[[Event], None]
+Kind = tuple[int, tuple[int, ...]]
 
 LAST_LINES = 20  # of standard error that are kept
 LONGEST_LINE = 500
@@ -60,11 +61,15 @@ def command_for(module: str) -> list[str]:
 
 
 class _Child:
-    """One process and its pipes. Its result is {"ok": False, "kind": "died", "signal", "text"} where it ended without one."""
+    """One process and its pipes. Its result is {"ok": False, "kind": "died", "signal", "text"} where it ended without one.
 
-    def __init__(self, module: str, environment: Mapping[str, str]) -> None:
+    kind  cores that it computes on, and CUDA devices that it sees
+    """
+
+    def __init__(self, module: str, kind: Kind) -> None:
+        self.kind = kind
         self.process = subprocess.Popen(
-            command_for(module), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, env=dict(environment)
+            command_for(module), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, env=_environment(*kind)
         )
         self.idle_since: float | None = None
         self.stopping = False
@@ -84,7 +89,7 @@ class _Child:
             except ValueError:  # half a line before its end
                 break
             if message.get("event") == "result":
-                return {**message, "lines": self._last_lines()}
+                return {**message, "lines": list(self._lines)}
             report(message)
         return self._died()
 
@@ -121,7 +126,7 @@ class _Child:
         code = self.process.returncode
         number = -code if code < 0 else None
         how = f"was ended by {signal.Signals(number).name}" if number is not None else f"ended with exit code {code} and no answer"
-        return {"event": "result", "ok": False, "kind": "died", "signal": number, "text": f"its process {how}.", "lines": self._last_lines()}
+        return {"event": "result", "ok": False, "kind": "died", "signal": number, "text": f"its process {how}.", "lines": list(self._lines)}
 
     def _ended(self) -> bool:
         """Whether it has ended, or does within GRACE seconds; it is not reaped yet, so that its group's number is still its own."""
@@ -164,9 +169,6 @@ class _Child:
                 if text := line.decode("utf-8", "replace").strip():
                     self._lines.append(printable(text, LONGEST_LINE))
 
-    def _last_lines(self) -> list[str]:
-        return list(self._lines)
-
 
 class Children:
     """The children of a worker, by run. Used from any number of threads; one works for a run at a time.
@@ -178,7 +180,7 @@ class Children:
     def __init__(self, module: str, most: int) -> None:
         self.module = module
         self.most = most
-        self._children: dict[str, tuple[tuple[int, tuple[int, ...]], _Child]] = {}
+        self._children: dict[str, _Child] = {}
         self._working: set[str] = set()
         self._stopped: set[str] = set()
         self._lock = threading.Lock()
@@ -218,7 +220,7 @@ class Children:
                 self._stopped.discard(run)
                 finished = request["kind"] == "finish" and run in self._children  # with much memory, which it needs no more
                 if run in self._children:
-                    self._children[run][1].idle_since = time.monotonic() - (IDLE if finished else 0.0)
+                    self._children[run].idle_since = time.monotonic() - (IDLE if finished else 0.0)
             timer = threading.Timer(0.0 if finished else IDLE, self.tidy)
             timer.daemon = True
             timer.start()
@@ -240,14 +242,14 @@ class Children:
                 self._stopped.add(run)
             child = self._children.get(run)
             if child is not None and run in self._working:
-                child[1].stop()
+                child.stop()
 
     def tidy(self, kept: float = IDLE) -> None:
         """End the children that have had no work for so many seconds."""
         now = time.monotonic()
         with self._lock:
-            idle = [run for run, (_, child) in self._children.items() if run not in self._working and now - (child.idle_since or now) >= kept - 0.1]
-            doomed = [self._children.pop(run)[1] for run in idle]
+            idle = [run for run, child in self._children.items() if run not in self._working and now - (child.idle_since or now) >= kept - 0.1]
+            doomed = [self._children.pop(run) for run in idle]
         for child in doomed:
             child.end()
 
@@ -255,45 +257,45 @@ class Children:
         """Kill all of them."""
         with self._lock:
             self._closed = True
-            doomed = [child for _, child in self._children.values()]
+            doomed = list(self._children.values())
         for child in doomed:
             child.kill()
         self.tidy(0.0)
 
-    def _child(self, run: str, kind: tuple[int, tuple[int, ...]]) -> _Child | None:
+    def _child(self, run: str, kind: Kind) -> _Child | None:
         """The child of the run, with these cores and devices; None where it was asked to stop meanwhile."""
         with self._lock:
             found = self._children.pop(run, None)
             doomed: list[_Child] = []
-            if found is not None and found[0] != kind:
-                doomed.append(found[1])
+            if found is not None and found.kind != kind:
+                doomed.append(found)
                 found = None
             if found is None:
                 doomed += self._excess()
                 found = self._spare(run, kind)
             if found is not None:
-                found[1].idle_since = None
+                found.idle_since = None
                 self._children[run] = found
         for child in doomed:
             child.end()
         if found is None:
-            found = kind, self._starter.submit(_Child, self.module, _environment(*kind)).result()
+            found = self._starter.submit(_Child, self.module, kind).result()
             with self._lock:
                 self._children[run] = found
         with self._lock:
-            return None if run in self._stopped or self._closed else found[1]
+            return None if run in self._stopped or self._closed else found
 
     def _excess(self) -> list[_Child]:
         """Remove and return the idle children that exceed `most` once another is added, longest idle first."""
         kept = [each for each in self._children if not each.startswith(PREPARES)]
-        idle = sorted((each for each in kept if each not in self._working), key=lambda each: self._children[each][1].idle_since or 0.0)
-        return [self._children.pop(each)[1] for each in idle[: max(0, len(kept) + 1 - self.most)]]
+        idle = sorted((each for each in kept if each not in self._working), key=lambda each: self._children[each].idle_since or 0.0)
+        return [self._children.pop(each) for each in idle[: max(0, len(kept) + 1 - self.most)]]
 
-    def _spare(self, run: str, kind: tuple[int, tuple[int, ...]]) -> tuple[tuple[int, tuple[int, ...]], _Child] | None:
+    def _spare(self, run: str, kind: Kind) -> _Child | None:
         """A child that prepared runs and has nothing to do becomes this run's: starting another costs a second."""
         if run.startswith(PREPARES):
             return None
-        spare = (each for each, (what, _) in self._children.items() if each.startswith(PREPARES) and each not in self._working and what == kind)
+        spare = (each for each, child in self._children.items() if each.startswith(PREPARES) and each not in self._working and child.kind == kind)
         name = next(spare, None)
         return None if name is None else self._children.pop(name)
 
@@ -304,13 +306,13 @@ class Children:
                 taken = {*self._children, *self._working}
                 name = next(name for number in itertools.count() if (name := f"{PREPARES}{number}") not in taken)
                 self._children[name] = self._children.pop(run)
-                self._children[name][1].idle_since = time.monotonic()
+                self._children[name].idle_since = time.monotonic()
 
     def _drop(self, run: str) -> None:
         with self._lock:
             found = self._children.pop(run, None)
-        if found is not None and found[1].process.returncode is None:
-            found[1].end()
+        if found is not None and found.process.returncode is None:
+            found.end()
 
 
 def _stopped_result() -> Event:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import threading
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
@@ -34,11 +33,10 @@ class SideBySide:
         self.need = need
         self.least = least
         self._children = Children(module, jobs)
-        self._lock = threading.Lock()
-        self._working: set[str] = set()
+        self._names = [f"stages side by side {number}" for number in range(jobs)]
         self._free: queue.SimpleQueue[str] = queue.SimpleQueue()
-        for number in range(jobs):
-            self._free.put(f"stages side by side {number}")
+        for name in self._names:
+            self._free.put(name)
 
     def __enter__(self) -> SideBySide:
         return self
@@ -58,13 +56,9 @@ class SideBySide:
             "memory": None if job.memory is None else [job.memory.bytes, job.memory.whose],
         }
         name = self._free.get()
-        with self._lock:
-            self._working.add(name)
         try:
             answer = self._children.work({"kind": "job", "run": name, "stage": stage.name, "job": facts}, job.pass_on, cores=max(1, self.cores // self.jobs))
         finally:
-            with self._lock:
-                self._working.discard(name)
             self._free.put(name)
         if not answer["ok"]:
             raise _error_of(stage.name, answer)
@@ -77,9 +71,7 @@ class SideBySide:
 
     def stop(self) -> None:
         """Ask all stages that run to stop at their next safe points."""
-        with self._lock:
-            working = set(self._working)
-        for name in working:
+        for name in self._names:
             self._children.stop(name)
 
 
