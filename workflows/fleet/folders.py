@@ -20,7 +20,6 @@ from stages.formats.importers.source import images_in
 Found = list[tuple[str, str]]
 
 _ENTRIES = 200_000  # of a folder, or paths that a pattern fits, that are read
-_WILD = re.compile(r"[*?\[]")
 
 
 def folder_entries(given: str, fleet: Path) -> tuple[Found, Path | None]:
@@ -57,7 +56,7 @@ def glob_entries(pattern: str) -> tuple[Found, Path | None]:
     if "**" in pattern or "\0" in pattern:
         raise UsageError(f"{printable(pattern, 300)}: found '**', expected a pattern of *, ? and [...], as 'shoots/*/'.")
     parts = Path(pattern).parts
-    wild = [place for place, part in enumerate(parts) if _WILD.search(part)]
+    wild = [place for place, part in enumerate(parts) if glob.has_magic(part)]
     root = Path(*parts[: wild[0]]) if wild[0] else Path()
     found: Found = []
     for path in sorted(itertools.islice(glob.iglob(pattern), _ENTRIES)):
@@ -65,7 +64,7 @@ def glob_entries(pattern: str) -> tuple[Found, Path | None]:
         found.append((named("-".join(_stem(Path(names[place])) for place in wild)), path))
     if not found:
         raise BadInput(f"{printable(pattern, 300)}: fits nothing; expected folders or videos, each of one scene.")
-    return _scenes(found), root.absolute()
+    return [(name, path) for name, path in found if os.path.isdir(path) or is_video(Path(path))], root.absolute()
 
 
 def listed_entries(given: Sequence[str]) -> tuple[Found, Path | None]:
@@ -81,11 +80,6 @@ def listed_entries(given: Sequence[str]) -> tuple[Found, Path | None]:
         differing = [place for place, column in enumerate(columns) if len(set(column)) > 1]
         names = [named("-".join(path.parts[place] for place in differing)) for path in paths]
     return list(zip(names, map(str, paths), strict=True)), None
-
-
-def _scenes(found: Found) -> Found:
-    """Those that are folders or videos."""
-    return [(name, path) for name, path in found if os.path.isdir(path) or is_video(Path(path))]
 
 
 def _stem(path: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from typing import Any
 
 _LONGEST = 200  # lines of one value; what follows a longer one is not looked for
@@ -24,12 +25,12 @@ def lines_of(text: str) -> dict[Path, int]:
         statement, used = _statement(lines, at)
         if statement is None:
             break
-        if lines[at].lstrip().startswith("["):
-            table = _deepest(statement)
-            statement = _nested_in(table, {})
-        else:
-            statement = _nested_in(table, statement)
-        _put(found, (), statement, at + 1)
+        is_header = lines[at].lstrip().startswith("[")
+        paths = list(_paths(statement, () if is_header else table))
+        if is_header:
+            table = paths[-1]
+        for path in paths:
+            found.setdefault(path, at + 1)
         at += used
     return found
 
@@ -44,25 +45,9 @@ def _statement(lines: list[str], at: int) -> tuple[dict[str, Any] | None, int]:
     return None, 0
 
 
-def _deepest(statement: dict[str, Any]) -> Path:
-    """The path of a table's header."""
-    path: list[str] = []
-    value: Any = statement
-    while isinstance(value, dict) and value:
-        name = next(iter(value))
-        path.append(name)
-        value = value[name]
-    return tuple(path)
-
-
-def _nested_in(table: Path, statement: dict[str, Any]) -> dict[str, Any]:
-    for name in reversed(table):
-        statement = {name: statement}
-    return statement
-
-
-def _put(found: dict[Path, int], path: Path, statement: dict[str, Any], line: int) -> None:
+def _paths(statement: dict[str, Any], above: Path = ()) -> Iterator[Path]:
+    """Of all keys of a statement, each after the table that it is in."""
     for name, value in statement.items():
-        found.setdefault((*path, name), line)
-        if isinstance(value, dict) and len(path) < _DEEPEST:
-            _put(found, (*path, name), value, line)
+        yield (*above, name)
+        if isinstance(value, dict) and len(above) < _DEEPEST:
+            yield from _paths(value, (*above, name))

@@ -17,6 +17,7 @@ All mistakes are reported at once, before anything runs.
 from __future__ import annotations
 
 import csv
+import glob
 import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -74,7 +75,8 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
         base = path.absolute().parent
     else:
         base = Path()  # the working folder, which may be gone: absolute sources need none
-        found, root = listed_entries(given) if len(given) > 1 else glob_entries(given[0]) if _is_glob(given[0]) else folder_entries(given[0], fleet)
+        is_pattern = glob.has_magic(given[0]) and not os.path.lexists(given[0])
+        found, root = listed_entries(given) if len(given) > 1 else glob_entries(given[0]) if is_pattern else folder_entries(given[0], fleet)
         inside = None if root is None else [root, *roots]
         entries = [Entry(name, [source]) for name, source in found]
     if not entries and not checker.mistakes:
@@ -88,10 +90,6 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
     scenes = [reader.scene(entry) for entry in entries]
     checker.end()
     return scenes
-
-
-def _is_glob(text: str) -> bool:
-    return any(character in text for character in "*?[") and not os.path.lexists(text)
 
 
 def _text(path: Path) -> str:
@@ -187,18 +185,7 @@ def _row(columns: list[str], cells: list[str], line: int) -> Entry:
             values.setdefault(stage, {})[name] = Text(cell)
     named = dict(zip(columns, cells, strict=False))
     sources = [cell for column, cell in zip(columns, cells, strict=False) if column == "source" and cell]
-    return Entry(named.get("name", ""), list(sources), values, line, _SameLine(line))
-
-
-class _SameLine(dict[str, int | None]):
-    """Every key stands in this line."""
-
-    def __init__(self, line: int) -> None:
-        super().__init__()
-        self.line = line
-
-    def get(self, key: str, default: Any = None) -> int:
-        return self.line
+    return Entry(named.get("name", ""), list(sources), values, line, dict.fromkeys(columns, line))
 
 
 def _choice(values: Mapping[str, Any], where: Mapping[str, int | None], checker: Checker, scene: str | None) -> Choice:

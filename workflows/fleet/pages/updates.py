@@ -121,16 +121,11 @@ def _shown_stage(scene: SceneState) -> str | None:
 def _picture(run: Path, stage: str) -> Path | None:
     if stage == TurntableOutputs.stage:
         return TurntableOutputs.of_run(run).poster
-    return next((Path(entry) for entry in _pictures_in(PosesOutputs.of_run(run).images)), None)
-
-
-def _pictures_in(folder: Path) -> list[str]:
-    """The first picture below a folder, by name."""
-    for parent, folders, names in os.walk(folder):
+    for parent, folders, names in os.walk(PosesOutputs.of_run(run).images):  # the first by name
         folders.sort()
         if names:
-            return [os.path.join(parent, min(names))]
-    return []
+            return Path(parent, min(names))
+    return None
 
 
 def _is_newer(target: Path, picture: Path) -> bool:
