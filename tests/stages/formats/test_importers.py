@@ -13,14 +13,9 @@ from efficientnerf.geometry.cameras import opengl_from_pose, project, rotated_cl
 from stages.formats import importers
 from stages.formats.importers import colmap_model
 from stages.formats.importers.description import describe_source
-from stages.io.capture import Capture
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, LENSES, SHARED, WIDTH, WRITERS, Settings, assert_same_rays
-
-
-def read(folder: Path, **settings: object) -> Capture:
-    chosen = Settings(**settings)  # type: ignore[arg-type]
-    return importers.IMPORTERS[importers.detect(folder)].read(folder, chosen)
+from tests.stages.exports import read
 
 
 @pytest.mark.parametrize("how", WRITERS)
@@ -28,6 +23,7 @@ def test_every_format_gives_the_same_rays(how: str, tmp_path: Path) -> None:
     name, write = WRITERS[how]
     folder = write(tmp_path / "source")
     assert importers.detect(folder) == name
+    assert [other for other in importers.candidates(folder) if other != "photographs"] == [name]
     capture = read(folder)
     assert capture.kind == name
     assert not capture.warnings

@@ -14,14 +14,10 @@ import pytest
 from pipeline.errors import BadInput
 from stages.formats import importers
 from stages.formats.importers import llff, transforms
-from stages.io.capture import Capture
 from stages.io.json_file import read_json
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH, Settings
-
-
-def read(folder: Path, **settings: Any) -> Capture:
-    return importers.IMPORTERS[importers.detect(folder)].read(folder, Settings(**settings))
+from tests.stages.exports import read
 
 
 def refusal(folder: Path, *named: str, **settings: Any) -> None:

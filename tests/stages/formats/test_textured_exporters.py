@@ -107,8 +107,7 @@ READERS: dict[str, Callable[[Path], Read]] = {".glb": read_glb, ".obj": read_obj
 TEXTURED = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in READERS]
 
 
-@pytest.mark.parametrize("picture", ["png", "jpeg"])
-@pytest.mark.parametrize("normals", [False, True], ids=["unlit", "normal map"])
+@pytest.mark.parametrize(("normals", "picture"), [(False, "png"), (True, "jpeg")], ids=["unlit", "normal map"])
 @pytest.mark.parametrize("extension", TEXTURED)
 def test_the_same_surface_in_the_same_colours(extension: str, normals: bool, picture: str, tmp_path: Path) -> None:
     mesh, path = textured(normals=normals), tmp_path / f"thing{extension}"
@@ -228,7 +227,7 @@ def test_a_full_disk_leaves_no_part_of_an_obj(function: str, call: int, tmp_path
         return real(*arguments, **more)
 
     monkeypatch.setattr(os, function, full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match="Errno 28"):
         MESH_EXPORTERS[".obj"](textured(), tmp_path / "a.obj", Z_UP)
     assert list(tmp_path.iterdir()) == []
 
