@@ -1,4 +1,4 @@
-"""The trained field on disk: the same after a round trip, and every kind of damage has its sentence."""
+"""The trained field on disk: the same after a round trip, and every kind of damage is refused."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import state_of
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact
 from stages.artifacts import TrainOutputs
@@ -24,8 +26,6 @@ CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3)
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("field", ["hash", "mlp"])
 def test_a_saved_field_draws_the_same_picture(tmp_path: Path, field: str, contracted: bool) -> None:
-    from efficientnerf.rendering.field_renderer import FieldRenderer
-
     m = untrained(field=field, contracted=contracted)
     with torch.no_grad():
         for _, p in m.parameters():
@@ -44,70 +44,49 @@ def test_a_saved_field_draws_the_same_picture(tmp_path: Path, field: str, contra
     assert [path.name for path in tmp_path.iterdir()] == [TrainOutputs.field]
 
 
+def refused(folder: Path, *named: str) -> None:
+    """That a field is refused in one short line, which names the file and all of `named`."""
+    with pytest.raises(CorruptArtifact) as caught:
+        load_renderer(folder)
+    text = str(caught.value)
+    assert text.isprintable()
+    assert len(text) < 600
+    assert [name for name in (TrainOutputs.field, *named) if name not in text] == [], text
+
+
 def test_damage_is_told(tmp_path: Path) -> None:
     path = tmp_path / TrainOutputs.field
-    m = untrained()
-    save_model(m, 0.5, 20.0, path)
+    save_model(untrained(), 0.5, 20.0, path)
     data = path.read_bytes()
     for damaged in (b"", data[:5], data[:2000], data[:-1], data + b"\0", b"\xff" * 40, b"{}" * 20):
         path.write_bytes(damaged)
-        with pytest.raises(CorruptArtifact, match=r"not a readable field file.*Train again"):
-            load_renderer(tmp_path)
+        refused(tmp_path, "Train again")
     for at in (len(data) // 2, len(data) - 1, data.index(b'"sha256') + 14):
         path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
-        with pytest.raises(CorruptArtifact, match=r"damaged field file.*Train again"):
-            load_renderer(tmp_path)
+        refused(tmp_path, "SHA-256", "Train again")
     path.unlink()
-    with pytest.raises(CorruptArtifact, match=f"{TrainOutputs.field}: not a readable field file"):
-        load_renderer(tmp_path)
+    refused(tmp_path)
 
 
-def test_tensors_that_do_not_fit_are_named(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_named_and_hostile_text_stays_in_a_line(tmp_path: Path) -> None:
     path = tmp_path / TrainOutputs.field
-    save_model(untrained(), 0.5, 20.0, path)
+    save_model(untrained(field="hash", contracted=False), 0.5, 20.0, path)
     tensors, about = read_tensors(path)
     write_tensors({name: t for name, t in tensors.items() if name != "sky.sh"}, about, path)
-    with pytest.raises(CorruptArtifact, match=r"tensor 'sky\.sh' is missing\. Train again"):
-        load_renderer(tmp_path)
-    write_tensors(tensors, {**about, "settings": {"iterations": "many"}}, path)
-    with pytest.raises(CorruptArtifact, match="iterations"):
-        load_renderer(tmp_path)
-
-
-def with_metadata(path: Path, text: str) -> None:
-    """A field file whose metadata is another text."""
-    from safetensors.torch import save
-
-    tensors, _ = read_tensors(path)
-    path.write_bytes(save(tensors, metadata={"field": text}))
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"format": 1' + "0" * 400 + "}", '{"format": []}', "[]", "1", '"\\ud800"'])
-def test_hostile_metadata_is_refused_in_a_line(tmp_path: Path, text: str) -> None:
-    path = tmp_path / TrainOutputs.field
-    save_model(untrained(field="hash", contracted=False), 0.5, 20.0, path)
-    with_metadata(path, text)
-    with pytest.raises(CorruptArtifact) as caught:
-        read_tensors(path)
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < 500
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("settings", []), ("settings", {"field": 10**400}), ("near", 10**400), ("bounds", "x"), ("bounds", [[10**400] * 3] * 2), ("background", 7), ("ndc", [])],
-)
-def test_hostile_values_of_a_field_are_refused_in_a_line(tmp_path: Path, name: str, value: Any) -> None:
-    path = tmp_path / TrainOutputs.field
-    save_model(untrained(field="hash", contracted=False), 0.5, 20.0, path)
-    tensors, about = read_tensors(path)
-    about.pop("sha256")
-    about.pop("format")
-    write_tensors(tensors, about | {name: value}, path)
-    with pytest.raises(CorruptArtifact) as caught:
-        load_renderer(tmp_path)
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < 600
+    refused(tmp_path, "sky.sh", "Train again")
+    del about["sha256"], about["format"]
+    values: dict[str, list[Any]] = {
+        "settings": [[], {"field": 10**400}], "near": [10**400], "bounds": ["x", [[10**400] * 3] * 2], "background": [7], "ndc": [[]],
+    }
+    for name, hostile in values.items():
+        for value in hostile:
+            write_tensors(tensors, about | {name: value}, path)
+            refused(tmp_path)
+    write_tensors(tensors, about | {"settings": {"iterations": "many"}}, path)
+    refused(tmp_path, "iterations", "Train again")
+    for text in ("[" * 100_000, '{"format": 1' + "0" * 400 + "}", '{"format": []}', "[]", "1", '"\\ud800"'):
+        path.write_bytes(save(tensors, metadata={"field": text}))
+        refused(tmp_path)
 
 
 def test_a_small_file_takes_no_memory_for_the_tables_that_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,5 +100,4 @@ def test_a_small_file_takes_no_memory_for_the_tables_that_it_states(tmp_path: Pa
     write_tensors(
         {"voxels": torch.zeros(side, side, side), "fine.table": torch.zeros(1, 2), "coarse.table": torch.zeros(1, 2)}, about, tmp_path / TrainOutputs.field
     )
-    with pytest.raises(CorruptArtifact, match=r"tensor '(coarse.table|voxels)' is torch.float32 \(.*\); expected \("):
-        load_renderer(tmp_path)
+    refused(tmp_path, "torch.float32", "expected")
