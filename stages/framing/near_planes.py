@@ -5,8 +5,8 @@ bound its content: on a plain subject its only sparse points may be those of the
 that a fourth has in its picture, the fourth shows it or something nearer. The neighbours of a camera, and what all cameras look at, are two more bounds.
 The nearest of the three counts. See docs/priors.md.
 
-Rays have no far plane but where the source states one: nearly all points of a picture may lie on a table, and the room behind it would be painted on a shell
-before its walls. docs/experiments/near-cameras.md
+All rays end behind what is farthest in any picture: nearly all points of one may lie on a table, and the room behind it would be painted on a shell before
+its walls. Farther out, a plain sky is learned in patches. docs/experiments/near-cameras.md
 
 C photos, P points.
 """
@@ -24,10 +24,11 @@ from stages.io.capture import Capture, SparsePoints
 MIN_TRACK = 3  # photographs that observe a reliable point
 MAX_ERROR = 2.0  # its reprojection error over the median
 MIN_POINTS = 10  # in a picture, of which its content is judged
-NEAREST, MOST_NEARER = 0.01, 10  # share, and number, of the reliable points in a picture that may lie nearer than its content begins: outliers
+OUTSIDE, MOST_OUTSIDE = 0.01, 10  # share, and number, of the reliable points in a picture that may lie before its content, and behind it: outliers
 RATIO = 0.5  # near plane over the depth of the nearest content; over that of the point that all cameras look at, at most
 NEIGHBOURS = 8  # cameras, nearest in place, among those whose axes are within 60 degrees
-END = 100.0  # far plane, over half of the box's longest side: contracted space ends at 64
+BEYOND = 1.5  # far plane over the depth of the farthest content
+END = 100.0  # far plane at most, over half of the box's longest side: contracted space ends at 64
 MAX_OVER_NEIGHBOURS = 1.5  # near plane over the median of theirs
 
 
@@ -46,7 +47,8 @@ def near_far_planes(capture: Capture, placed: Sequence[Camera], world: Similarit
         return boxes
     content = content_depths(capture, placed, world)
     stated = np.array([bool(photo.near and photo.far) for photo in capture.photos])
-    near, far = np.where(stated, 0.9, RATIO) * content[:, 0], np.fmax(boxes[:, 1], np.where(stated, 1.1 * content[:, 1], END))
+    farthest = min(BEYOND * float(np.fmax.reduce(content[~stated, 1], initial=0.0)), END)
+    near, far = np.where(stated, 0.9, RATIO) * content[:, 0], np.fmax(boxes[:, 1], np.where(stated, 1.1 * content[:, 1], farthest))
     caps = [MAX_OVER_NEIGHBOURS * of_neighbours(near, placed)]
     if focus is not None:
         caps.append(RATIO * depths_in_picture(focus, placed))
@@ -75,7 +77,8 @@ def content_depths(capture: Capture, placed: Sequence[Camera], world: Similarity
             continue
         depths = np.sort((xyz[in_view(xyz, [camera])[0]] - camera.centre) @ camera.forward)
         if len(depths) >= MIN_POINTS:
-            row[:] = depths[min(int(NEAREST * len(depths)), MOST_NEARER)], depths[int(0.99 * (len(depths) - 1))]
+            outside = min(int(OUTSIDE * len(depths)), MOST_OUTSIDE)
+            row[:] = depths[outside], depths[-1 - outside]
     return found
 
 
