@@ -71,7 +71,7 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
     elif not (known or forget):
         sides = sides_of(run)
         if sides is None:
-            raise BadInput(f"{run}: has no mesh whose size could be told. Give two places to measure between.")
+            raise BadInput(f"{run}: has no mesh to measure. Give two places to measure between.")
         summary = sides
         if not as_json:
             listing(sides_in_words(sides), *unit_in_words(sides))

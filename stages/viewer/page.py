@@ -82,11 +82,12 @@ def splats_page(
     frame = source_frame(metadata)
     world_from_spz = frame.world_from_capture.matrix() @ Similarity(1.0, gltf_from_capture(frame.up).T, np.zeros(3)).matrix()
     try:
-        content = zlib.decompressobj(31).decompress(spz, LARGEST_SPZ)
+        stream = zlib.decompressobj(31)
+        content = stream.decompress(spz, LARGEST_SPZ)
     except zlib.error as error:
         raise FormatError(f"{title}: its Gaussians are damaged: {error}") from None
-    if content[:4] != MAGIC:
-        raise FormatError(f"{title}: its Gaussians are no SPZ file")
+    if not stream.eof or content[:4] != MAGIC:
+        raise FormatError(f"{title}: its Gaussians are no whole SPZ file")
     about = {key: value for key, value in metadata.items() if key != "captured_path"}
     facts = {"sha256": hashlib.sha256(content).hexdigest(), "frame": world_from_spz[:3].tolist(), "meta": about}
     return _page(spz[10:-8], len(content), _cameras(cameras, photographs), title, splats=facts, asset=asset)  # the stream in the gzip

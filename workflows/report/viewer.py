@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -30,13 +31,21 @@ def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
             if name not in shown:
                 page.unlink(missing_ok=True)
             elif anew or not is_newest(run, page):
-                try:
-                    write_viewer_of(run.path, shown[name], page, ASSET_VIEWER if name == VIEWER and ASSET_VIEWER in shown else None)
-                except FormatError:  # `enerf verify` says what is wrong
-                    page.unlink(missing_ok=True)
+                _write_sound(run, shown, name)
         except OSError as error:
             raise cannot_write(page, error) from error
     return path if os.path.lexists(path) else None
+
+
+def _write_sound(run: Run, shown: Mapping[str, Path], name: str) -> None:
+    """Write a page of what it shows, or of the asset where Gaussians are damaged; none where that is damaged, too. `enerf verify` says what is wrong."""
+    page, other = run.path / name, ASSET_VIEWER if name == VIEWER and ASSET_VIEWER in shown else None
+    for made in dict.fromkeys((shown[name], BakeOutputs.of_run(run.path).asset)):
+        try:
+            write_viewer_of(run.path, made, page, other)
+            return
+        except FormatError:
+            page.unlink(missing_ok=True)
 
 
 def write_viewer_of(run: Path, shown: Path, target: Path, other: str | None = None) -> None:

@@ -131,6 +131,11 @@ def test_the_page_shows_gaussians_where_there_are_any_or_what_was_asked_for(run:
     assert written(None) == {"viewer.html": False}, "of another asset"
     record_splats(run.path)
     assert written(None) == {"viewer.html": True}
-    (run.path / "splats/splats.spz").write_bytes(b"damaged")
-    os.utime(run.path / "splats")
+    whole = (run.path / "splats/splats.spz").read_bytes()
+    for damaged in (b"damaged", whole[: len(whole) // 2]):
+        (run.path / "splats/splats.spz").write_bytes(damaged)
+        os.utime(run.path / "splats")
+        assert written(None) == {"viewer.html": False}, "the asset is sound"
+    (run.path / "bake/asset.nerftree").write_bytes(b"damaged")
+    os.utime(run.path / "bake")
     assert written(None) == {}
