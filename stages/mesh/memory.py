@@ -7,6 +7,7 @@ import math
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.fusion import MARGIN
 from efficientnerf.surface.isosurface import BLOCK, pool_of
+from efficientnerf.surface.photometric import LARGEST
 from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
 from stages.artifacts import MeshInputs
 from stages.io.scene import load, views_of
@@ -14,6 +15,7 @@ from stages.memory.forecast import Known
 from stages.memory.need import MIB, SURFACES, Need, libraries
 from stages.memory.tree import asset_of, tree_bytes
 from stages.mesh.check import CAPTURED, FUSED, LONGER_SIDE, ORBIT
+from stages.mesh.refinement import MOST
 from stages.mesh.settings import MeshSettings
 from stages.mesh.texture import largest_photograph
 from stages.train.data import count_pixels
@@ -27,13 +29,15 @@ PIXEL, BLOCK_VOXEL = 36, 120
 TEXEL, PHOTOGRAPH_PIXEL = 140, 60
 # Of a stored voxel, what a normal map is baked from: the surface before decimation with its normals, and cells in which its faces are found.
 DENSE_VOXEL, DENSE_CELLS = 250, 8 * 256**3
+# Of a vertex that is fitted to photographs: places and scores in them.
+FITTED_VERTEX = 1600
 # Bytes written: of a face in all files; of a texel in its own file and in GLB; of pictures. Faces of a voxel and texels of a photograph's pixel, at most.
 WRITTEN_FACE, WRITTEN_TEXEL, SHEET, FACES, TEXELS = 180, 3, 3 * MIB // 4, 4, 4
 
 
-def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False) -> Need:
+def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False, fitted: int = 0) -> Need:
     """Memory to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
-    and with a normal map where `dense`."""
+    with a normal map where `dense`, and so many vertices fitted to photographs."""
     views = CAPTURED + ORBIT + FUSED
     pool = pool_of(volume_of(tree))
     cells = [-(-side // pool) + 2 for side in tree.resolution]
@@ -45,6 +49,7 @@ def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: in
         "libraries": libraries() + SURFACES,
     }
     optional = {"points": POINT * points, "the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
+                "the fit to photographs": (FITTED_VERTEX * fitted + MOST * min(pixels, LARGEST)) if fitted else 0,
                 "the normal map": (DENSE_VOXEL * len(tree.density_values) + DENSE_CELLS) if dense else 0}  # fmt: skip
     return Need(terms | {what: count for what, count in optional.items() if count})
 
@@ -52,7 +57,13 @@ def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: in
 def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
     """Memory of the stage mesh."""
     texture = 0 if settings.texture == "off" else settings.texture_size
-    return surface_needed(tree, texture=texture, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map)
+    fitted = 0 if settings.photometric_refinement == "off" else _most_faces(tree, settings) // 2
+    pixels = largest_photograph(inputs, settings.texture)
+    return surface_needed(tree, texture=texture, pixels=pixels, dense=settings.normal_map, fitted=fitted)
+
+
+def _most_faces(tree: NerfTree, settings: MeshSettings) -> int:
+    return min(int(str(settings.max_faces).replace("k", "000")), FACES * len(tree.density_values))
 
 
 def memory_needed(known: Known) -> Need:
@@ -63,6 +74,6 @@ def memory_needed(known: Known) -> Need:
 def space_needed(known: Known) -> int:
     """Mesh files, textures and pictures."""
     own, views = known.settings["mesh"], views_of(load(known.inputs(MeshInputs).poses.folder), "train")
-    faces = min(int(str(own.max_faces).replace("k", "000")), FACES * len(asset_of(known).density_values))
+    faces = _most_faces(asset_of(known), own)
     texels = 0 if own.texture == "off" else min(own.texture_size**2, TEXELS * count_pixels(views)) * (1 + own.normal_map)
     return SHEET + WRITTEN_FACE * faces + WRITTEN_TEXEL * texels

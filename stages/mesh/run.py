@@ -29,6 +29,7 @@ from stages.memory.need import refuse_what_does_not_fit
 from stages.mesh.check import asset_views, checked, level_of, shown_by, warning_of
 from stages.mesh.files import write_empty_meshes
 from stages.mesh.memory import needed
+from stages.mesh.refinement import refined_surface
 from stages.mesh.settings import MeshSettings, refuse_normal_map_without_texture
 from stages.mesh.texture import facts_of, textured, with_relief
 from stages.mesh.timing import Stopwatch
@@ -179,6 +180,7 @@ def run(job: Job) -> None:
         write_empty(outputs, surface, seen, frame, job)
         write_json(outputs.timings, watch.seconds)
         return
+    surface = refined_surface(surface, seen, inputs, settings.photometric_refinement, job, watch)
     texture_progress = watch.listening(lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text))
     found = textured(surface, tree, inputs, settings.texture, settings.texture_size, texture_progress)
     if dense is not None:

@@ -34,6 +34,12 @@ class MeshSettings:
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
         10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, follow for normals, which keep edges.", advanced=True
     )
+    photometric_refinement: Literal["auto", "off"] = setting(
+        "auto",
+        "Whether the surface is moved, by a few pixels, to where the training photographs agree on it; auto: where three show it, unless cameras are poor or"
+        " photographs agree no better afterwards.",
+        advanced=True,
+    )
     texture: Literal["auto", "photographs", "asset", "off"] = setting(
         "auto",
         "Source of the texture's colours: the training photographs, blended (photographs), or the asset (asset); auto: photographs where they show the mesh;"
@@ -59,7 +65,7 @@ def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
 
 STAGE = Stage(
     name="mesh",
-    version=16,
+    version=17,
     settings=MeshSettings,
     needs=needs_of(MeshInputs),
     run=ByName("stages.mesh.run:run"),

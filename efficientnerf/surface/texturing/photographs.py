@@ -31,6 +31,7 @@ BORDER = 0.03  # of the longer side of a photograph, over which it fades out
 JUMP = 0.01  # of the inverse depth, at a depth edge
 SLACK = 0.001  # of its depth that a texel may lie behind what the mesh shows there
 BESIDE = 1.0  # pixels that it may be from where that depth was taken: it lies deeper by as much as the surface slopes
+FACING, CLEAR = 0.3, 3.0  # cosine to the normal, and pixels from edges, from which a photograph shows a vertex
 FAINT = 250  # alpha under which a pixel shows something else, too
 FINER = 1.25  # texels on the side of a pixel
 FINEST = 2.0  # pixels of a photograph on the side of a texel from which it is reduced to half
@@ -91,17 +92,32 @@ def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours
     p = seen.pixels[faces]
     edge, other = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0])
+    at, column, row = _shown(seen, photo)
     visible = np.zeros(len(vertices), bool)
-    at = np.flatnonzero(np.isfinite(seen.pixels).all(1) & (seen.depth > 0) & (seen.facing > 0.3))
+    visible[at] = True
+    density = np.where(visible[faces].any(1), np.sqrt(area), 0.0)
+    values = photo.colours[row, column].astype(np.float64) / 255
+    return Survey(np.nan_to_num(density).astype(np.float32), _sharpness(photo, seen.clear, tick), _gains(values, colours[at].astype(np.float64)))
+
+
+def shown_vertices(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: Photograph, tick: Callable[[], None] = _untold) -> np.ndarray:
+    """(V,) float32 how well a photograph shows each vertex away from edges: pixels of a unit of area there; zero where it does not."""
+    seen = _seen(vertices, faces, normals, photo, tick)
+    at, _, _ = _shown(seen, photo)
+    out = np.zeros(len(vertices), np.float32)
+    out[at] = seen.facing[at] * (photo.camera.intrinsics["fx"] / np.linalg.norm(photo.camera.centre - vertices[at], axis=1)) ** 2
+    return out
+
+
+def _shown(seen: _Seen, photo: Photograph) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers of the vertices that a photograph shows, not too obliquely and away from edges, and columns and rows of their pixels."""
+    at = np.flatnonzero(np.isfinite(seen.pixels).all(1) & (seen.depth > 0) & (seen.facing > FACING))
     column, row = np.floor(np.clip(seen.pixels[at], -1, 1e9)).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < photo.camera.width) & (row < photo.camera.height)
     at, column, row = at[inside], column[inside], row[inside]
     slack = SLACK + _beside(photo) * np.sqrt(np.maximum(1 - seen.facing[at] ** 2, 0)) / seen.facing[at]
-    shown = (seen.depth[at] * seen.near[row, column] <= 1 + slack) & (seen.clear[row, column] >= 3.0)
-    visible[at[shown]] = True
-    density = np.where(visible[faces].any(1), np.sqrt(area), 0.0)
-    values = photo.colours[row[shown], column[shown]].astype(np.float64) / 255
-    return Survey(np.nan_to_num(density).astype(np.float32), _sharpness(photo, seen.clear, tick), _gains(values, colours[at[shown]].astype(np.float64)))
+    shown = (seen.depth[at] * seen.near[row, column] <= 1 + slack) & (seen.clear[row, column] >= CLEAR)
+    return at[shown], column[shown], row[shown]
 
 
 def _beside(photo: Photograph) -> float:

@@ -1,0 +1,38 @@
+"""The surface of a mesh fitted to the training photographs, where the cameras are good enough for that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from efficientnerf.surface.agreement import AssetView
+from efficientnerf.surface.mesh import Mesh, vertex_normals
+from efficientnerf.surface.photometric import refined
+from efficientnerf.surface.silhouettes import fitted_to_silhouettes
+from pipeline.stage import Job
+from stages.artifacts import MeshInputs
+from stages.io.refined_cameras import load_scene
+from stages.io.scene import views_of
+from stages.mesh.texture import photographs
+from stages.mesh.timing import Stopwatch
+from stages.reports import CameraVerdict, read_report
+
+MOST = 64  # photographs, evenly spread over the capture
+SKIPPED = 2  # of the asset's views, one in this many has its silhouette fitted
+
+
+def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, choice: str, job: Job, watch: Stopwatch) -> Mesh:
+    """A mesh of the training frame moved to where photographs agree on it, with the asset's silhouettes again, and facts of that. `choice`: auto or off."""
+    views = views_of(load_scene(inputs.poses.folder, inputs.train.folder), "train")
+    cameras = read_report(inputs.poses.verdict, CameraVerdict) if inputs.poses.verdict.is_file() else CameraVerdict()
+    if choice == "off" or cameras.grade == "poor":
+        return mesh
+    chosen = tuple(views[n] for n in np.unique(np.linspace(0, len(views) - 1, min(MOST, len(views))).round().astype(int)))
+    found = refined(mesh.vertices, mesh.faces, photographs(inputs, chosen), job.safe_point)
+    vertices = found.vertices
+    if found.improved:
+        vertices = fitted_to_silhouettes(vertices, mesh.faces, seen[::SKIPPED], job.safe_point)
+    watch.lap("photometric refinement")
+    facts = {"photo_consistency": [round(found.before, 4), round(found.after, 4)], "photo_consistent": round(found.seen, 4), "refined": found.improved}
+    return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces), facts=mesh.facts | facts)
