@@ -2,7 +2,7 @@
 
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => a.map((x) => x / (Math.hypot(...a) || 1));
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const STEEPEST = (89.5 * Math.PI) / 180;
 
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);

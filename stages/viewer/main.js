@@ -147,14 +147,11 @@ class Viewer {
     return out;
   }
 
-  // Along the view axis to the surface that the only pixel of a view shows; below zero where there is none.
-  depth(view) {
+  depth(view, x, y) {
     if (this.fence !== null) this.renderer.gl.deleteSync(this.fence);
     this.fence = null;
-    this.renderer.begin(view, { ...this.settings(false), mode: 4 }, 1, 1);
-    this.renderer.band(1);
     this.touch();
-    return new DataView(this.renderer.pixels().buffer).getFloat32(0, true);
+    return this.renderer.depth(view, x, y, this.settings(false));
   }
 
   async show(subject) {

@@ -12,7 +12,6 @@ export class Measure {
     const { scale = 1, rotation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], translation = [0, 0, 0] } = Object(viewer.tree.meta.world_from_capture);
     Object.assign(this, { viewer, title, scale, rotation, translation, points: [], on: false, missed: false });
     this.unit = viewer.tree.meta.metric === true ? " m" : "";
-    element("measure").hidden = Boolean(viewer.tree.splats); // their pictures have no depth
     element("measure").addEventListener("click", () => this.show(!this.on));
     element("undo").addEventListener("click", () => this.keep(this.points.slice(0, -1)));
     element("clear").addEventListener("click", () => this.keep([]));
@@ -24,7 +23,7 @@ export class Measure {
   }
 
   show(on) {
-    this.on = on && !element("measure").hidden;
+    this.on = on;
     element("measure").setAttribute("aria-pressed", String(this.on));
     element("measured").hidden = !this.on;
     this.keep(this.points);
@@ -38,8 +37,7 @@ export class Measure {
 
   // x, y: in pixels of the canvas
   click(x, y) {
-    const { viewer } = this, { canvas } = viewer, { rotation, eye, lens } = viewer.eye.view(canvas.width, canvas.height);
-    const depth = viewer.depth({ rotation, eye, lens: [lens[0], lens[1], lens[2] - x + 0.5, lens[3] - y + 0.5] });
+    const { viewer } = this, { canvas } = viewer, view = viewer.eye.view(canvas.width, canvas.height), { rotation, eye, lens } = view, depth = viewer.depth(view, x, y);
     if (!(depth > 0 && depth < 1e29)) return this.keep(this.points, true);
     const ray = [((x - lens[2]) / lens[0]) * depth, ((y - lens[3]) / lens[1]) * depth, depth];
     this.keep([...this.points, eye.map((value, row) => value + rotation[row][0] * ray[0] + rotation[row][1] * ray[1] + rotation[row][2] * ray[2])]);

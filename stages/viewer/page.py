@@ -28,6 +28,7 @@ from pipeline.text import printable
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.splats.spz import MAGIC
 from stages.formats.exporters.writing import source_frame
+from stages.framing.true_frame import TrueFrame
 from stages.viewer.html import json_for_html, policy_hash
 
 FOLDER = Path(__file__).parent
@@ -69,13 +70,14 @@ def viewer_page(
 
 def splats_page(
     spz: bytes, metadata: Mapping[str, Any], *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene",
-    asset: str | None = None,
+    asset: str | None = None, true: TrueFrame | None = None,
 ) -> bytes:  # fmt: skip
     """The page of Gaussians in the bytes of an SPZ file of ours.
 
     metadata     of the asset that they were made of
     cameras ...  as of `viewer_page`
     asset        the name of a page next to it that shows the asset
+    true         the frame in which places are told; the file is in the capture's
 
     Raises FormatError.
     """
@@ -88,7 +90,8 @@ def splats_page(
         raise FormatError(f"{title}: its Gaussians are damaged: {error}") from None
     if not stream.eof or content[:4] != MAGIC:
         raise FormatError(f"{title}: its Gaussians are no whole SPZ file")
-    about = {key: value for key, value in metadata.items() if key != "captured_path"}
+    told = {} if true is None else true.metadata(metadata)
+    about = {key: value for key, value in metadata.items() if key != "captured_path"} | told
     facts = {"sha256": hashlib.sha256(content).hexdigest(), "frame": world_from_spz[:3].tolist(), "meta": about}
     return _page(spz[10:-8], len(content), _cameras(cameras, photographs), title, splats=facts, asset=asset)  # the stream in the gzip
 

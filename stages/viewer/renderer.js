@@ -145,6 +145,13 @@ export class Renderer {
     return to === height;
   }
 
+  // Along the axis of a view of the canvas to the surface that it shows at a point, in pixels; below zero where there is none.
+  depth({ rotation, eye, lens: [fx, fy, cx, cy] }, x, y, options) {
+    this.begin({ rotation, eye, lens: [fx, fy, cx - x + 0.5, cy - y + 0.5] }, { ...options, mode: 4 }, 1, 1);
+    this.band(1);
+    return new DataView(this.pixels().buffer).getFloat32(0, true);
+  }
+
   present() {
     const { gl, canvas } = this, { width, height, buffer } = this.target;
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, buffer);

@@ -2,11 +2,14 @@
 // front, a square each, without instances: software renderers draw those one by one.
 
 import { FormatError, structureOf } from "./asset.js";
+import { dot } from "./camera.js";
 import { Renderer, UNITS } from "./renderer.js";
 import { BASIS, SCALE, VERTEX, programOf } from "./shader.js";
 import { sha256 } from "./sha256.js";
+import { insideShare } from "./volume.js";
 
-const NEAR = 0.05, BESIDE = 0.15, LOW_PASS = "0.3"; // as the CPU has them
+const NEAR = 0.05, BESIDE = 0.15, LOW_PASS = 0.3; // as the CPU has them
+const AXES = [0, 1, 2];
 const SLANT = 1.3, SOFT = 2; // how much longer a Gaussian off the axis is drawn than it is; pixels that LOW_PASS adds
 const ROUGH = 0.3; // pixels, the size of Gaussians that are left out while the eye moves
 const SQUARE = [0, 1, 2, 2, 1, 3]; // its corners, of two triangles
@@ -61,6 +64,55 @@ onmessage = ({ data }) => {
   if (data.places) ({ places, extents } = data);
   else postMessage(backToFront(places, extents, data.planes, ${NEAR}, data.least));
 };`;
+
+// How a view of so many pixels sees what is in the file's frame: rows `turn` and `shift` to the camera, the eye in that frame, the world's units in one of it,
+// and the least and greatest x / z and y / z up to which derivatives of the projection follow the means.
+function cameraOf(frame, { rotation: r, eye, lens }, width, height) {
+  const [fx, fy, cx, cy] = lens, away = frame.map((row, axis) => row[3] - eye[axis]), camera = (column, of) => AXES.reduce((sum, axis) => sum + r[axis][column] * of(axis), 0);
+  const turn = AXES.map((row) => AXES.map((column) => camera(row, (axis) => frame[axis][column]))), shift = AXES.map((row) => camera(row, (axis) => away[axis]));
+  const square = AXES.reduce((sum, axis) => sum + frame[axis][0] ** 2, 0), own = AXES.map((column) => AXES.reduce((sum, axis) => sum - (frame[axis][column] * away[axis]) / square, 0));
+  const [x, y] = [(BESIDE * width) / fx, (BESIDE * height) / fy];
+  return { turn, shift, own, size: Math.sqrt(square), lens, limits: [-cx / fx - x, -cy / fy - y, (width - cx) / fx + x, (height - cy) / fy + y] };
+}
+
+// The planes of `backToFront` for a picture with `spare` pixels round it.
+function planesOf({ turn, shift, size }, [fx, fy, cx, cy], width, height, spare) {
+  // What is between a side of the picture and its middle, in the units of the file.
+  const inside = (axis, sign, slope) => {
+    const scale = sign / size / Math.hypot(1, slope), [one, z] = [turn[axis], turn[2]];
+    return [...one.map((x, column) => (x - slope * z[column]) * scale), (shift[axis] - slope * shift[2]) * scale];
+  };
+  const across = [inside(0, 1, (-cx - spare) / fx), inside(0, -1, (width - cx + spare) / fx)];
+  return [[...turn[2], shift[2]], ...across, inside(1, 1, (-cy - spare) / fy), inside(1, -1, (height - cy + spare) / fy)];
+}
+
+// Of a Gaussian at a point of the picture: its alpha, as `projection` and PAINT have it, and the depth at which it is densest along the point's ray. For that its
+// standard deviations have the low-pass of its picture, too: the ray may pass by a Gaussian that is thinner than a pixel.
+function alongRay({ splats: { frame, texels, rows, unit }, region }, number, { turn, shift, lens: [fx, fy, cx, cy], limits }, x, y, subject) {
+  const at = 16 * texels * number, view = new DataView(rows.buffer, at), mean = AXES.map((axis) => view.getInt32(4 * axis, true) * unit);
+  const p = turn.map((row, axis) => dot(row, mean) + shift[axis]), code = view.getUint32(16, true), which = code >>> 30;
+  const three = [20, 10, 0].map((low) => ((((code >>> low) & 511) * Math.SQRT1_2) / 511) * (1 - 2 * ((code >>> (low + 9)) & 1)));
+  const [i, j, k, w] = [...three.slice(0, which), Math.sqrt(Math.max(0, 1 - dot(three, three))), ...three.slice(which)];
+  const own = [
+    [1 - 2 * (j * j + k * k), 2 * (i * j + k * w), 2 * (i * k - j * w)],
+    [2 * (i * j - k * w), 1 - 2 * (i * i + k * k), 2 * (k * j + i * w)],
+    [2 * (i * k + j * w), 2 * (k * j - i * w), 1 - 2 * (i * i + j * j)],
+  ];
+  const root = own.map((axis, n) => turn.map((row) => dot(row, axis) * Math.exp(rows[at + 20 + n] / 16 - 10)));
+  const slope = [0, 1].map((axis) => Math.min(Math.max(p[axis] / p[2], limits[axis]), limits[axis + 2]));
+  const [u, v] = [0, 1].map((axis) => root.map((each) => ([fx, fy][axis] / p[2]) * (each[axis] - slope[axis] * each[2])));
+  const a = dot(u, u) + LOW_PASS, b = dot(u, v), c = dot(v, v) + LOW_PASS, dx = x - (fx * p[0]) / p[2] - cx, dy = y - (fy * p[1]) / p[2] - cy;
+  const across = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]], determinant = dot(across, across) + LOW_PASS * (a + c - LOW_PASS);
+  const share = subject && region ? insideShare(region, ...frame.map((row) => dot(row, mean) + row[3])) : 1;
+  const alpha = Math.min(0.99, ((share * rows[at + 12]) / 255) * Math.exp((-0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy)) / determinant));
+  const ray = [(x - cx) / fx, (y - cy) / fy, 1], sums = [0, 0];
+  for (const each of root) {
+    const square = dot(each, each), weight = dot(ray, each) / square / (square + LOW_PASS * (p[2] / fx) ** 2);
+    sums[0] += weight * dot(p, each);
+    sums[1] += weight * dot(ray, each);
+  }
+  return { alpha: alpha < 1 / 255 ? 0 : alpha, depth: sums[0] / sums[1] };
+}
 
 function projection({ degree, splats: { texels, unit }, region }) {
   const code = (byte) => `float((w${byte >> 4}.${"xyzw"[(byte >> 2) & 3]} >> ${8 * (byte & 3)}u) & 255u)`;
@@ -184,35 +236,25 @@ export class SplatRenderer extends Renderer {
 
   // At rest Gaussians are sorted for the view at once; while the eye moves as the worker last had them.
   begin(view, options, width, height) {
-    const { gl, tree } = this, { rotation: r, eye } = view, { frame, places, extents } = tree.splats, [fx, fy, cx, cy] = view.lens;
+    const { gl, tree } = this, { frame, places, extents } = tree.splats, camera = cameraOf(frame, view, width, height);
     if (!this.target || this.target.width !== width || this.target.height !== height) this._resize(width, height);
-    const axes = [0, 1, 2], away = frame.map((row, axis) => row[3] - eye[axis]), camera = (column, of) => axes.reduce((sum, axis) => sum + r[axis][column] * of(axis), 0);
-    const turn = axes.map((row) => axes.map((column) => camera(row, (axis) => frame[axis][column]))), shift = axes.map((row) => camera(row, (axis) => away[axis]));
-    const square = axes.reduce((sum, axis) => sum + frame[axis][0] ** 2, 0), own = axes.map((column) => axes.reduce((sum, axis) => sum - (frame[axis][column] * away[axis]) / square, 0));
-    const rough = options.rough && this.order && this.worker, size = Math.sqrt(square), least = (options.rough ? ROUGH : 0) / (fx * size);
+    const rough = options.rough && this.order && this.worker, least = (options.rough ? ROUGH : 0) / (view.lens[0] * camera.size);
     const spare = options.rough ? 0.1 * width : SOFT; // the eye goes on while they are sorted
-    // What is between a side of the picture and its middle, in the units of the file.
-    const inside = (axis, sign, slope) => {
-      const scale = sign / size / Math.hypot(1, slope), [one, z] = [turn[axis], turn[2]];
-      return [...one.map((x, column) => (x - slope * z[column]) * scale), (shift[axis] - slope * shift[2]) * scale];
-    };
-    const across = [inside(0, 1, (-cx - spare) / fx), inside(0, -1, (width - cx + spare) / fx)];
-    const planes = [[...turn[2], shift[2]], ...across, inside(1, 1, (-cy - spare) / fy), inside(1, -1, (height - cy + spare) / fy)];
+    const planes = planesOf(camera, view.lens, width, height, spare);
     if (!rough) this.order = backToFront(places, extents, planes, NEAR, least);
     else if (!this.sorting) {
       this.sorting = true;
       this.worker.postMessage({ planes, least });
     }
     gl.useProgram(this.first);
-    const at = (name, program = this.first) => gl.getUniformLocation(program, name), columns = (rows) => axes.flatMap((column) => axes.map((axis) => rows[axis][column]));
-    gl.uniformMatrix3fv(at("turn"), false, columns(turn));
+    const at = (name, program = this.first) => gl.getUniformLocation(program, name), columns = (rows) => AXES.flatMap((column) => AXES.map((axis) => rows[axis][column]));
+    gl.uniformMatrix3fv(at("turn"), false, columns(camera.turn));
     gl.uniformMatrix3fv(at("world"), false, columns(frame));
-    gl.uniform3f(at("shift"), ...shift);
-    gl.uniform3f(at("eye"), ...own);
+    gl.uniform3f(at("shift"), ...camera.shift);
+    gl.uniform3f(at("eye"), ...camera.own);
     gl.uniform3f(at("origin"), ...frame.map((each) => each[3]));
     gl.uniform4f(at("lens"), ...view.lens);
-    const [x, y] = [(BESIDE * width) / fx, (BESIDE * height) / fy];
-    gl.uniform4f(at("limits"), -cx / fx - x, -cy / fy - y, (width - cx) / fx + x, (height - cy) / fy + y);
+    gl.uniform4f(at("limits"), ...camera.limits);
     gl.uniform2f(at("range"), ...options.range);
     gl.uniform1i(at("mode"), options.mode);
     gl.uniform1i(at("subject"), this.subject ? 1 : 0);
@@ -227,6 +269,19 @@ export class SplatRenderer extends Renderer {
     gl.useProgram(this.program);
     gl.uniform2f(at("size", this.program), width, height);
     this.background = options.background;
+  }
+
+  // At the Gaussian with which more than half of the light of the point is absorbed, of those that are drawn there, in the order of their centres.
+  depth(view, x, y) {
+    const { tree, canvas: { width, height } } = this, { frame, places, extents } = tree.splats, [fx, fy, cx, cy] = view.lens;
+    const camera = cameraOf(frame, view, width, height), planes = planesOf(camera, [fx, fy, cx - x + 0.5, cy - y + 0.5], 1, 1, SOFT);
+    const order = backToFront(places, extents, planes, NEAR, 0);
+    for (let n = order.length - 1, light = 1; n >= 0; n--) {
+      const { alpha, depth } = alongRay(tree, order[n], camera, x, y, this.subject);
+      light *= 1 - alpha;
+      if (light < 0.5) return depth;
+    }
+    return -1;
   }
 
   // The picture, whole.

@@ -43,7 +43,7 @@ function leaps(cells, [X, Y, Z]) {
 }
 
 // Share of the opacity of a voxel at a point that belongs to a region's box.
-function insideShare(region, x, y, z) {
+export function insideShare(region, x, y, z) {
   const [a, b, c] = [0, 1, 2].map((axis) => Math.abs([x, y, z][axis] - (region.low[axis] + region.high[axis]) / 2) - (region.high[axis] - region.low[axis]) / 2);
   const radius = Math.min(region.radius, Math.min(region.high[0] - region.low[0], region.high[1] - region.low[1]) / 2), p = a + radius, q = b + radius;
   const across = Math.hypot(Math.max(p, 0), Math.max(q, 0)) + Math.min(Math.max(p, q), 0) - radius, distance = -Math.max(across, c);

@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels
-from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.cameras import Camera, Similarity, rays
+from efficientnerf.splats import rendering
+from efficientnerf.splats.gaussians import Gaussians
 from pipeline.run import Run
-from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.splats.frames import moved
+from stages.formats.exporters.writing import SourceFrame
+from stages.framing.true_frame import TrueFrame, save_frame
 from stages.io.scene import Orbit, Scene, View, save, similarity_to_json
-from stages.viewer.page import viewer_page
 from tests.efficientnerf.capture.rings import cameras_round
 from tests.stages.balls import SIMILARITY
+from tests.stages.formats.gaussians import read_spz, scattered
 from tests.stages.viewer import browser
 from tests.stages.viewer.browser import VIEW, WIDE
 from tests.stages.viewer.scenes import ORBIT
 from tests.workflows.command import Enerf
-from workflows.report.viewer import page_bytes
+from workflows.report.viewer import write_viewer_of
 
 pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
 
@@ -40,7 +49,7 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run that made a solid block."""
+    """A run that made a solid block, and Gaussians round it."""
     path = tmp_path / "a run"
     Run.create(path, Path("/photographs"))
     for outputs in (PosesOutputs.of_run(path), BakeOutputs.of_run(path)):
@@ -52,20 +61,64 @@ def run(tmp_path: Path) -> Path:
     index = np.argwhere(np.ones((16, 16, 16), bool))
     tree = tree_from_voxels((4, 4, 4), 0.1, np.full(3, -0.8), index, np.full(4096, 100.0), np.zeros((4096, 1, 3), np.float32), brick=4, metadata=metadata)
     format.save(tree, BakeOutputs.of_run(path).asset, "compact")
+    SplatsOutputs.of_run(path).folder.mkdir()
+    SPLAT_EXPORTERS[".spz"](moved(shell(), SIMILARITY.inverse()), SplatsOutputs.of_run(path).spz, SourceFrame(SIMILARITY))
     return path
 
 
-def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Enerf, run: Path, tmp_path: Path) -> None:
-    asset, file = BakeOutputs.of_run(run).asset, tmp_path / "page.html"
-    file.write_bytes(viewer_page(page_bytes(run, asset), title=run.name))
+def shell(count: int = 1500) -> Gaussians:
+    """Gaussians near a sphere, of all shapes and opacities, all larger than a pixel."""
+    given, rng = scattered(count, 0), np.random.default_rng(1)
+    means = given.means / np.linalg.norm(given.means, axis=1, keepdims=True) * rng.uniform(0.7, 1.0, (count, 1))
+    return replace(given, means=means.astype(np.float32), scales=np.exp(rng.uniform(np.log(0.03), np.log(0.2), (count, 3))).astype(np.float32))
+
+
+def shown_by(kind: str, run: Path) -> Path:
+    return BakeOutputs.of_run(run).asset if kind == "asset" else SplatsOutputs.of_run(run).spz
+
+
+def depth_of_asset(run: Path, camera: Camera, at: np.ndarray) -> list[float]:
+    depth = render(format.load(BakeOutputs.of_run(run).asset), camera, background=(0, 0, 0)).depth
+    return [depth[y, x] for x, y in at]
+
+
+def depth_of_gaussians(run: Path, camera: Camera, at: np.ndarray) -> list[float]:
+    """Where the Gaussian is densest along a pixel's ray before which, of Gaussians in the order of depth, the CPU renders less than half of the opacity."""
+    up = SourceFrame(SIMILARITY).up
+    found = moved(moved(read_spz(SplatsOutputs.of_run(run).spz)[1], Similarity(1.0, gltf_from_capture(up).T, np.zeros(3))), SIMILARITY)
+    order = np.argsort((found.means - camera.centre) @ camera.forward)
+    out = []
+    for (x, y), ray in zip(at, rays(camera, at + 0.5)[1], strict=True):
+        first, last = 0, len(order)  # of the first `first` the opacity is below half
+        while last - first > 1:
+            middle = (first + last) // 2
+            light = rendering.render(Gaussians(*(part[order[:middle]] for part in parts_of(found))), camera).opacity[y, x]
+            first, last = (middle, last) if light < 0.5 else (first, middle)
+        mean, (w, i, j, k) = found.means[order[first]] - camera.centre, found.rotations[order[first]].astype(np.float64)
+        turn = Rotation.from_quat([i, j, k, w]).as_matrix()
+        inverse = turn @ np.diag(found.scales[order[first]].astype(np.float64) ** -2) @ turn.T
+        out.append(float(ray @ inverse @ mean / (ray @ inverse @ ray) * (ray @ camera.forward)))
+    return out
+
+
+def parts_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
+    return gaussians.means, gaussians.scales, gaussians.rotations, gaussians.opacities, gaussians.harmonics
+
+
+@pytest.mark.parametrize(("kind", "unit"), [("asset", 1.0), ("Gaussians", 2.0)])
+def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Enerf, run: Path, tmp_path: Path, kind: str, unit: float) -> None:
+    file, true = tmp_path / "page.html", Similarity(unit, np.eye(3), np.zeros(3))
+    if unit != 1:
+        save_frame(TrueFrame(true, 0.01, ()), run)
+    write_viewer_of(run, shown_by(kind, run), file)
     with browser.opened(chromium, file, **WIDE) as page:
         page.ready()
         page.page.click("#measure")
         page.shown()
         view, width, height = page.page.evaluate(VIEW)
-        places = CORNERS * [width, height]
+        places = np.round(CORNERS * [width, height]).astype(int)
         for x, y in places:
-            page.page.locator("#scene").click(position={"x": x, "y": y})
+            page.page.locator("#scene").click(position={"x": int(x), "y": int(y)})
         lines = page.page.input_value("#lengths").splitlines()
         page.page.click("#undo")
         assert "in all" not in page.page.input_value("#lengths")
@@ -84,19 +137,19 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
 
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = view["rotation"], view["eye"]
-    camera = Camera("eye", width, height, "PINHOLE", tuple(view["lens"]), pose)
-    pixels = np.floor(places) + 0.5
-    origins, directions = rays(camera, pixels)
-    depth = render(format.load(asset), camera, background=(0, 0, 0)).depth
-    along = np.array([depth[int(y), int(x)] for x, y in pixels]) / (directions @ camera.forward)
-    on_surface = SIMILARITY.inverse().points(origins + along[:, None] * directions)
+    lens = np.add(view["lens"], [0, 0, 0.5, 0.5])  # centres of pixels are where it was clicked
+    camera = Camera("eye", width, height, "PINHOLE", tuple(lens), pose)
+    origins, directions = rays(camera, places + 0.5)
+    depth = np.array((depth_of_asset if kind == "asset" else depth_of_gaussians)(run, camera, places))
+    on_surface = true.points(SIMILARITY.inverse().points(origins + (depth / (directions @ camera.forward))[:, None] * directions))
     picked = np.array([place["position"] for place in found.object["places"]])
-    assert np.linalg.norm(picked - on_surface, axis=1).max() < 0.03, "half a pixel from where it was clicked, and no more"
+    assert np.linalg.norm(picked - on_surface, axis=1).max() < 0.01 * depth.min() * unit / SIMILARITY.scale
 
 
-def test_where_there_is_no_surface_nothing_is_measured(chromium: Any, run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["asset", "Gaussians"])
+def test_where_there_is_no_surface_nothing_is_measured(chromium: Any, run: Path, tmp_path: Path, kind: str) -> None:
     file = tmp_path / "page.html"
-    file.write_bytes(viewer_page(page_bytes(run, BakeOutputs.of_run(run).asset), title=run.name))
+    write_viewer_of(run, shown_by(kind, run), file)
     with browser.opened(chromium, file, **WIDE) as page:
         page.ready()
         page.page.click("#measure")

@@ -55,9 +55,9 @@ def write_viewer_of(run: Path, shown: Path, target: Path, other: str | None = No
     """
     cameras, photographs = captured(run)
     title = os.path.basename(os.path.abspath(run))
-    if shown == SplatsOutputs.of_run(run).spz:  # in the capture's frame, whatever `enerf measure` found
+    if shown == SplatsOutputs.of_run(run).spz:
         metadata = contents(BakeOutputs.of_run(run).asset)[0]
-        page = splats_page(shown.read_bytes(), metadata, cameras=cameras, photographs=photographs, title=title, asset=other)
+        page = splats_page(shown.read_bytes(), metadata, cameras=cameras, photographs=photographs, title=title, asset=other, true=_frame_of(run))
     else:
         page = viewer_page(page_bytes(run, shown), cameras=cameras, photographs=photographs, title=title)
     write_page(target, page)
@@ -65,14 +65,18 @@ def write_viewer_of(run: Path, shown: Path, target: Path, other: str | None = No
 
 def page_bytes(run: Path, asset: Path) -> bytes:
     """The bytes of a run's asset that its page holds, in the frame that `enerf measure` found. Raises FormatError."""
-    try:
-        frame = true_frame.load_frame(run)
-    except PipelineError:  # the page shows the scene even so
-        frame = None
+    frame = _frame_of(run)
     if frame is None:
         return compact_bytes(asset)
     tree = load(asset)
     return serialize(tree.with_metadata(**frame.metadata(tree.metadata)), "compact")
+
+
+def _frame_of(run: Path) -> true_frame.TrueFrame | None:
+    """The frame that was found for the run; none where its file is damaged: the page shows the scene even so."""
+    with suppress(PipelineError):
+        return true_frame.load_frame(run)
+    return None
 
 
 def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
