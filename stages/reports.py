@@ -13,6 +13,7 @@ from stages.io.scene_schema import T, read_document
 
 class Framing(Struct, frozen=True):
     bounds_from: str = ""
+    up_from: str = ""
 
 
 class Rejected(Struct, frozen=True):
@@ -23,13 +24,21 @@ class Rejected(Struct, frozen=True):
 
 
 class MarkersFound(Struct, frozen=True):
-    """Markers that give the scale: its error as a share (99 %)."""
+    """Markers that give the scale: its error as a share (99 %), and whether they give up, too."""
 
     error: float | None = None
+    up: bool = False
+
+
+class Aligned(Struct, frozen=True):
+    """What of GPS, or of cameras that the source states, is used."""
+
+    used: str = ""
 
 
 class CaptureFacts(Struct, frozen=True):
     markers: MarkersFound = MarkersFound()
+    gps: Aligned | None = None
 
 
 class PosesReport(Struct, frozen=True):

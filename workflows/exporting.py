@@ -166,7 +166,7 @@ def export_cameras(export: Export) -> list[Written]:
         true = load_frame(what) if is_run(what) else None
         found = found if true is None else true.scene(found)
         with writing(path, force=export.force):
-            cameras.write(found, path)
+            cameras.write(found, path, None if true is None else true.up)
         written.append({"path": str(path.absolute()), "cameras": len(found.views)})
     return written
 

@@ -12,7 +12,7 @@ from workflows.cli.target import asset_of, is_run
 
 
 def load_asset(path: Path) -> NerfTree:
-    """The asset of a run or of a file, read and checked; of a run in the frame that `enerf measure` found. Raises BadInput and CorruptArtifact."""
+    """The asset of a run or of a file, read and checked; of a run in the frame that was found since. Raises BadInput and CorruptArtifact."""
     found = asset_of(path)
     try:
         tree = load(found)

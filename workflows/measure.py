@@ -1,24 +1,29 @@
-"""`enerf measure`."""
+"""`enerf measure` and `enerf orient`."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from pipeline.errors import BadInput, CorruptArtifact, UsageError
-from stages.framing.true_frame import NAME, save_frame
+from pipeline.run import Run
+from stages.framing.true_frame import AS_CAPTURED, NAME, TrueFrame, load_frame, save_frame
 from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
 from workflows.cli.output import closing, listing, write_json
 from workflows.cli.resolve import metres_of
 from workflows.cli.target import open_run
-from workflows.measuring import Measured, frame_by_lengths, in_words, measured, sides_in_words, sides_of, unit_in_words
+from workflows.measuring import Measured, frame_by_lengths, ground_of, ground_through, in_words, measured, sides_in_words, sides_of, unit_in_words, up_from
 from workflows.measuring import measure as measure_places
 from workflows.report.page import NAME as REPORT
 from workflows.report.page import write_report
 from workflows.report.signature import VIEWER
 from workflows.report.viewer import write_run_viewer
+
+CONFLICT = 3.0  # degrees between the up that is set and one that the run knows, beyond which a warning says so
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # places may begin with a minus
@@ -48,19 +53,12 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
     summary: dict[str, Any] = {}
     if known or forget:
         opened = open_run(run)
-        frame = None if forget else frame_by_lengths(_inside(run), run, lengths)
-        with opened.locked():
-            if frame is None:
-                (run / NAME).unlink(missing_ok=True)
-            else:
-                save_frame(frame, run)
-                summary["known_lengths"] = [{"from": each.begin, "to": each.end, "metres": each.metres, "residual": each.residual} for each in frame.lengths]
-                summary |= {"metres_per_unit_of_capture": frame.from_capture.scale, "scale_error": frame.error}
-            if (run / VIEWER).is_file():
-                write_run_viewer(opened, anew=True)
-            if (run / REPORT).is_file():
-                write_report(opened, workflow().stages)
-        if frame is not None and not as_json and not quiet:
+        frame = _found(run).with_lengths(1.0, None, ()) if forget else frame_by_lengths(_inside(run), run, lengths)
+        _keep(opened, frame)
+        if known:
+            summary["known_lengths"] = [{"from": each.begin, "to": each.end, "metres": each.metres, "residual": each.residual} for each in frame.lengths]
+            summary |= {"metres_per_unit_of_capture": frame.from_capture.scale, "scale_error": frame.error}
+        if known and not as_json and not quiet:
             residuals = [f"  {each.metres:g} m: off by {each.residual:+.2%}" for each in frame.lengths] if len(lengths) > 1 else []
             closing(f"{run}: lengths in metres, within {frame.error:.2g} of each (99 %)", *residuals)
     if places:
@@ -77,6 +75,66 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
             listing(sides_in_words(sides), *unit_in_words(sides))
     if as_json:
         write_json({"event": "summary", "ok": True, "run": str(run), **summary, "exit_code": 0})
+
+
+@click.command(context_settings={"ignore_unknown_options": True})  # places may begin with a minus
+@click.argument("run", metavar="RUN", type=folder_type)
+@click.argument("places", metavar="[PLACE PLACE PLACE]", nargs=-1)
+@click.option("--up", metavar="X,Y,Z", help="The direction that is up, in the frame of RUN's exports, instead of places; the ground is not set.")
+@click.option("--forget", is_flag=True, help="Go back to the up that RUN found.")
+@json_option
+@quiet_option
+@common_options
+def orient(run: Path, places: tuple[str, ...], up: str | None, forget: bool, as_json: bool, quiet: bool) -> None:
+    """Set which way is up in a finished RUN, and where the ground is, by three PLACEs on it (as of `enerf measure`), far apart and not in a row; the cameras
+    are above it.
+
+    Nothing is trained again. From then on exports of RUN (meshes, points, Gaussians, volumes, cameras, assets) have z up, or y up where the format has it so,
+    and 0 on the ground; places and sizes of `enerf measure`, the report and the viewer's pages follow. Lengths stay. Turntables of the run and of `enerf
+    render`, and files that the stages made, keep the up that RUN found.
+    """
+    if (len(places) > 0) + (up is not None) + forget != 1 or len(places) not in (0, 3):
+        raise UsageError("Give three places on the ground, or --up X,Y,Z, or --forget.")
+    opened = open_run(run)
+    if forget:
+        _keep(opened, _found(run).with_ground(None))
+        if as_json:
+            write_json({"event": "summary", "ok": True, "run": str(run), "exit_code": 0})
+        return
+    inside = measured(run)
+    ground, error = (ground_of(inside, up), None) if up is not None else ground_through(inside, places)
+    angle, (words, known) = float(np.degrees(np.arccos(np.clip(inside.own_up @ ground.up, -1, 1)))), up_from(run)
+    _keep(opened, inside.true.with_ground(ground))
+    said = f"{angle:.1f} degrees from the up that the run has, which is {words}"
+    conflict = known and angle > max(error or 0.0, CONFLICT)
+    if conflict:
+        print(f"warning: the new up is {said}.", file=sys.stderr)
+    if as_json:
+        facts = {"up": list(ground.up), "up_error": error, "ground": ground.height if places else None, "degrees_from_run": angle, "up_of_run": words}
+        write_json({"event": "summary", "ok": True, "run": str(run), **facts, "exit_code": 0})
+    elif not quiet:
+        closing(f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}")
+
+
+def _keep(opened: Run, frame: TrueFrame) -> None:
+    """Keep the frame, none where it is the capture's, and write the pages again that show it."""
+    with opened.locked():
+        if frame.error is None and frame.ground is None:
+            (opened.path / NAME).unlink(missing_ok=True)
+        else:
+            save_frame(frame, opened.path)
+        if (opened.path / VIEWER).is_file():
+            write_run_viewer(opened, anew=True)
+        if (opened.path / REPORT).is_file():
+            write_report(opened, workflow().stages)
+
+
+def _found(run: Path) -> TrueFrame:
+    """The frame that was found before; the capture's where there is none that can be used."""
+    try:
+        return load_frame(run) or AS_CAPTURED
+    except (BadInput, CorruptArtifact):
+        return AS_CAPTURED
 
 
 def _inside(run: Path) -> Measured:

@@ -1,4 +1,4 @@
-"""Lengths between places of a run, and its unit by lengths that are known.
+"""Lengths between places of a run, its unit by lengths that are known, and its up by places on the ground.
 
 A place is `X,Y,Z` in the frame of the run's exports, as the viewer copies it, or a pixel in two or more photographs, `PHOTO:x,y+PHOTO:x,y`: x and y are pixels
 of the photograph at full size and upright, from its upper left corner. All is computed in the capture's frame, and scaled at the end.
@@ -24,7 +24,7 @@ from pipeline.text import printable
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.writing import SourceFrame
-from stages.framing.true_frame import KnownLength, TrueFrame, load_frame
+from stages.framing.true_frame import AS_CAPTURED, Ground, KnownLength, TrueFrame, load_frame
 from stages.io import scene
 from stages.mesh.files import read_vertices
 from stages.reports import poses_report
@@ -33,6 +33,8 @@ from workflows.cli.target import is_run, open_run
 from workflows.loading import describe_asset
 
 LARGEST_ERROR = 0.03  # of a length: what is less sure is no unit, as of markers
+LARGEST_TILT = 5.0  # degrees, of up: what is less sure is none
+FLATTEST = 0.05  # of its longest side, how high the triangle of three places on the ground is at least
 LARGEST_MISS = 0.01  # of a picture's longest side: beyond it the pixels are not of one point
 LARGEST_PLACE = 1e12
 SHOWN = 200  # characters of a place in a message
@@ -46,18 +48,27 @@ _EXPECTED = "expected X,Y,Z, or pixels of two photographs or more: a.jpg:120,340
 class Measured:
     """What can be measured in.
 
-    frame  in which places are given, from the capture's: that of exports
+    true   the frame in which places are given: that of exports
     error  of the scale, as a share (99 %); None: not known
-    up     (3,) unit, in the capture's frame
+    own_up  (3,) unit, in the capture's frame, as the run found it
     grain  the standard deviation of a place X,Y,Z that someone picked, in the capture's unit: half a voxel
     """
 
     cameras: Mapping[str, Camera]
-    frame: Similarity
+    true: TrueFrame
     metric: bool
     error: float | None
-    up: np.ndarray
+    own_up: np.ndarray
     grain: float
+
+    @property
+    def frame(self) -> Similarity:
+        return self.true.from_capture
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit, in the capture's frame, as it was set since."""
+        return self.own_up if self.true.ground is None else np.array(self.true.ground.up)
 
     @property
     def unit(self) -> str:
@@ -113,13 +124,13 @@ def measured(run: Path, *, captured: bool = False) -> Measured:
     poses, asset = PosesOutputs(open_run(run).folder("poses")), BakeOutputs.of_run(run).asset
     if not poses.scene.is_file():
         raise BadInput(f"{run}: has no cameras yet. Make them first: enerf run --out {run} --until poses")
-    found, true = scene.load(poses.folder), None if captured else load_frame(run)
+    found, true = scene.load(poses.folder), (None if captured else load_frame(run)) or AS_CAPTURED
     grain = float(describe_asset(asset)["voxel_side"]) / 2 / found.world_from_capture.scale if asset.is_file() else 0.0  # type: ignore[arg-type]
     cameras = {view.name: view.source_camera for view in found.views}
     up = SourceFrame(found.world_from_capture).up
-    if true is not None:
-        return Measured(cameras, true.from_capture, True, true.error, up, grain)
-    return Measured(cameras, Similarity.identity(), found.metric, poses_report(poses.folder).facts.markers.error if found.metric else None, up, grain)
+    if true.error is not None:
+        return Measured(cameras, true, True, true.error, up, grain)
+    return Measured(cameras, true, found.metric, poses_report(poses.folder).facts.markers.error if found.metric else None, up, grain)
 
 
 def sides_of(run: Path) -> dict[str, Any] | None:
@@ -178,7 +189,47 @@ def frame_by_lengths(inside: Measured, run: Path, known: Sequence[tuple[str, str
     if error > LARGEST_ERROR:
         raise BadInput(f"{run}: lengths would be known within {error:.0%} only. Give a longer one, or pick its ends in more photographs, from different sides.")
     lengths = tuple(KnownLength(begin, end, metres, off) for (begin, end, metres), off in zip(known, residuals, strict=True))
-    return TrueFrame(Similarity(ratio, np.eye(3), np.zeros(3)), error, lengths)
+    return inside.true.with_lengths(ratio, error, lengths)
+
+
+def ground_through(inside: Measured, places: Sequence[str]) -> tuple[Ground, float]:
+    """The ground through three places, the cameras above it, and the error of up (99 %), degrees. Raises BadInput where they do not say which way is up."""
+    found = [inside.place(text) for text in places]
+    at = np.array([each.position for each in found])
+    sides = np.linalg.norm(at[[1, 2, 0]] - at[[2, 0, 1]], axis=1)  # each opposite to its place
+    normal = np.cross(at[1] - at[0], at[2] - at[0])
+    area = float(np.linalg.norm(normal))
+    listed = ", ".join(printable(text, SHOWN) for text in places)
+    if not area > FLATTEST * sides.max() ** 2:
+        raise BadInput(f"{listed}: three places in one line, or nearly, which up may turn about. Pick them far apart in both directions.")
+    up = normal / area
+    spreads = np.array([up @ each.covariance @ up for each in found]) ** 0.5
+    error = float(np.degrees(np.arctan(SURE * np.linalg.norm(spreads * sides / area))))
+    if error > LARGEST_TILT:
+        raise BadInput(f"{listed}: up would be known within {error:.0f} degrees only. Pick places farther apart, or in more photographs.")
+    above = np.median([camera.centre @ up for camera in inside.cameras.values()]) - at.mean(axis=0) @ up
+    up = up if above >= 0 else -up
+    return Ground(tuple(up.tolist()), float(at.mean(axis=0) @ up), list(places)), error
+
+
+def ground_of(inside: Measured, text: str) -> Ground:
+    """The ground of an upward direction `X,Y,Z` in the frame of exports, through the capture's origin. Raises UsageError."""
+    numbers = _POINT.fullmatch(text)
+    up = np.array([float(each) for each in numbers.groups()] if numbers else np.zeros(3))
+    if not (0 < np.abs(up).max() < LARGEST_PLACE):
+        raise UsageError(f"--up {printable(text, SHOWN)}: expected a direction X,Y,Z.")
+    up = inside.frame.rotation.T @ (up / np.abs(up).max())
+    return Ground(tuple((up / np.linalg.norm(up)).tolist()), 0.0, [])
+
+
+def up_from(run: Path) -> tuple[str, bool]:
+    """What the up of a run comes from, in words, and whether that is more than a guess."""
+    report = poses_report(PosesOutputs.of_run(run).folder)
+    if report.facts.markers.up:
+        return "by markers", True
+    if report.facts.gps is not None and "up" in report.facts.gps.used:
+        return "by GPS", True
+    return report.framing.up_from or "estimated", report.framing.up_from in ("given", "stated by the source")
 
 
 def in_words(found: Mapping[str, Any]) -> list[str]:

@@ -1,7 +1,7 @@
 // The page: loads the asset, listens, and draws when something changed.
 
 import { FormatError, readAsset } from "./asset.js";
-import { Eye } from "./camera.js";
+import { Eye, uprightOf } from "./camera.js";
 import { Controls } from "./controls.js";
 import { facts, fromBase64, fromBase64Slow, inflated } from "./payload.js";
 import { Renderer, Unsupported } from "./renderer.js";
@@ -44,7 +44,7 @@ class Viewer {
     this.renderer = renderer;
     this.canvas = renderer.canvas;
     this.box = boxOf(tree);
-    this.eye = new Eye(tree.meta.orbit || home, cameras, this.box);
+    this.eye = new Eye(tree.meta.orbit || home, cameras, this.box, uprightOf(tree.meta));
     this.options = { mode: 0, background: tree.background || [0, 0, 0], surroundings: tree.environment !== null, rough: false, range: [1, 2] };
     this.subject = false;
     this.share = 0.5; // of the canvas' sides that is drawn while the eye moves

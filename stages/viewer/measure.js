@@ -1,6 +1,6 @@
 // Places on the surface that were clicked at, the lengths between them, and the command that measures the same.
 
-import { projected } from "./camera.js";
+import { projected, turned } from "./camera.js";
 
 const element = (id) => document.getElementById(id);
 const apart = (a, b) => Math.hypot(...a.map((x, axis) => x - b[axis]));
@@ -57,11 +57,12 @@ export class Measure {
     const { points } = this, legs = points.slice(1).map((point, n) => apart(points[n], point));
     if (this.missed) return "There is no surface. Click at another place.";
     if (!legs.length) return points.length ? "Click at the next place." : "Click at places on the surface.";
-    const extent = [0, 1, 2].map((axis) => Math.max(...points.map((point) => point[axis])) - Math.min(...points.map((point) => point[axis])));
+    const upright = points.map((point) => turned(this.viewer.eye.upright, point));
+    const extent = [0, 1, 2].map((axis) => Math.max(...upright.map((point) => point[axis])) - Math.min(...upright.map((point) => point[axis])));
     return [
       ...legs.map((leg, n) => `${n + 1} to ${n + 2}: ${this.length(leg)}`),
       ...(legs.length > 1 ? [`in all: ${this.length(legs.reduce((a, b) => a + b, 0))}`] : []),
-      `height of ${points.length} over 1: ${this.length(points.at(-1)[2] - points[0][2])}`,
+      `height of ${points.length} over 1: ${this.length(upright.at(-1)[2] - upright[0][2])}`,
       `upright box round them: ${extent.map((side) => this.length(side)).join(" × ")}`,
       ...(this.unit ? [] : ["The unit is not known: enerf measure RUN --known-length A B LENGTH."]),
       `enerf measure ${quoted(this.title)} ${points.map((point) => this.captured(point).map((x) => Number(x.toPrecision(9))).join(",")).join(" ")}`,

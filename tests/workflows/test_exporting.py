@@ -24,11 +24,11 @@ from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
-from stages.framing.true_frame import TrueFrame, save_frame
+from stages.framing.true_frame import AS_CAPTURED, Ground, TrueFrame, save_frame
 from stages.mesh.files import read_mesh, read_vertices
 from stages.mesh.settings import MeshSettings
 from stages.points.settings import PointsSettings
-from tests.stages.io.meshes import block
+from tests.stages.io.meshes import accessor, block, glb_document
 from workflows import exporting
 from workflows.cli.resolve import Settings, table_of
 from workflows.exporting import Export
@@ -86,6 +86,22 @@ def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(ru
     before, after = (read_vertices(SimpleNamespace(ply=path)) for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
     np.testing.assert_allclose(after, 3 * before, rtol=1e-6)
     assert b"unit metre" in (run.parent / "mesh.obj").read_bytes()[:200]
+
+
+def test_what_the_stage_has_made_is_written_upright_where_up_was_set(run: Path) -> None:
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    up = np.array([0.48, -0.6, -0.64])
+    save_frame(AS_CAPTURED.with_ground(Ground(tuple(up.tolist()), 0.5, [])), run)
+    export(run, "mesh.ply", "mesh.glb")
+    before, after = (read_vertices(SimpleNamespace(ply=path)) for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
+    np.testing.assert_allclose(after[:, 2], before @ up - 0.5, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(after - after[0], axis=1), np.linalg.norm(before - before[0], axis=1), rtol=1e-5)
+    assert b"up 0 0 1; unit metre" in (run.parent / "mesh.ply").read_bytes()[:200]
+    document, blob = glb_document(run.parent / "mesh.glb")
+    heights = accessor(document, blob, document["meshes"][0]["primitives"][0]["attributes"]["POSITION"])[:, 1]
+    np.testing.assert_allclose([heights.min(), heights.max()], [after[:, 2].min(), after[:, 2].max()], atol=1e-5)
+    assert document["nodes"][0]["extras"]["source_frame"]["capture_up"] == [0, 0, 1]
 
 
 def test_a_texture_may_be_left_out_of_it(run: Path) -> None:

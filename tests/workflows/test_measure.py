@@ -1,4 +1,4 @@
-"""`enerf measure`: lengths by places and by pixels, metres by known lengths that exports follow, and one line for each mistake."""
+"""`enerf measure`: lengths by places and pixels, metres by known lengths that exports follow; `enerf orient`: up by places; and one line for each mistake."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from efficientnerf.geometry.cameras import Camera, project
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
+from stages.formats.exporters.writing import source_frame
 from stages.framing.true_frame import NAME
 from stages.io.scene import Scene, View, save, similarity_to_json
 from tests.efficientnerf.capture.rings import cameras_round
@@ -145,7 +146,9 @@ def test_a_frame_of_other_cameras_is_not_applied(enerf: Enerf, run: Path) -> Non
 @pytest.mark.parametrize(
     "change",
     [
-        {"format": 2}, {"cameras": 3}, {"error": -1}, {"error": "x"}, {"lengths": [{"begin": "a"}]},
+        {"format": 2}, {"cameras": 3}, {"error": -1}, {"error": "x"}, {"error": None}, {"format": 2, "ground": {"up": [1, 0, 0], "height": 0, "places": []}},
+        {"format": 2, "ground": {"up": [0, 0, 2], "height": 0, "places": []}}, {"ground": {"up": [0, 0, 1], "height": 0, "places": []}},
+        {"lengths": [{"begin": "a"}]},
         {"frame_from_capture": {"scale": 0, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0]}},
         {"frame_from_capture": {"scale": 1, "rotation": np.zeros((3, 3)).tolist(), "translation": [0, 0, 0]}},
     ],
@@ -193,3 +196,120 @@ def test_a_mistake_is_told_in_a_line_or_two(enerf: Enerf, run: Path, arguments: 
 def test_what_is_no_run_cannot_be_measured(enerf: Enerf, tmp_path: Path) -> None:
     found = enerf("measure", tmp_path, "1,2,3", "4,5,6")
     assert (found.code, "run" in found.err) == (2, True)
+
+
+UP = np.array([0.2, -0.3, 0.93]) / np.linalg.norm([0.2, -0.3, 0.93])
+ON_GROUND = -0.4 * UP + 0.5 * np.array([np.cross(UP, axis) for axis in ([1.0, 0, 0], [0, 1.0, 0], [-0.6, -0.8, 0])])
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arcsin(min(1.0, np.linalg.norm(np.cross(a, b))))) + (90 if a @ b < 0 else 0))
+
+
+def camera_poses(enerf: Enerf, run: Path) -> tuple[np.ndarray, dict[str, object]]:
+    """(C, 4, 4) poses as they are exported, and the document."""
+    assert enerf("export", run, "--to", run.parent / "cameras.json", "--force").code == 0
+    found = json.loads((run.parent / "cameras.json").read_text(encoding="utf-8"))
+    return np.array([frame["transform_matrix"] for frame in found["frames"]]), found
+
+
+@pytest.mark.parametrize("by", ["numbers", "pixels"])
+def test_three_places_on_the_ground_make_exports_upright(enerf: Enerf, run: Path, by: str) -> None:
+    kept = {path: path.read_bytes() for stage in ("poses", "bake") for path in (run / stage).iterdir()}
+    before, _ = camera_poses(enerf, run)
+    places = [by_numbers(place) if by == "numbers" else by_pixels(place, 0, 1, 2, 3, 4, 5) for place in ON_GROUND]
+    found = enerf("orient", run, *places, "--json")
+    assert found.code == 0, found.err
+    assert degrees(np.array(found.object["up"]), UP) < 0.1
+    assert found.object["degrees_from_run"] == pytest.approx(degrees(UP, SIMILARITY.rotation.T[:, 2]), abs=0.1)
+    assert 0 < found.object["up_error"] < 1
+    after, document = camera_poses(enerf, run)
+    assert (document["up"], document["unit"]) == ([0, 0, 1], "unknown")
+    turn = after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
+    assert max(degrees(each @ UP, np.array([0.0, 0, 1])) for each in turn) < 0.1
+    np.testing.assert_allclose(after[:, :3, 3], before[:, :3, 3] @ turn[0].T + [0, 0, 0.4], atol=1e-3)  # the ground at 0, cameras above it, the same scale
+    seen = enerf("measure", run, *(by_pixels(place, 0, 1, 2, 3, 4, 5) for place in (A, B, *ON_GROUND)), "--json").object
+    assert seen["lengths"][0]["length"] == pytest.approx(LENGTH, rel=1e-5)
+    positions = [each["position"] for each in seen["places"][2:]]
+    np.testing.assert_allclose(np.array(positions)[:, 2], 0, atol=1e-3)
+
+    metadata = load_asset(run).metadata
+    assert (metadata["up"], metadata["metric"]) == ([0, 0, 1], False)
+    assert enerf("convert", run, run.parent / "upright.nerftree").code == 0
+    assert source_frame(load_asset(run.parent / "upright.nerftree").metadata).up.tolist() == [0, 0, 1]
+    again = enerf("orient", run, *map(by_numbers, np.array(positions)), "--json")  # the same places, told in the new frame
+    np.testing.assert_allclose(camera_poses(enerf, run)[0], after, atol=1e-5)
+    np.testing.assert_allclose(again.object["up"], found.object["up"], atol=1e-5)
+    assert {path: path.read_bytes() for path in kept} == kept
+
+
+def test_up_and_lengths_are_forgotten_each_for_itself(enerf: Enerf, run: Path) -> None:
+    known, places = ("--known-length", by_numbers(A), by_numbers(B), "30cm"), [by_numbers(place) for place in ON_GROUND]
+    first, _ = camera_poses(enerf, run)
+    assert enerf("measure", run, *known).code == 0
+    metres, (sized, document) = (run / NAME).read_bytes(), camera_poses(enerf, run)
+    scale = 0.3 / LENGTH
+    assert enerf("orient", run, *(by_numbers(scale * place) for place in ON_GROUND)).code == 0
+    turned, of_both = camera_poses(enerf, run)
+    assert of_both["unit"] == "metre"
+    np.testing.assert_allclose(np.diff(turned[:, 2, 3]), scale * np.diff(first[:, :3, 3] @ UP), atol=1e-6)
+    assert enerf("orient", run, "--forget").code == 0
+    assert (run / NAME).read_bytes() == metres
+    again, same = camera_poses(enerf, run)
+    assert (again.tolist(), same) == (sized.tolist(), document)
+
+    assert enerf("measure", run, "--forget").code == 0
+    assert enerf("orient", run, *places).code == 0
+    upright, (poses, _) = (run / NAME).read_bytes(), camera_poses(enerf, run)
+    assert enerf("measure", run, "--known-length", by_pixels(A, 0, 2, 4), by_pixels(B, 0, 2, 4), "30cm").code == 0
+    np.testing.assert_allclose(camera_poses(enerf, run)[0][:, :3, 3], scale * poses[:, :3, 3], rtol=1e-4)
+    assert enerf("measure", run, "--forget").code == 0
+    assert (run / NAME).read_bytes() == upright
+    assert enerf("orient", run, "--forget").code == 0
+    assert not (run / NAME).exists()
+    assert camera_poses(enerf, run)[0].tolist() == first.tolist()
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, -1, 0], [1, 0, 0], [1e-5, 0, -1], [-0.3, 0.4, -0.5], [0.2, -0.3, 0.93]])
+def test_a_direction_is_turned_up_and_back(enerf: Enerf, run: Path, up: list[float]) -> None:
+    before, _ = camera_poses(enerf, run)
+    assert enerf("orient", run, "--up", by_numbers(np.array(up))).code == 0
+    after, _ = camera_poses(enerf, run)
+    turn = after[0, :3, :3] @ before[0, :3, :3].T
+    np.testing.assert_allclose(turn @ (up / np.linalg.norm(up)), [0, 0, 1], atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(after[:, :3, 3], axis=1), np.linalg.norm(before[:, :3, 3], axis=1), rtol=1e-9)
+    assert enerf("orient", run, "--up", by_numbers(turn[:, 2])).code == 0  # the former z, told in the new frame
+    np.testing.assert_allclose(camera_poses(enerf, run)[0], before, atol=1e-6)
+
+
+def test_an_up_that_the_run_knows_otherwise_is_told_with_the_angle(enerf: Enerf, run: Path) -> None:
+    angle = f"{degrees(UP, SIMILARITY.rotation.T[:, 2]):.1f} degrees"
+    found = enerf("orient", run, "--up", by_numbers(UP))
+    assert (found.err, angle in found.out) == ("", True)
+    PosesOutputs.of_run(run).report.write_text('{"facts": {"markers": {"error": 0.001, "up": true}}}', encoding="utf-8")
+    found = enerf("orient", run, "--up", "0,0,1", "--quiet")
+    assert (found.code, found.out, found.err) == (0, "", f"warning: the new up is {angle} from the up that the run has, which is by markers.\n")
+    PosesOutputs.of_run(run).report.write_text('{"facts": {"gps": {"used": "scale and up"}}}', encoding="utf-8")
+    assert "by GPS" in enerf("orient", run, "--up", "1,0,0", "--quiet").err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "three places on the ground"),
+        (["1,2,3", "4,5,6"], "three places on the ground"),
+        (["1,2,3", "4,5,6", "1,1,1", "--forget"], "three places on the ground"),
+        (["--up", "0,0,1", "--forget"], "three places on the ground"),
+        (["0,0,0", "1,1,1", "-2,-2,-2.01"], "in one line"),
+        (["0,0,0", "0,0,0", "1,0,0"], "in one line"),
+        (["0,0,0", "0.001,0,0", "0,0.001,0"], "degrees only"),
+        (["1,2,3", "4,5,6", "x.png:1,2"], "no such photograph"),
+        (["--up", "0,0,0"], "--up 0,0,0: expected a direction"),
+        (["--up", "z"], "--up z: expected a direction"),
+        (["--up", "0,1e300,0"], "expected a direction"),
+    ],
+)
+def test_what_gives_no_up_is_told_in_a_line_or_two(enerf: Enerf, run: Path, arguments: list[str], words: str) -> None:
+    found = enerf("orient", run, *arguments)
+    assert (found.code, words in found.err, len(found.err.splitlines()) <= 2) == (2, True, True), found
+    assert not (run / NAME).exists()

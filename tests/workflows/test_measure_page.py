@@ -24,7 +24,7 @@ from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.writing import SourceFrame
-from stages.framing.true_frame import TrueFrame, save_frame
+from stages.framing.true_frame import AS_CAPTURED, Ground, save_frame
 from stages.io.scene import Orbit, Scene, View, save, similarity_to_json
 from tests.efficientnerf.capture.rings import cameras_round
 from tests.stages.balls import SIMILARITY
@@ -105,11 +105,15 @@ def parts_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     return gaussians.means, gaussians.scales, gaussians.rotations, gaussians.opacities, gaussians.harmonics
 
 
-@pytest.mark.parametrize(("kind", "unit"), [("asset", 1.0), ("Gaussians", 2.0)])
-def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Enerf, run: Path, tmp_path: Path, kind: str, unit: float) -> None:
-    file, true = tmp_path / "page.html", Similarity(unit, np.eye(3), np.zeros(3))
-    if unit != 1:
-        save_frame(TrueFrame(true, 0.01, ()), run)
+FRAMES = {"as captured": AS_CAPTURED, "set": AS_CAPTURED.with_lengths(2.0, 0.01, ()).with_ground(Ground((0.48, 0.6, 0.64), 0.3, []))}
+
+
+@pytest.mark.parametrize("kind", ["asset", "Gaussians"])
+@pytest.mark.parametrize("frame", FRAMES)
+def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Enerf, run: Path, tmp_path: Path, kind: str, frame: str) -> None:
+    file, true = tmp_path / "page.html", FRAMES[frame].from_capture
+    if frame == "set":
+        save_frame(FRAMES[frame], run)
     write_viewer_of(run, shown_by(kind, run), file)
     with browser.opened(chromium, file, **WIDE) as page:
         page.ready()
@@ -143,7 +147,12 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
     depth = np.array((depth_of_asset if kind == "asset" else depth_of_gaussians)(run, camera, places))
     on_surface = true.points(SIMILARITY.inverse().points(origins + (depth / (directions @ camera.forward))[:, None] * directions))
     picked = np.array([place["position"] for place in found.object["places"]])
-    assert np.linalg.norm(picked - on_surface, axis=1).max() < 0.01 * depth.min() * unit / SIMILARITY.scale
+    assert np.linalg.norm(picked - on_surface, axis=1).max() < 0.01 * depth.min() * true.scale / SIMILARITY.scale
+    if frame == "set":  # z is up, in the picture too
+        heights = float(lines[3].split(": ")[1].removesuffix(" m")), float(lines[4].rpartition("×")[2].removesuffix(" m"))
+        np.testing.assert_allclose(heights, [picked[-1, 2] - picked[0, 2], np.ptp(picked[:, 2])], rtol=1e-3)
+        right = true.rotation @ SIMILARITY.rotation.T @ pose[:3, 0]
+        assert abs(right[2]) < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["asset", "Gaussians"])

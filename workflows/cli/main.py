@@ -26,6 +26,7 @@ COMMANDS = {  # name -> its module, and what `enerf --help` says of it
     "fleet": ("workflows.fleet.command", "Run many scenes, here or on many machines; a failed scene stops no other."),
     "board": ("workflows.board", "Write a sheet of markers to print, for lengths in metres."),
     "measure": ("workflows.measure", "Measure lengths in a run, or give it metres by lengths that you know."),
+    "orient": ("workflows.measure", "Set which way is up in a run, by places on the ground."),
     "check": ("workflows.inspection.command", "Check photographs before a run."),
     "status": ("workflows.cli.status", "Show which stages are up to date, and why not."),
     "verify": ("workflows.cli.verify", "Check every file against its recorded hash."),

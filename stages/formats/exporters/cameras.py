@@ -9,6 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose
 from pipeline.files import write_json
 from stages.formats.exporters.writing import SourceFrame
@@ -19,7 +21,7 @@ _WRITTEN_AS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL":
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def transforms_from_scene(scene: Scene) -> dict[str, Any]:
+def transforms_from_scene(scene: Scene, up: np.ndarray | None = None) -> dict[str, Any]:
     """The document of a transforms.json: x right, y up, looking along -z, camera to the capture's frame.
 
     Intrinsics that all cameras share stand at the top, else in each frame. A FULL_OPENCV lens keeps that name, which nerfstudio does not
@@ -33,14 +35,14 @@ def transforms_from_scene(scene: Scene) -> dict[str, Any]:
         frame["transform_matrix"] = opengl_from_pose(view.source_camera.world_from_camera).tolist()
         frames.append(frame)
     splits = {f"{split}_filenames": [view.name for view in views_of(scene, split)] for split in SPLITS}
-    of_capture = SourceFrame(scene.world_from_capture, scene.metric)
+    of_capture = SourceFrame(scene.world_from_capture, scene.metric, up)
     stated = {"unit": of_capture.unit, "up": (of_capture.up + 0.0).tolist()}  # which nerfstudio passes over
     return shared | stated | {name: names for name, names in splits.items() if names} | {"frames": frames}
 
 
-def write(scene: Scene, path: Path) -> None:
-    """Write transforms.json for a scene, atomically."""
-    write_json(path, transforms_from_scene(scene))
+def write(scene: Scene, path: Path, up: np.ndarray | None = None) -> None:
+    """Write transforms.json for a scene, atomically; `up` as of SourceFrame."""
+    write_json(path, transforms_from_scene(scene, up))
 
 
 def _lens(camera: Camera) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from pipeline.errors import BadInput
 from pipeline.files import atomic, atomic_together
 
 MOST_TEXELS = 16384  # along a side of a texture: what graphics cards show
+UNIT = 1e-3  # how far from 1 the length of a unit vector may be
 _ROWS = 50_000  # lines of text made at a time
 
 
@@ -22,17 +23,19 @@ _ROWS = 50_000  # lines of text made at a time
 class SourceFrame:
     """The capture's frame, in which meshes and points are handed to exporters.
 
-    world_from_capture  to the training frame, whose z is up
+    world_from_capture  to the training frame
     metric              whether a unit is known to be a metre
+    set_up              (3,) unit, the direction that someone set to be up; None: the training frame's z
     """
 
     world_from_capture: Similarity
     metric: bool = False
+    set_up: np.ndarray | None = None
 
     @property
     def up(self) -> np.ndarray:
         """(3,) unit, the direction in the capture's frame that is up."""
-        return self.world_from_capture.rotation.T @ np.array([0.0, 0.0, 1.0])
+        return self.world_from_capture.rotation.T @ np.array([0.0, 0.0, 1.0]) if self.set_up is None else self.set_up
 
     @property
     def unit(self) -> str:
@@ -52,7 +55,16 @@ def source_frame(metadata: Mapping[str, Any]) -> SourceFrame:
     recorded, similarity = metadata.get("world_from_capture"), Similarity.identity()
     if recorded is not None:
         similarity = Similarity(float(recorded["scale"]), np.asarray(recorded["rotation"], np.float64), np.asarray(recorded["translation"], np.float64))
-    return SourceFrame(similarity, bool(metadata.get("metric", False)))
+    return SourceFrame(similarity, bool(metadata.get("metric", False)), _set_up(metadata.get("up")))
+
+
+def _set_up(given: object) -> np.ndarray | None:
+    """The `up` in an asset's metadata; None for what is no unit vector: other writers may mean something else by it."""
+    if not (isinstance(given, (list, tuple)) and len(given) == 3 and all(isinstance(each, (int, float)) for each in given)):
+        return None
+    up = np.clip(np.asarray(given, np.float64), -2, 2)
+    length = np.linalg.norm(up)
+    return up / length if abs(length - 1) < UNIT else None
 
 
 def check_mesh(mesh: Mesh, path: Path) -> None:

@@ -120,6 +120,7 @@ COMMANDS: dict[str, tuple[list[str], str, set[str]]] = {
     "verify asset": (["verify", "X"], ".nerftree", set()),
     "report": (["report", "X"], "", set()),
     "measure": (["measure", "X", "0,0,0", "1,1,1"], "", set()),
+    "orient": (["orient", "X", "0,0,0", "1,0,0", "0,1,0"], "", set()),
     "inspect": (["inspect", "X"], "", {"folder_of_pipes"}),
     "inspect asset": (["inspect", "X"], ".nerftree", {"folder_of_pipes"}),
     "inspect mesh": (["inspect", "X"], ".ply", {"folder_of_pipes"}),
