@@ -11,10 +11,10 @@ import numpy as np
 
 from efficientnerf.surface.agreement import AssetView
 from efficientnerf.surface.colours import surface_colours
+from efficientnerf.surface.fitting.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.fusion import Fusion
 from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_threshold, enclosed_cells, isosurface, silent
 from efficientnerf.surface.mesh import Mesh, PointCloud, decimate, sample, separate, tidy, vertex_normals
-from efficientnerf.surface.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.smoothing import rounds_within, smooth, smooth_normals
 from efficientnerf.surface.visible_parts import Shown, visible_parts
 from efficientnerf.surface.volume import NdcVolume, Volume

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.fitting.photometric import LARGEST
 from efficientnerf.surface.fusion import MARGIN
 from efficientnerf.surface.isosurface import BLOCK, pool_of
-from efficientnerf.surface.photometric import LARGEST
 from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
 from stages.artifacts import MeshInputs
 from stages.io.scene import load, views_of

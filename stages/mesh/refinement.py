@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from efficientnerf.surface.agreement import AssetView
+from efficientnerf.surface.fitting.photometric import refined
+from efficientnerf.surface.fitting.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.mesh import Mesh, vertex_normals
-from efficientnerf.surface.photometric import refined
-from efficientnerf.surface.silhouettes import fitted_to_silhouettes
 from pipeline.stage import Job
 from stages.artifacts import MeshInputs
 from stages.io.refined_cameras import load_scene

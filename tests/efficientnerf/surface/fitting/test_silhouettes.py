@@ -8,8 +8,8 @@ import trimesh
 
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.surface.agreement import AssetView, agreement
+from efficientnerf.surface.fitting.silhouettes import distance_inside, fitted_to_silhouettes
 from efficientnerf.surface.rasteriser import mesh_image
-from efficientnerf.surface.silhouettes import distance_inside, fitted_to_silhouettes
 
 PIXEL = 3.0 / 140  # at the origin
 

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from efficientnerf.backends.numba.mesh import photometric as kernel
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.surface.photometric import refined
+from efficientnerf.surface.fitting.photometric import refined
 from efficientnerf.surface.texturing.photographs import Photograph
 
 SIDE, PIXELS = 41, 160
