@@ -100,8 +100,8 @@ class TrueFrame:
     def metadata(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
         """What of an asset's metadata differs in this frame."""
         world = then(source_frame(metadata).world_from_capture, self.from_capture.inverse())
-        told = {"world_from_capture": similarity_to_json(world), "metric": self.error is not None or bool(metadata.get("metric", False))}
-        return told if self.up is None else told | {"up": self.up.tolist()}
+        out = {"world_from_capture": similarity_to_json(world), "metric": self.error is not None or bool(metadata.get("metric", False))}
+        return out if self.up is None else out | {"up": self.up.tolist()}
 
     def source_frame(self, metadata: Mapping[str, Any]) -> SourceFrame:
         """This frame, as exporters take it, from an asset's metadata."""

@@ -58,7 +58,7 @@ def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
     """Memory of the stage mesh."""
     texture = 0 if settings.texture == "off" else settings.texture_size
     fitted = 0 if settings.photometric_refinement == "off" else _most_faces(tree, settings) // 2
-    pixels = largest_photograph(inputs, settings.texture)
+    pixels = largest_photograph(inputs, "photographs" if fitted else settings.texture)
     return surface_needed(tree, texture=texture, pixels=pixels, dense=settings.normal_map, fitted=fitted)
 
 

@@ -10,6 +10,7 @@ from efficientnerf.surface.agreement import AssetView
 from efficientnerf.surface.fitting.photometric import refined
 from efficientnerf.surface.fitting.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.mesh import Mesh, vertex_normals
+from efficientnerf.surface.nested import SKIPPED
 from pipeline.stage import Job
 from stages.artifacts import MeshInputs
 from stages.io.refined_cameras import load_scene
@@ -19,7 +20,6 @@ from stages.mesh.timing import Stopwatch
 from stages.reports import CameraVerdict, read_report
 
 MOST = 64  # photographs, evenly spread over the capture
-SKIPPED = 2  # of the asset's views, one in this many has its silhouette fitted
 
 
 def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, choice: str, job: Job, watch: Stopwatch) -> Mesh:

@@ -77,7 +77,7 @@ def splats_page(
     metadata     of the asset that they were made of
     cameras ...  as of `viewer_page`
     asset        the name of a page next to it that shows the asset
-    true         the frame in which places are told; the file is in the capture's
+    true         the frame of the places that are shown; the file is in the capture's
 
     Raises FormatError.
     """
@@ -90,8 +90,8 @@ def splats_page(
         raise FormatError(f"{title}: its Gaussians are damaged: {error}") from None
     if not stream.eof or content[:4] != MAGIC:
         raise FormatError(f"{title}: its Gaussians are no whole SPZ file")
-    told = {} if true is None else true.metadata(metadata)
-    about = {key: value for key, value in metadata.items() if key != "captured_path"} | told
+    changed = {} if true is None else true.metadata(metadata)
+    about = {key: value for key, value in metadata.items() if key != "captured_path"} | changed
     facts = {"sha256": hashlib.sha256(content).hexdigest(), "frame": world_from_spz[:3].tolist(), "meta": about}
     return _page(spz[10:-8], len(content), _cameras(cameras, photographs), title, splats=facts, asset=asset)  # the stream in the gzip
 
