@@ -7,7 +7,6 @@ pixel is object. Shadows on a coloured screen change its lightness more than its
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -131,19 +130,16 @@ def _touching_border(region: np.ndarray) -> np.ndarray:
 
 def without_specks(mask: np.ndarray) -> np.ndarray:
     """A mask (h, w) uint8 without parts much smaller than the largest, and without pinholes."""
-    mask = mask.copy()
     inside = mask > 127
-    for number, area, part in _parts(inside):
-        if number and area < SPECK * inside.sum():
-            mask[part] = 0
-    for number, area, part in _parts(mask <= 127):
-        if number and area < HOLE * mask.size:
-            mask[part] = 255
-    return mask
+    mask = np.where(_small_parts(inside, SPECK * inside.sum()), np.uint8(0), mask)
+    return np.where(_small_parts(mask <= 127, HOLE * mask.size), np.uint8(255), mask)
 
 
-def _parts(region: np.ndarray) -> list[tuple[int, int, Any]]:
-    """The connected parts of a region: their place by size, the largest 0; pixels; and where they are, a mask of the whole picture."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=8)
-    order = sorted(range(1, count), key=lambda part: -int(stats[part, cv2.CC_STAT_AREA]))
-    return [(number, int(stats[part, cv2.CC_STAT_AREA]), labels == part) for number, part in enumerate(order)]
+def _small_parts(region: np.ndarray, area: float) -> np.ndarray:
+    """(h, w) bool: the connected parts of a region of fewer pixels than `area`, but the largest one."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    small = areas < area
+    if len(areas):
+        small[np.argmax(areas)] = False
+    return np.asarray(np.concatenate([[False], small])[labels])
