@@ -26,7 +26,7 @@ VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
 # Of a pixel of a view whose depth is fused, and of a voxel of a block that is fused at a time.
 PIXEL, BLOCK_VOXEL = 36, 120
 # Of a texel, with what it has seen of photographs; of a photograph's pixel with depth and edges.
-TEXEL, PHOTOGRAPH_PIXEL = 140, 60
+TEXEL, PHOTOGRAPH_PIXEL = 110, 60
 # Of a stored voxel, what a normal map is baked from: the surface before decimation with its normals, and cells in which its faces are found.
 DENSE_VOXEL, DENSE_CELLS = 250, 8 * 256**3
 # Of a vertex that is fitted to photographs: places and scores in them.

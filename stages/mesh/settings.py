@@ -46,7 +46,7 @@ class MeshSettings:
         " off: vertex colours only.",
     )
     texture_size: Annotated[int, Meta(ge=256, le=8192)] = setting(
-        2048,
+        4096,
         "Maximum number of texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.",
         advanced=True,
     )
@@ -65,7 +65,7 @@ def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
 
 STAGE = Stage(
     name="mesh",
-    version=17,
+    version=18,
     settings=MeshSettings,
     needs=needs_of(MeshInputs),
     run=ByName("stages.mesh.run:run"),

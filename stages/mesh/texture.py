@@ -16,7 +16,7 @@ from efficientnerf.surface.texturing.asset import texture_of_asset
 from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.filling import texture_from
 from efficientnerf.surface.texturing.normal_map import Dense, with_normal_map
-from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, photograph, survey, texels_wanted
+from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, exposed_alike, photograph, survey, texels_wanted
 from stages.artifacts import MeshInputs
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import View, load, views_of
@@ -49,6 +49,7 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
     for number, photo in enumerate(photographs(inputs, views)):
         progress(number, steps, "texture")
         surveys.append(survey(mesh.vertices, mesh.faces, mesh.normals, mesh.colours, photo, partial(progress, number, steps, "texture")))
+    surveys = exposed_alike(surveys)
     density = np.max([each.density for each in surveys], axis=0)
     atlas = atlas_of(mesh.vertices, mesh.faces, texels_wanted(mesh.vertices, mesh.faces, density), largest)
     sharpness = float(np.median([each.sharpness for each in surveys]))

@@ -2,12 +2,13 @@
 
 A photograph shows a texel where the mesh's depth says so, away from depth edges, masked pixels and the photograph's borders: the mesh is
 never exact, and colours behind an edge must not bleed onto it. Its grade there is the area of its pixels that a texel covers (so that oblique, distant
-and coarse photographs count less), times the cosine to the normal, its sharpness and its distance from these edges. docs/experiments/textures.md
+and coarse photographs count less), times the cosine to the normal, its sharpness and its distance from these edges; colours are weighted by its square
+root. docs/experiments/textures.md
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,7 +23,6 @@ from efficientnerf.surface.texturing.atlas import Atlas, Texels
 from efficientnerf.surface.texturing.filling import carried_on
 
 KEPT = 12  # photographs that a texel remembers
-POWER = 0.5  # of grades, that colours are weighted by. docs/experiments/textures.md
 SCALE = 60.0  # of 255, by which colours differ of which one is an outlier. docs/experiments/textures.md
 VOTE = 1.5  # of the colour that the asset has, on which of the photographs is right, against the best of them
 TRUST = 0.01  # grade of the colour that is expected. docs/experiments/textures.md
@@ -78,7 +78,7 @@ class Survey:
 
     density    (F,) float32 pixels on the side of the square that a face is half of, where one of its vertices shows; zero elsewhere
     sharpness  of its pixels of the mesh: how much of their detail is fine
-    gains      (3,) factors that bring its colours to those of the vertices
+    gains      (3,) factors that bring its colours to those of the vertices; nan where it shows too few
     """
 
     density: np.ndarray
@@ -146,12 +146,22 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _gains(values: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(3,) factors from values (N, 3) to those expected (N, 3): medians of ratios, without nearly black or white ones; ones where all are small."""
+    """(3,) factors from values (N, 3) to those expected (N, 3): medians of ratios, without nearly black or white ones; nan where too few are left."""
     good = ((values > 0.08) & (values < 0.92) & (expected > 0.08) & (expected < 0.92)).all(1)
-    if good.sum() < MIN_SAMPLES:
-        return np.ones(3)
-    found = np.median(np.log(expected[good] / values[good]), axis=0)
-    return np.asarray(np.exp(np.clip(found, -MOST_GAIN, MOST_GAIN))) if np.abs(found).max() > GAIN else np.ones(3)
+    return np.asarray(np.exp(np.median(np.log(expected[good] / values[good]), axis=0))) if good.sum() >= MIN_SAMPLES else np.full(3, np.nan)
+
+
+def exposed_alike(surveys: Sequence[Survey]) -> list[Survey]:
+    """The same surveys with gains that bring each photograph to the median of all: what all differ by from the mesh's own colours is those colours' fault.
+    Ones where gains are small or unknown."""
+    found = np.log([each.gains for each in surveys])
+    known = np.isfinite(found).all(axis=1)
+    relative = np.zeros_like(found)
+    if known.any():
+        relative[known] = found[known] - np.median(found[known], axis=0)
+    gains = np.exp(np.clip(relative, -MOST_GAIN, MOST_GAIN))
+    gains[np.abs(relative).max(axis=1) <= GAIN] = 1.0
+    return [replace(each, gains=own) for each, own in zip(surveys, gains, strict=True)]
 
 
 def _sharpness(photo: Photograph, clear: np.ndarray, tick: Callable[[], None]) -> float:
@@ -237,13 +247,13 @@ class PhotographTexture:
     density: np.ndarray
     sharpness: float
     seen: np.ndarray = field(init=False)
-    grades: np.ndarray = field(init=False)
+    weights: np.ndarray = field(init=False)
     halvings: int = field(init=False)  # of photographs, before texels look at them: several of whose pixels lie in a texel
 
     def __post_init__(self) -> None:
         count = len(self.texels.place)
         self.seen = np.zeros((count, KEPT, 3), np.uint8)
-        self.grades = np.zeros((count, KEPT), np.float32)
+        self.weights = np.zeros((count, KEPT), np.uint16)
         self.density = np.ascontiguousarray(self.density, np.float32)
         ratio = self.texels_per_pixel()
         self.halvings = max(0, int(np.floor(np.log(1 / ratio) / np.log(FINEST) + 1e-9))) if ratio > 0 else 0
@@ -264,14 +274,14 @@ class PhotographTexture:
         while done < self.halvings and min(photo.usable.shape) >= 2 * SMALLEST_PHOTOGRAPH:
             photo, done = halved(photo), done + 1
         seen = _seen(self.vertices, self.faces, self.normals, photo, tick)
-        weight = np.float32(np.clip(SHARP * found.sharpness / self.sharpness, 0.05, 1.0)) if self.sharpness > 0 else np.float32(1)
+        sharpness = np.float32(np.clip(SHARP * found.sharpness / self.sharpness, 0.05, 1.0)) if self.sharpness > 0 else np.float32(1)
         gains = np.ascontiguousarray(found.gains, np.float32)
         density = self.density / np.float32(2**done)
         for part in pieces(len(self.faces), first=4096):
             tick()
             observe(
                 part.start, part.stop, self.texels.begin, self.texels.share, self.faces, seen.pixels, seen.depth, seen.facing, seen.near, seen.clear,
-                photo.colours, gains, np.float32(REACH), np.float32(SLACK), np.float32(_beside(photo)), density, weight, self.seen, self.grades,
+                photo.colours, gains, np.float32(REACH), np.float32(SLACK), np.float32(_beside(photo)), density, sharpness, self.seen, self.weights,
             )  # fmt: skip
 
     def finished(self, mesh: Mesh, tick: Callable[[], None] = _untold) -> tuple[np.ndarray, np.ndarray]:
@@ -286,5 +296,5 @@ class PhotographTexture:
         out, known = np.empty((len(self.seen), 3), np.uint8), np.empty(len(self.seen), np.float32)
         for part in pieces(len(self.seen), first=4096):
             tick()
-            blend(part.start, part.stop, self.seen, self.grades, KEPT, POWER, SCALE, expected, VOTE, TRUST, out, known)
+            blend(part.start, part.stop, self.seen, self.weights, SCALE, expected, VOTE, TRUST, out, known)
         return out, known

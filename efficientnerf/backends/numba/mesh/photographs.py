@@ -6,6 +6,8 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 
+WEIGHT = 65535.0  # of a photograph that shows a texel best
+
 
 @numba.njit(cache=True, error_model="numpy")
 def mark_edges(near, jump, begin, end, out):  # type: ignore[no-untyped-def]
@@ -80,9 +82,19 @@ def _jumps(left, here, other, right, jump):  # type: ignore[no-untyped-def]
     return step > jump * max(here, other) and step > 3.0 * even
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _catmull_rom(t):  # type: ignore[no-untyped-def]
+    """Weights of four pixels in a row for a place between the middle two, `t` float32 from the second on: linear interpolation would blur."""
+    half, one = np.float32(0.5), np.float32(1.0)
+    squared, cubed = t * t, t * t * t
+    first, last = half * (np.float32(2.0) * squared - t - cubed), half * (cubed - squared)
+    second = one + half * (np.float32(3.0) * cubed - np.float32(5.0) * squared)
+    return first, second, one - first - second - last, last
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def observe(  # type: ignore[no-untyped-def]
-    begin_face, end_face, texel_begin, share, faces, pixels, depth, facing, near, clear, photo, gain, reach, slack, beside, density, weight, seen, grades,
+    begin_face, end_face, texel_begin, share, faces, pixels, depth, facing, near, clear, photo, gain, reach, slack, beside, density, sharpness, seen, weights,
 ):  # fmt: skip
     """Lets texels of faces `begin_face` to `end_face` see a photograph; of what a texel has seen the K best graded are kept.
 
@@ -100,12 +112,12 @@ def observe(  # type: ignore[no-untyped-def]
     slack        share of its depth that a texel may lie behind what is seen
     beside       the same for each unit of the slope of its surface
     density      (F,) float32 pixels for each texel, of the photograph that has most: its square root
-    weight       of the photograph
+    sharpness    0 to 1, that its grades are multiplied by
     seen         (T, K, 3) uint8 colours
-    grades       (T, K) float32 their grades, descending; zero: none
+    weights      (T, K) uint16 WEIGHT times the square roots of their grades, descending; zero: none
     """
     height, width = near.shape
-    kept = grades.shape[1]
+    kept = weights.shape[1]
     for face in numba.prange(begin_face, end_face):
         p, q, r = faces[face, 0], faces[face, 1], faces[face, 2]
         if not (depth[p] > 0.0 and depth[q] > 0.0 and depth[r] > 0.0 and max(facing[p], facing[q], facing[r]) > 0.05):
@@ -122,7 +134,7 @@ def observe(  # type: ignore[no-untyped-def]
             a, b, c = share[texel, 0] * depth[p], share[texel, 1] * depth[q], share[texel, 2] * depth[r]
             deep = a + b + c
             x, y = (a * pixels[p, 0] + b * pixels[q, 0] + c * pixels[r, 0]) / deep, (a * pixels[p, 1] + b * pixels[q, 1] + c * pixels[r, 1]) / deep
-            if not (x >= 1.0 and y >= 1.0 and x < width - 1.0 and y < height - 1.0):
+            if not (x >= 2.0 and y >= 2.0 and x < width - 2.0 and y < height - 2.0):
                 continue
             column, row = int(x), int(y)
             cosine = share[texel, 0] * facing[p] + share[texel, 1] * facing[q] + share[texel, 2] * facing[r]
@@ -134,37 +146,39 @@ def observe(  # type: ignore[no-untyped-def]
             if deep * near[row, column] > 1.0 + slack + beside * slope:
                 continue
             edge = min(free / reach, np.float32(1.0))
-            grade = np.float32(weight * edge * edge * cosine * size * size)
-            if grade <= grades[texel, kept - 1]:
+            weight = np.uint16(np.float32(WEIGHT) * edge * size * np.sqrt(sharpness * cosine))
+            if weight <= weights[texel, kept - 1]:
                 continue
             u, v = x - 0.5, y - 0.5
             i, j = int(u), int(v)
             s, t = np.float32(u - i), np.float32(v - j)
             place = kept - 1
-            while place > 0 and grades[texel, place - 1] < grade:
-                grades[texel, place] = grades[texel, place - 1]
+            while place > 0 and weights[texel, place - 1] < weight:
+                weights[texel, place] = weights[texel, place - 1]
                 for channel in range(3):
                     seen[texel, place, channel] = seen[texel, place - 1, channel]
                 place -= 1
-            grades[texel, place] = grade
+            weights[texel, place] = weight
+            columns, rows = _catmull_rom(s), _catmull_rom(t)
             for channel in range(3):
-                upper = np.float32(photo[j, i, channel]) * (1 - s) + np.float32(photo[j, i + 1, channel]) * s
-                lower = np.float32(photo[j + 1, i, channel]) * (1 - s) + np.float32(photo[j + 1, i + 1, channel]) * s
-                value = (upper * (1 - t) + lower * t) * gain[channel]
-                seen[texel, place, channel] = np.uint8(min(max(value + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
+                value = np.float32(0.0)
+                for row in range(4):
+                    along = np.float32(0.0)
+                    for column in range(4):
+                        along += columns[column] * np.float32(photo[j - 1 + row, i - 1 + column, channel])
+                    value += rows[row] * along
+                seen[texel, place, channel] = np.uint8(min(max(value * gain[channel] + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def blend(begin, end, seen, grades, views, power, scale, prior, vote, trust, out, known):  # type: ignore[no-untyped-def]
+def blend(begin, end, seen, weights, scale, prior, vote, trust, out, known):  # type: ignore[no-untyped-def]
     """One colour for each of the texels `begin` to `end` from what they have seen.
 
-    seen, grades  as for `observe`
-    views   of these, the best so many count
-    power   of grades, that colours are weighted by
+    seen, weights  as for `observe`
     scale   difference of colours, 0-255, from which one that disagrees counts less
     prior   (T, 3) uint8 colour that is expected, and counts where little was seen
     vote    what it counts among the colours seen, of which the best counts one, where these disagree
-    trust   its grade
+    trust   its grade: the square of its weight
     out     (T, 3) uint8
     known   (T,) float32 share of the colour that is from photographs
 
@@ -173,7 +187,7 @@ def blend(begin, end, seen, grades, views, power, scale, prior, vote, trust, out
     """
     for texel in numba.prange(begin, end):
         count = 0
-        while count < views and grades[texel, count] > 0.0:
+        while count < weights.shape[1] and weights[texel, count] > 0:
             count += 1
         if count == 0:
             known[texel] = 0.0
@@ -181,6 +195,7 @@ def blend(begin, end, seen, grades, views, power, scale, prior, vote, trust, out
                 out[texel, channel] = prior[texel, channel]
             continue
         best, least = 0, np.inf
+        strongest = np.float64(weights[texel, 0])
         if count > 1:
             for one in range(count):
                 total = 0.0
@@ -188,23 +203,23 @@ def blend(begin, end, seen, grades, views, power, scale, prior, vote, trust, out
                     apart = 0.0
                     for channel in range(3):
                         apart += abs(np.float64(seen[texel, one, channel]) - np.float64(seen[texel, other, channel]))
-                    total += np.sqrt(grades[texel, other] / grades[texel, 0]) * apart
+                    total += weights[texel, other] / strongest * apart
                 for channel in range(3):
                     total += vote * abs(np.float64(seen[texel, one, channel]) - np.float64(prior[texel, channel]))
                 if total < least:
                     best, least = one, total
         red, green, blue = np.float64(seen[texel, best, 0]), np.float64(seen[texel, best, 1]), np.float64(seen[texel, best, 2])
-        strongest = grades[texel, 0]
         for _ in range(3):
             total, reds, greens, blues = 0.0, 0.0, 0.0, 0.0
             for one in range(count):
                 r, g, b = np.float64(seen[texel, one, 0]), np.float64(seen[texel, one, 1]), np.float64(seen[texel, one, 2])
                 apart = ((r - red) ** 2 + (g - green) ** 2 + (b - blue) ** 2) / (scale * scale)
-                weight = (grades[texel, one] / strongest) ** power / ((1.0 + apart) * (1.0 + apart))
+                weight = weights[texel, one] / strongest / ((1.0 + apart) * (1.0 + apart))
                 total += weight
                 reds, greens, blues = reds + weight * r, greens + weight * g, blues + weight * b
             red, green, blue = np.float64(reds / total), np.float64(greens / total), np.float64(blues / total)
-        share = strongest / (strongest + trust)
+        grade = (strongest / WEIGHT) ** 2
+        share = grade / (grade + trust)
         known[texel] = share
         out[texel, 0] = np.uint8(min(max(share * red + (1.0 - share) * prior[texel, 0] + 0.5, 0.0), 255.0))
         out[texel, 1] = np.uint8(min(max(share * green + (1.0 - share) * prior[texel, 1] + 0.5, 0.0), 255.0))

@@ -11,7 +11,7 @@ from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface.mesh import vertex_normals
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 from efficientnerf.surface.texturing.atlas import Atlas, atlas_of
-from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, survey
+from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, exposed_alike, survey
 
 Colours = Callable[[np.ndarray], np.ndarray]
 
@@ -69,7 +69,7 @@ def textured(
 ) -> tuple[Atlas, np.ndarray, np.ndarray]:
     """The atlas, colours (T, 3) of its texels 0-1 and how much of each is from photographs. What is expected: the pattern, dull; gains against the pattern."""
     normals = vertex_normals(vertices, faces)
-    surveys = [survey(vertices, faces, normals, pattern(vertices), photo) for photo in photos]
+    surveys = exposed_alike([survey(vertices, faces, normals, pattern(vertices), photo) for photo in photos])
     atlas = atlas_of(vertices, faces, np.inf, size)
     density = np.max([each.density for each in surveys], axis=0)
     texels = PhotographTexture(vertices, faces, normals, atlas, density, float(np.median([each.sharpness for each in surveys])))

@@ -12,7 +12,7 @@ from efficientnerf.geometry.cameras import project
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.filling import carried_on
-from efficientnerf.surface.texturing.photographs import REACH, PhotographTexture, edge_distance, photograph, survey
+from efficientnerf.surface.texturing.photographs import REACH, PhotographTexture, Survey, edge_distance, exposed_alike, photograph, survey
 
 from .shapes import ball, box, cameras, pattern, photographed, textured
 
@@ -53,14 +53,26 @@ def test_what_passes_by_in_one_photograph_is_left_out() -> None:
 def test_a_photograph_of_another_exposure_is_corrected() -> None:
     vertices, faces = ball(4)
     photos = [photographed(vertices, faces, camera) for camera in cameras(8)]
-    dark = replace(photos[2], colours=np.round(photos[2].colours * 0.7).astype(np.uint8))
-    found = survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), dark)
-    np.testing.assert_allclose(found.gains, 1 / 0.7, rtol=0.05)
-    kept = survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), photos[2])
-    np.testing.assert_allclose(kept.gains, 1, atol=1e-9)  # small differences are not touched
-    atlas, colours, known = textured(vertices, faces, [*photos[:2], dark, *photos[3:]])
+    photos[2] = replace(photos[2], colours=np.round(photos[2].colours * 0.7).astype(np.uint8))
+    surveys = exposed_alike([survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), photo) for photo in photos])
+    np.testing.assert_allclose(surveys[2].gains, 1 / 0.7, rtol=0.05)
+    np.testing.assert_allclose([each.gains for n, each in enumerate(surveys) if n != 2], 1, atol=1e-9)  # small differences are not touched
+    atlas, colours, known = textured(vertices, faces, photos)
     truth = pattern(atlas.texels.values(vertices, faces))
     assert psnr(colours[known > 0.9], truth[known > 0.9]) > 33
+
+
+def test_photographs_keep_their_colours_where_the_mesh_has_others() -> None:
+    vertices, faces = ball(4)
+    photos = [photographed(vertices, faces, camera) for camera in cameras(8)]
+    surveys = exposed_alike([survey(vertices, faces, vertex_normals(vertices, faces), 0.7 * pattern(vertices), photo) for photo in photos])
+    np.testing.assert_array_equal([each.gains for each in surveys], 1)
+
+
+def test_a_photograph_that_shows_too_little_keeps_its_colours() -> None:
+    shown = Survey(np.ones(1, np.float32), 1.0, np.full(3, 1.5))
+    gains = [each.gains for each in exposed_alike([shown, replace(shown, gains=np.full(3, np.nan)), shown, replace(shown, gains=np.full(3, 0.75))])]
+    np.testing.assert_allclose(gains, [[1.0] * 3, [1.0] * 3, [1.0] * 3, [0.5] * 3], rtol=1e-9, atol=0)
 
 
 def test_a_face_that_is_hidden_gets_nothing() -> None:
