@@ -1,0 +1,3 @@
+import time
+
+BEGAN = time.time()  # before any other module of this package was read: `efficientnerf.backends.numba.runtime`

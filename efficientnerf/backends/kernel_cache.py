@@ -1,7 +1,10 @@
-"""Where compiled CPU kernels are kept: a private folder for each set of kernel sources and compiler versions.
+"""Where compiled CPU kernels are kept: a private folder for what compiles them (versions, kind of machine), and in it one for each state of a module's sources.
 
-numba compares the file of a cached function with the one it was compiled from, but not the files of the functions it calls, whose code it
-holds as well, nor those of constants. Here a change to any of these leads to another folder. Within a folder numba tells processors apart by name and features.
+    FOLDER/key()/MODULE/KEY    KEY stands for the module's source and for those of all modules of this package that it imports, directly or by others
+
+numba compares the file of a cached function with the one it was compiled from, but not the files of the functions it calls, whose code it holds as well, nor
+those of constants. Here a change to any of these leads to another KEY; what does not depend on it stays, and states of other versions or checkouts lie side by
+side. Within a folder numba tells processors apart by name and features.
 
 The first of these that can be written by the user alone is taken:
 
@@ -17,6 +20,7 @@ numba unpickles what it finds, so a folder that others could write to is never u
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import hashlib
 import os
@@ -29,7 +33,6 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -37,33 +40,22 @@ from pathlib import Path
 import platformdirs
 
 from efficientnerf.backends import Notice
+from efficientnerf.backends.sources import Sources
 
 ROOT = Path(__file__).resolve().parents[2]  # where the packages lie
-KERNELS = "efficientnerf/backends/numba"  # the folder that holds kernels
-CONSTANTS = (  # modules whose constants these import: numbers among them are part of the compiled code
-    "efficientnerf/backends/layout.py", "efficientnerf/geometry/cameras.py", "efficientnerf/geometry/ndc.py", "efficientnerf/geometry/spaces.py",
-    "efficientnerf/rendering/compositing.py", "efficientnerf/rendering/harmonics.py", "efficientnerf/sampling/samples.py",
-)  # fmt: skip
+KERNELS = "efficientnerf.backends.numba"  # the package that holds kernels
 KEPT, UNUSED_DAYS = 8, 30  # folders of other keys: so many, unless used within a day; none that was not used for so many days
 DAY = 86400.0
 USUAL = 150  # functions that a run on the CPU compiles: 173 to 178 of three runs
 
+SOURCES = Sources(ROOT)
+
 
 @functools.cache
 def key() -> str:
-    """`key_of` these packages."""
-    return key_of(ROOT)
-
-
-def key_of(root: Path) -> str:
-    """16 hexadecimal digits that stand for the kernels' sources below a folder and for what compiles them."""
-    digest = hashlib.sha256()
+    """16 hexadecimal digits that stand for what compiles kernels."""
     versions = (version("numba"), version("llvmlite"), version("numpy"), sys.implementation.cache_tag or sys.version, platform.machine())
-    digest.update("\n".join(versions).encode())
-    for path in (*sorted((root / KERNELS).rglob("*.py")), *(root / name for name in CONSTANTS)):
-        content = path.read_bytes()
-        digest.update(f"\n{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
-    return digest.hexdigest()[:16]
+    return hashlib.sha256("\n".join(versions).encode()).hexdigest()[:16]
 
 
 @functools.cache
@@ -73,16 +65,36 @@ def folder() -> Path:
     if place is None:
         place = Path(tempfile.mkdtemp(prefix="efficientnerf-kernels-"))
         atexit.register(shutil.rmtree, place, ignore_errors=True)
+    for gone in place.iterdir():  # modules of other versions, which nothing else looks at
+        if gone.is_dir() and not SOURCES.has(gone.name):
+            _prune(gone, "")
     if refusals:
         warnings.warn(f"compiled kernels are kept in {place}; refused: {', '.join(refusals)}. ENERF_CACHE_DIR chooses a folder.", Notice, stacklevel=2)
     return place
 
 
+@functools.cache
+def folder_of(name: str, key: str) -> Path:
+    """The folder of a key under a name, a module's or another, in `folder()`; made if need be. Removes those of other keys that are long out of use."""
+    place = folder() / name / key
+    with contextlib.suppress(OSError):  # whoever writes there sees to it
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        os.utime(place)
+        _prune(place.parent, key)
+    return place
+
+
+def key_of_kernels() -> str:
+    """16 hexadecimal digits that stand for the sources of all kernels."""
+    return SOURCES.key(SOURCES.modules_below(KERNELS))
+
+
 def are_compiled() -> bool:
-    """Whether kernels of this key are kept, about as many as a run uses. Writes nothing."""
+    """Whether kernels of these sources are kept, about as many as a run uses. Writes nothing."""
     for root in _roots():
         if (root / key()).is_dir():
-            return sum(1 for _ in (root / key()).rglob("*.nbi")) >= USUAL
+            places = (root / key() / module / SOURCES.key([module]) for module in SOURCES.modules_below(KERNELS))
+            return sum(1 for place in places for _ in place.glob("*.nbi")) >= USUAL
     return False
 
 
@@ -163,7 +175,7 @@ class Compilation:
 _watched: list[Compilation] = []
 
 
-@contextmanager
+@contextlib.contextmanager
 def compilation(started: Callable[[], None]) -> Iterator[Compilation]:
     """Count kernels that are compiled, rather than loaded, within; `started` is called before the first of them."""
     found = Compilation(started)

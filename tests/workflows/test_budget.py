@@ -124,10 +124,14 @@ def test_what_a_run_takes_whatever_its_limit_is_said_as_it_begins(
     source = tmp_path / "source"
     source.mkdir()
     (source / "a.jpg").write_bytes(b"x")
-    cache = tmp_path / "cache" / "kernels" / kernel_cache.key()
+    adam = f"{kernel_cache.KERNELS}.adam"
+    cache = tmp_path / "cache" / "kernels" / kernel_cache.key() / adam / kernel_cache.SOURCES.key([adam])
     cache.mkdir(parents=True)
     for number in range(kernel_cache.USUAL if compiled else 3):
         (cache / f"{number}.nbi").touch()
+    (cache.parent / "0123456789abcdef").mkdir()
+    for number in range(kernel_cache.USUAL):  # of other sources
+        (cache.parent / "0123456789abcdef" / f"{number}.nbi").touch()
     monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr("pipeline.executors.memory.usable_memory", lambda *_: None)
     assert len(plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny", memory=memory)).warnings) == expected

@@ -41,7 +41,7 @@ def test_the_choices_of_the_run_are_compiled_at_the_sizes_of_a_small_one() -> No
 
 
 def test_kernels_of_other_choices_are_other_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start.kernel_cache, "folder", lambda: tmp_path)
+    monkeypatch.setattr(start.kernel_cache, "folder_of", lambda *_: tmp_path)
 
     def stamp(*sets: str) -> Path:
         return start.stamp_of(start.small_settings(settings(*sets)))
@@ -81,7 +81,7 @@ def test_nothing_is_started_where_it_is_not_worth_it(tmp_path: Path, monkeypatch
 
 
 def test_nothing_is_started_where_it_is_switched_off_or_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start.kernel_cache, "folder", lambda: tmp_path)
+    monkeypatch.setattr(start.kernel_cache, "folder_of", lambda *_: tmp_path)
     monkeypatch.setattr(start.subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
     monkeypatch.setenv(start.SWITCH, "off")
     assert start.start(settings()) is None
@@ -97,7 +97,7 @@ def test_the_process_ends_with_the_run_and_leaves_nothing(tmp_path: Path, monkey
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.delenv(start.SWITCH)
     (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr(start.kernel_cache, "folder", lambda: tmp_path)  # without a stamp
+    monkeypatch.setattr(start.kernel_cache, "folder_of", lambda *_: tmp_path)  # without a stamp
     process = start.start(settings())
     assert process is not None
     assert process.stdin is not None

@@ -13,7 +13,6 @@ from typing import Any
 
 import filelock
 
-from efficientnerf.backends import kernel_cache
 from pipeline.errors import PipelineError
 from pipeline.run import Run
 from pipeline.runner import run_stages
@@ -49,7 +48,8 @@ def main() -> None:
         if not request["detached"]:
             threading.Thread(target=_end_with_parent, args=(Path(name),), daemon=True).start()
         # Another such process is enough for all runs that begin now; and what is missing in the end a run itself compiles.
-        with contextlib.suppress(filelock.Timeout, PipelineError), filelock.FileLock(kernel_cache.folder() / "precompilation.lock", timeout=0):
+        lock = filelock.FileLock(stamp_of(request["settings"]).with_name("lock"), timeout=0)
+        with contextlib.suppress(filelock.Timeout, PipelineError), lock:
             precompile(request["settings"], Path(name))
 
 

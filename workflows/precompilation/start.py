@@ -106,8 +106,9 @@ def start(settings: Table, *, detached: bool = False) -> subprocess.Popen[bytes]
 
 
 def stamp_of(small: Table) -> Path:
-    """The file that says that the kernels of a run with these settings are compiled."""
-    return kernel_cache.folder() / f"compiled-{hashlib.sha256(json.dumps(small, sort_keys=True).encode()).hexdigest()[:16]}"
+    """The file that says that the kernels of a run with these settings are compiled, of sources as they are."""
+    place = kernel_cache.folder_of("precompilation", kernel_cache.key_of_kernels())
+    return place / hashlib.sha256(json.dumps(small, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _is_worth_it(device: str, memory: Limit | None) -> bool:

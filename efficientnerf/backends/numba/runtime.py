@@ -7,7 +7,8 @@ or a lock of its own. NUMBA_THREADING_LAYER and NUMBA_THREADING_LAYER_PRIORITY, 
 
 Cache: `kernel_cache.folder()`, for functions of this package alone. It only saves time: files in it that are damaged are removed and compiled again, and a
 disk that takes or gives no file is not an error. Both are said in a RuntimeWarning. Of several processes that need a form of a function at the same moment
-one compiles it, and the others wait for it and load it.
+one compiles it, and the others wait for it and load it. Where sources of a form were changed since this process began, as by an upgrade, what it has read of
+them is not known, and the form is neither loaded nor kept.
 """
 
 from __future__ import annotations
@@ -23,44 +24,49 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numba
-from numba.core import caching, event
+from numba.core import caching, dispatcher, event
 
 try:
     import fcntl
 except ImportError:  # Windows: two processes may compile the same
     fcntl = None  # type: ignore[assignment]
 
+from efficientnerf import BEGAN
 from efficientnerf.backends import LAYERS, Notice, kernel_cache
+from efficientnerf.backends.numba.bound import bound
 
 if os.environ.get("NUMBA_THREADING_LAYER_PRIORITY", LAYERS) == LAYERS:
     numba.config.THREADING_LAYER_PRIORITY = LAYERS.split()  # numba may have been imported before the environment said so
 
 
 class KernelLocator(caching._CacheLocator):
-    """Tells numba where the compiled form of a function of this package is kept. The folder stands for the sources, wherever these lie."""
+    """Tells numba where compiled forms of a function of this package are kept. The folder stands for the sources, wherever these lie."""
 
-    def __init__(self, function: Callable[..., Any], path: Path) -> None:
+    def __init__(self, function: Callable[..., Any], module: str) -> None:
+        self.module = module
         self._line = function.__code__.co_firstlineno
-        self._folder = kernel_cache.folder() / path.parent
+        self._key = kernel_cache.SOURCES.key([module])
+        self._folder = kernel_cache.folder_of(module, self._key)
 
     def get_cache_path(self) -> str:
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        return kernel_cache.key()
+        return self._key
 
     def get_disambiguator(self) -> str:
         return str(self._line)
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], path: str) -> KernelLocator | None:
-        source = Path(path).resolve()
-        if not source.is_relative_to(kernel_cache.ROOT / kernel_cache.KERNELS):
+        module = kernel_cache.SOURCES.module_of(Path(path).resolve())
+        if module is None or not module.startswith(f"{kernel_cache.KERNELS}."):
             return None
-        found = cls(function, source.relative_to(kernel_cache.ROOT))
+        found = cls(function, module)
         found.ensure_cache_path()
         return found
 
@@ -106,7 +112,7 @@ class ByteLocks:
 
 
 class KernelFiles(caching.IndexDataCacheFile):
-    """The files of a function's compiled forms, those of this package with their SHA-256 at the end.
+    """The files of the compiled forms of a function of this package, with their SHA-256 at the end.
 
     A file that a power cut left empty, cut short or full of zeros would else end the program: numba unpickles what it finds, and runs the machine code.
 
@@ -117,14 +123,7 @@ class KernelFiles(caching.IndexDataCacheFile):
     numba loads a form before it compiles it, and saves it after that: the lock of the form is taken and given back here.
     """
 
-    def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
-        super().__init__(cache_path, filename_base, source_stamp)
-        self._own = source_stamp == kernel_cache.key()
-
     def save(self, key: Any, data: Any) -> None:
-        if not self._own:
-            super().save(key, data)
-            return
         name = self._index_name.removesuffix("nbi") + hashlib.sha256(self._dump(key)).hexdigest()[:32] + ".nbc"
         try:
             self._save_data(name, data)
@@ -134,11 +133,13 @@ class KernelFiles(caching.IndexDataCacheFile):
             _warn_once(f"{self._cache_path}: {error.strerror or error}; compiled kernels are not kept.")
         finally:
             _locks.give_back(self._index_path)
-            _compilations.end_form(self._form(key))
+            self.leave(key)
+
+    def leave(self, key: Any) -> None:
+        """The form is not saved, or was."""
+        _compilations.end_form(self._form(key))
 
     def load(self, key: Any) -> Any:
-        if not self._own:
-            return super().load(key)
         found = self._loaded(key)
         if found is None:
             form = self._form(key)
@@ -173,13 +174,10 @@ class KernelFiles(caching.IndexDataCacheFile):
         yield content
         with super()._open_for_write(filepath) as file:
             file.write(content.getvalue())
-            if self._own:
-                file.write(hashlib.sha256(content.getvalue()).digest())  # numba stops reading before it
+            file.write(hashlib.sha256(content.getvalue()).digest())  # numba stops reading before it
 
     def _is_whole(self, path: str) -> bool:
         """Whether a file is there and what was written; removes it else."""
-        if not self._own:
-            return True
         try:
             content = Path(path).read_bytes()
         except FileNotFoundError:
@@ -189,6 +187,44 @@ class KernelFiles(caching.IndexDataCacheFile):
         Path(path).unlink(missing_ok=True)
         warnings.warn(f"{path}: damaged, as by a power cut; removed, and compiled again.", Notice, stacklevel=2)
         return False
+
+
+class KernelCache(caching.FunctionCache):
+    """numba's cache of one function, of this package or not.
+
+    numba knows a form by the types of its arguments, the processor, the function's own bytecode, and values in closure cells. Here what else it is made of, and
+    the sources of its module leave open, joins these: what it was bound to by other modules, and the sources of that and of its arguments' types.
+    """
+
+    def __init__(self, function: FunctionType) -> None:
+        super().__init__(function)
+        found = self._impl.locator
+        self._module = found.module if isinstance(found, KernelLocator) else None
+        if self._module is not None:
+            self._cache_file = KernelFiles(self._cache_path, self._impl.filename_base, found.get_source_stamp())
+
+    def _index_key(self, signature: Any, codegen: Any) -> Any:
+        key = super()._index_key(signature, codegen)
+        if self._module is None:
+            return key
+        text, modules = bound(self._py_func, signature)
+        return (*key, text, kernel_cache.SOURCES.key({self._module, *modules}))
+
+    def _load_overload(self, signature: Any, target_context: Any) -> Any:
+        return super()._load_overload(signature, target_context) if self._is_certain(signature) else None
+
+    def _save_overload(self, signature: Any, data: Any) -> None:
+        if self._is_certain(signature):
+            super()._save_overload(signature, data)
+        else:
+            self._cache_file.leave(self._index_key(signature, data.codegen))
+
+    def _is_certain(self, signature: Any) -> bool:
+        """Whether what this process compiles is made of the sources as they are."""
+        if self._module is None:
+            return True
+        text, modules = bound(self._py_func, signature)
+        return text is not None and not kernel_cache.SOURCES.changed_since({self._module, *modules}, BEGAN)
 
 
 class _Compilations(event.Listener):
@@ -232,7 +268,7 @@ class _Compilations(event.Listener):
 _locks = ByteLocks()
 _compilations = _Compilations()
 caching.CacheImpl._locator_classes.insert(0, KernelLocator)
-caching.IndexDataCacheFile = KernelFiles
+dispatcher.FunctionCache = KernelCache  # type: ignore[attr-defined]
 event.register("numba:compile", _compilations)
 
 __all__ = ["numba"]

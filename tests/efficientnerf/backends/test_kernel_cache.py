@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,19 @@ from efficientnerf.backends import kernel_cache
 
 PACKAGE = kernel_cache.ROOT / "efficientnerf"
 KEY = "0123456789abcdef"
-INNER = """
+SOURCES = {
+    "geometry/__init__.py": "",
+    "geometry/limits.py": "STEP = 1",
+    "geometry/spaces.py": "from .limits import *",
+    "backends/numba/inner.py": """
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.geometry.spaces import STEP
 
 @numba.njit(cache=True)
 def inner(x):
-    return x + {}
-"""
-OUTER = """
+    return x + STEP
+""",
+    "backends/numba/outer.py": """
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.inner import inner
 
@@ -34,15 +40,24 @@ def outer(x):
     for i in numba.prange(x):
         total += inner(i)
     return total
-"""
+""",
+    "backends/numba/other.py": """
+from efficientnerf.backends.numba.runtime import numba
+
+@numba.njit(cache=True)
+def other(x):
+    return 10 * x
+""",
+}
 PROGRAM = """
 import json, numba, sys
 from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba.other import other
 from efficientnerf.backends.numba.outer import outer
 
 started = []
 with kernel_cache.compilation(lambda: started.append(1)) as found:
-    result = outer(3)
+    result = outer(3) + other(1)
 maps = open("/proc/self/maps").read() if sys.platform == "linux" else ""
 facts = {"result": result, "functions": found.functions, "seconds": found.seconds, "started": len(started), "layer": numba.threading_layer()}
 print(json.dumps({**facts, "folder": str(kernel_cache.folder()), "tbb": "libtbb.so" in maps}))
@@ -51,17 +66,20 @@ print(json.dumps({**facts, "folder": str(kernel_cache.folder()), "tbb": "libtbb.
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A package with two kernels, one of which calls the other from another file."""
+    """A package with three kernels; one calls another from another file, with a number from a third."""
     copy = tmp_path / "one" / "efficientnerf"
-    (copy / "backends" / "numba").mkdir(parents=True)
-    for name in ("__init__.py", "backends/__init__.py", "backends/kernel_cache.py", "backends/numba/__init__.py", "backends/numba/runtime.py"):
+    names = ("kernel_cache", "sources", "__init__", "numba/__init__", "numba/bound", "numba/runtime")
+    for name in ("__init__.py", *(f"backends/{name}.py" for name in names)):
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(PACKAGE / name, copy / name)
-    for name in kernel_cache.CONSTANTS:
-        (copy.parent / name).parent.mkdir(exist_ok=True)
-        (copy.parent / name).write_text("")
-    (copy / "backends" / "numba" / "inner.py").write_text(INNER.format(1))
-    (copy / "backends" / "numba" / "outer.py").write_text(OUTER)
+    write(copy, SOURCES)
     return copy
+
+
+def write(package: Path, sources: dict[str, str]) -> None:
+    for name, text in sources.items():
+        (package / name).parent.mkdir(exist_ok=True)
+        (package / name).write_text(text)
 
 
 def run(package: Path, program: str = PROGRAM, **environment: str) -> dict[str, Any]:
@@ -75,18 +93,114 @@ def run(package: Path, program: str = PROGRAM, **environment: str) -> dict[str, 
 def test_a_kernel_is_compiled_once_for_the_same_sources_wherever_they_lie(package: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     first = run(package, ENERF_CACHE_DIR=str(cache))
-    assert (first["result"], first["functions"], first["started"]) == (6, 1, 1)  # the one called counts with the one that calls it
+    assert (first["result"], first["functions"], first["started"]) == (16, 2, 1)  # the one called counts with the one that calls it
     assert first["seconds"] > 0
     assert Path(first["folder"]).parent == cache / "kernels"
     assert {path.stat().st_mode & 0o777 for path in (cache, cache / "kernels", Path(first["folder"]))} == {0o700}
     elsewhere = tmp_path / "two" / "efficientnerf"
     shutil.copytree(package, elsewhere)
     again = run(elsewhere, ENERF_CACHE_DIR=str(cache))
-    assert (again["result"], again["functions"], again["started"], again["folder"]) == (6, 0, 0, first["folder"])
-    (elsewhere / "backends" / "numba" / "inner.py").write_text(INNER.format(2))
-    changed = run(elsewhere, ENERF_CACHE_DIR=str(cache))
-    assert (changed["result"], changed["functions"]) == (9, 1)
-    assert changed["folder"] != first["folder"]
+    assert (again["result"], again["functions"], again["started"], again["folder"]) == (16, 0, 0, first["folder"])
+
+
+def test_what_depends_on_a_source_that_changed_is_compiled_and_nothing_else(package: Path, tmp_path: Path) -> None:
+    """And the forms of two states of the sources lie side by side."""
+    edited = tmp_path / "two" / "efficientnerf"
+    shutil.copytree(package, edited)
+
+    def found(sources: Path) -> tuple[int, int]:
+        done = run(sources, ENERF_CACHE_DIR=str(tmp_path / "cache"))
+        return done["result"], done["functions"]
+
+    assert found(package) == (16, 2)
+    write(edited, {"geometry/limits.py": "STEP = 2"})
+    assert found(edited) == (19, 1)
+    write(edited, {"backends/numba/other.py": SOURCES["backends/numba/other.py"].replace("10", "20"), "model.py": ""})
+    assert found(edited) == (29, 1)
+    assert found(package) == (16, 0)
+    assert found(edited) == (29, 0)
+
+
+BOUND = {
+    "backends/numba/factory.py": """
+import types
+from efficientnerf.backends.numba.runtime import numba
+
+def _apply(x):
+    return _visit(x) * FACTOR
+
+def bind(visit, factor):
+    copy = types.FunctionType(_apply.__code__, {**globals(), "_visit": visit, "FACTOR": factor}, "apply")
+    copy.__module__, copy.__qualname__ = __name__, "apply"
+    return numba.njit(cache=True)(copy)
+""",
+    "backends/numba/visitor.py": """
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.geometry.limits import STEP
+
+@numba.njit(cache=True)
+def visit(x):
+    return x + STEP
+""",
+    "backends/numba/caller.py": """
+from efficientnerf.backends.numba.factory import bind
+from efficientnerf.backends.numba.visitor import visit
+
+kernel = bind(visit, 10)
+""",
+    "backends/numba/taker.py": """
+from efficientnerf.backends.numba.runtime import numba
+
+@numba.njit(cache=True)
+def first(pair):
+    return pair.a
+""",
+    "geometry/pair.py": """
+from typing import NamedTuple
+
+class Pair(NamedTuple):
+    a: int
+    b: int
+""",
+}
+CALLS = """
+import json
+from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba.caller import kernel
+from efficientnerf.backends.numba.taker import first
+from efficientnerf.geometry.pair import Pair
+
+with kernel_cache.compilation(lambda: None) as found:
+    results = [kernel(1), first(Pair(a=1, b=2))]
+print(json.dumps({"results": results, "functions": found.functions}))
+"""
+
+
+def test_what_a_form_is_made_of_besides_its_module_joins_its_key(package: Path, tmp_path: Path) -> None:
+    """Functions and numbers that another module binds it to, and types of arguments, which it does not import."""
+    write(package, BOUND)
+
+    def found() -> tuple[list[int], int]:
+        done = run(package, CALLS, ENERF_CACHE_DIR=str(tmp_path / "cache"))
+        return done["results"], done["functions"]
+
+    assert found() == ([20, 1], 2)
+    write(package, {"geometry/limits.py": "STEP = 2", "geometry/pair.py": BOUND["geometry/pair.py"].replace("a: int\n    b: int", "b: int\n    a: int")})
+    assert found() == ([30, 1], 2)
+    write(package, {"backends/numba/caller.py": BOUND["backends/numba/caller.py"].replace("10", "100")})
+    assert found() == ([300, 1], 1)
+    write(package, {**BOUND, "geometry/limits.py": "STEP = 1"})
+    assert found() == ([20, 1], 0)
+
+
+def test_a_process_whose_sources_change_under_it_neither_keeps_nor_loads_forms(package: Path, tmp_path: Path) -> None:
+    """As by an upgrade: it has imported some of the old ones, and reads the new ones."""
+    change = "import pathlib, efficientnerf.geometry.spaces; pathlib.Path('efficientnerf/geometry/limits.py').write_text('STEP = 2')" + PROGRAM
+    for program, expected in ((change, (16, 2)), (PROGRAM, (19, 1)), (change, (16, 1))):
+        if program is change:
+            write(package, SOURCES)
+        done = run(package, program, ENERF_CACHE_DIR=str(tmp_path / "cache"))
+        assert (done["result"], done["functions"]) == expected
 
 
 def damaged(content: bytes) -> dict[str, bytes]:
@@ -102,7 +216,7 @@ def test_an_empty_kernel_index_is_removed_and_compiled_again(package: Path, tmp_
     for path in folder.rglob("*.nbi"):
         path.write_bytes(b"")
     again = run(package, ENERF_CACHE_DIR=str(cache))
-    assert (again["result"], again["functions"]) == (6, 1)
+    assert (again["result"], again["functions"]) == (16, 2)
     assert "removed, and compiled again" in again["stderr"]
 
 
@@ -110,7 +224,7 @@ def test_an_empty_kernel_index_is_removed_and_compiled_again(package: Path, tmp_
 def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -> None:
     from efficientnerf.backends.numba.runtime import KernelFiles
 
-    files = KernelFiles(str(tmp_path), "kernel", kernel_cache.key())
+    files = KernelFiles(str(tmp_path), "kernel", "sources")
     files.save("signature", ["code"])
     assert files.load("signature") == ["code"]
     path = next(tmp_path.glob(f"*{suffix}"))
@@ -133,7 +247,7 @@ def test_forms_that_are_compiled_at_the_same_moment_are_never_mixed_up(tmp_path:
         for after in (False, True):
             folder = tmp_path / f"{number} {after}"
             folder.mkdir()
-            files = {form: KernelFiles(str(folder), "kernel", kernel_cache.key()) for form in ("float32", "float64")}
+            files = {form: KernelFiles(str(folder), "kernel", "sources") for form in ("float32", "float64")}
             known = getattr(files["float32"], step)
 
             def interrupted(*values: Any, known: Any = known, files: Any = files, after: bool = after) -> Any:
@@ -155,11 +269,11 @@ def test_forms_that_are_compiled_at_the_same_moment_are_never_mixed_up(tmp_path:
 def test_a_process_that_is_killed_while_it_saves_leaves_no_other_forms_code(tmp_path: Path) -> None:
     from efficientnerf.backends.numba.runtime import KernelFiles
 
-    files = KernelFiles(str(tmp_path), "kernel", kernel_cache.key())
+    files = KernelFiles(str(tmp_path), "kernel", "sources")
     files.save("float32", ["code of float32"])
     next(tmp_path.glob("*.nbi")).unlink()
     for step in ("_save_data", "_save_index"):
-        killed = KernelFiles(str(tmp_path), "kernel", kernel_cache.key())
+        killed = KernelFiles(str(tmp_path), "kernel", "sources")
 
         def kill(*_: Any) -> None:
             raise KeyboardInterrupt
@@ -175,7 +289,7 @@ import json, sys, time
 from efficientnerf.backends import kernel_cache
 from efficientnerf.backends.numba.runtime import KernelFiles
 
-files = KernelFiles(sys.argv[1], "kernel", kernel_cache.key())
+files = KernelFiles(sys.argv[1], "kernel", "sources")
 found = files.load("float32")
 print(json.dumps(found), flush=True)
 if found is None:
@@ -245,39 +359,12 @@ started = []
 """,
     )
     found = run(package, full, ENERF_CACHE_DIR=str(tmp_path / "cache"))
-    assert found["result"] == 6
+    assert found["result"] == 16
     assert "No space left on device; compiled kernels are not kept" in found["stderr"]
 
 
-def test_the_key_stands_for_each_kernel_source_and_its_place(package: Path) -> None:
-    inner = package / "backends" / "numba" / "inner.py"
-    keys = [kernel_cache.key_of(package.parent)]
-    inner.write_text(INNER.format(2))
-    keys.append(kernel_cache.key_of(package.parent))
-    inner.rename(inner.with_name("outermost.py"))
-    keys.append(kernel_cache.key_of(package.parent))
-    (package.parent / kernel_cache.KERNELS / "new.py").touch()
-    keys.append(kernel_cache.key_of(package.parent))
-    (package.parent / kernel_cache.CONSTANTS[0]).write_text("FARTHEST = 1")
-    keys.append(kernel_cache.key_of(package.parent))
-    assert len(set(keys)) == 5
-    (package / "model.py").write_text("no kernel")
-    assert kernel_cache.key_of(package.parent) == keys[-1]
-
-
-def test_the_key_stands_for_all_constants_that_kernels_import() -> None:
-    """They are part of the compiled code; classes and functions of other folders are called by Python alone."""
-    known = {name.removesuffix(".py").replace("/", ".") for name in kernel_cache.CONSTANTS}
-    found = set()
-    for path in (kernel_cache.ROOT / kernel_cache.KERNELS).rglob("*.py"):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ImportFrom) and path.name != "runtime.py":
-                assert node.level == 0, path
-                constants = node.module if any(alias.name.isupper() for alias in node.names) else None
-                found |= {constants or f"{node.module}.{alias.name}" for alias in node.names if constants or f"{node.module}.{alias.name}" in known}
-    ours = {name for name in found if name.startswith("efficientnerf") and not name.startswith(kernel_cache.KERNELS.replace("/", "."))}
-    assert len(ours) > 2
-    assert ours <= known
+def kernels() -> list[Path]:
+    return sorted((kernel_cache.ROOT / kernel_cache.KERNELS.replace(".", "/")).rglob("*.py"))
 
 
 def imports_numba(node: ast.AST) -> bool:
@@ -333,11 +420,48 @@ def test_folders_out_of_use_are_removed_and_nothing_else(tmp_path: Path) -> None
     assert now - own.stat().st_mtime < 60
 
 
+def test_states_of_a_modules_sources_out_of_use_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The present one stays, however old, and so do those of other modules; of modules that are gone none is present."""
+    adam, gone = f"{kernel_cache.KERNELS}.adam", f"{kernel_cache.KERNELS}.gone"
+    now, root = time.time(), tmp_path / "cache" / "kernels" / kernel_cache.key()
+
+    def made(module: str, name: str, days: float) -> Path:
+        (root / module / name).mkdir(parents=True)
+        (root / module / name / "code.nbc").touch()
+        os.utime(root / module / name, (now - days * kernel_cache.DAY,) * 2)
+        return root / module / name
+
+    own, old, other = made(adam, KEY, 100), made(adam, "a" * 16, 31), made(f"{kernel_cache.KERNELS}.mlp", "b" * 16, 31)
+    week = [made(adam, f"c{number:015x}", 7 + number / 100) for number in range(kernel_cache.KEPT + 2)]
+    left, removed = made(gone, "d" * 16, 7), made(gone, "e" * 16, 31)
+    monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
+    for each in (tmp_path / "cache", root.parent, root):
+        each.chmod(0o700)
+    for function in (kernel_cache.folder, kernel_cache.folder_of):
+        monkeypatch.setattr(kernel_cache, function.__name__, function.__wrapped__)
+    assert kernel_cache.folder_of(adam, KEY) == own
+    assert all(place.exists() for place in (own, other, left, *week[: kernel_cache.KEPT]))
+    assert not any(place.exists() for place in (old, removed, *week[kernel_cache.KEPT :]))
+    assert now - own.stat().st_mtime < 60
+
+
 def test_no_kernel_lets_the_compiler_reorder_sums() -> None:
     """Copies of a function that are optimised in different surroundings would differ in the last bit, and so would runs that compile and runs that load."""
     found = []
-    for path in sorted((kernel_cache.ROOT / kernel_cache.KERNELS).rglob("*.py")):
+    for path in kernels():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.keyword) and node.arg in ("fastmath", "flags"):
                 found.append(f"{path.relative_to(kernel_cache.ROOT)}:{node.value.lineno}")
     assert not found
+
+
+def test_kernels_take_nothing_from_modules_that_they_do_not_import() -> None:
+    """No import by a computed name, no name that is bound anew later; implementations of a function, and models of a type, lie in its module."""
+    for path in kernels():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        own = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        for node in ast.walk(tree):
+            assert not isinstance(node, ast.Global), path
+            assert not (isinstance(node, ast.Name | ast.Attribute) and getattr(node, "id", getattr(node, "attr", "")) in ("importlib", "__import__")), path
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("overload", "register_model"):
+                assert ast.unparse(node.args[0]) in {*own, "operation", "operator.invert"}, path  # operators of vectors
