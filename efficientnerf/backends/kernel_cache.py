@@ -54,7 +54,8 @@ SOURCES = Sources(ROOT)
 @functools.cache
 def key() -> str:
     """16 hexadecimal digits that stand for what compiles kernels."""
-    versions = (version("numba"), version("llvmlite"), version("numpy"), sys.implementation.cache_tag or sys.version, platform.machine())
+    python = f"{sys.implementation.cache_tag or sys.version} {sys.flags.optimize}"  # -O takes assertions out of kernels
+    versions = (version("numba"), version("llvmlite"), version("numpy"), python, platform.machine())
     return hashlib.sha256("\n".join(versions).encode()).hexdigest()[:16]
 
 
