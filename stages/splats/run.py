@@ -38,7 +38,7 @@ from stages.splats.memory import most_gaussians, needed
 from stages.splats.pictures import photographs, render_cameras, renders
 from stages.splats.settings import SplatsSettings
 
-PASSES, FEWEST_STEPS, MOST_STEPS = 4, 300, 1800  # docs/experiments/splats.md
+PASSES, FEWEST_STEPS, MOST_STEPS = 8, 600, 1800  # docs/experiments/splats.md
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
 
 

@@ -31,7 +31,7 @@ class SplatsSettings:
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
     iterations: Count | Auto = setting(
         "auto",
-        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: four passes over all pixels, 300 to 1800 steps.",
+        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: eight passes over all pixels, 600 to 1800 steps.",
         advanced=True,
     )
     pictures: Literal["photographs", "asset"] = setting(
@@ -43,4 +43,4 @@ class SplatsSettings:
     seed: Seed = setting(0, "Seed of the order of the images.", advanced=True)
 
 
-STAGE = Stage(name="splats", version=6, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))
+STAGE = Stage(name="splats", version=7, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))
