@@ -152,11 +152,11 @@ def test_an_asset_alone_is_fitted_to_its_own_renders(inputs: dict[str, Path]) ->
     ("pixels", "count", "steps"),
     [
         ([480 * 360] * 31, 480 * 360, 600),
-        ([640_000] * 100, 200_000, 1800),
-        ([800 * 533] * 292, 200_000, 1800),
-        ([1008 * 756] * 40, 200_000, 931),
+        ([640_000] * 100, 300_000, 1800),
+        ([800 * 533] * 292, 300_000, 1800),
+        ([1008 * 756] * 40, 300_000, 931),
         ([40_000] * 100, 40_000, 600),
-        ([], 200_000, 600),
+        ([], 300_000, 600),
     ],
 )
 def test_more_pixels_take_more_steps_and_bear_more_gaussians(pixels: list[int], count: int, steps: int) -> None:
