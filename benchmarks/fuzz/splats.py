@@ -1,15 +1,18 @@
-"""3D Gaussians that `inspect` describes: SPZ, and the PLY of 3DGS."""
+"""3D Gaussians that `inspect` describes: SPZ, SOG, and the PLY of 3DGS."""
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import tempfile
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
+from benchmarks.fuzz import json_text
 from benchmarks.fuzz.binary import changed_bytes
 from benchmarks.fuzz.meshes import ply_changed
 from benchmarks.fuzz.reader import Opened, Reader
@@ -54,6 +57,28 @@ def spz_changed(rng: Random, data: bytes) -> bytes:
     return packed.compress(inside) + packed.flush()
 
 
+def sog_changed(rng: Random, data: bytes) -> bytes:
+    """The zip as it is stored, or its meta.json, or an image, with right checksums."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            files = {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # of an input that was changed before
+        return changed_bytes(rng, data)
+    kind = rng.random()
+    if kind < 0.4 or "meta.json" not in files:
+        return changed_bytes(rng, data, begin=0 if kind < 0.1 else max(0, len(data) - 600))
+    if kind < 0.9:
+        files["meta.json"] = json_text.changed(rng, files["meta.json"])
+    else:
+        name = rng.choice([*files])
+        files[name] = changed_bytes(rng, files[name])
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name), content, archive.compression)
+    return out.getvalue()
+
+
 def open_splats(suffix: str) -> Callable[[Path], Opened]:
     def opened(folder: Path) -> Opened:
         from workflows.inspection.describe import describe
@@ -73,6 +98,7 @@ READERS = {
     reader.name: reader
     for reader in (
         Reader("spz", "SPZ of 3D Gaussians", seeds(".spz"), spz_changed, open_splats(".spz")),
+        Reader("sog", "SOG of 3D Gaussians", seeds(".sog"), sog_changed, open_splats(".sog")),
         Reader("splats_ply", "PLY of 3D Gaussians", seeds(".ply"), ply_changed, open_splats(".ply"), share=0.25),
     )
 }

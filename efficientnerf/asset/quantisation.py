@@ -111,10 +111,13 @@ def base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return codes, table[: int(codes.max(initial=0)) + 1]
 
 
-def clustered(vectors: np.ndarray, weight: np.ndarray, entries: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids (P, D) float32, halves in value, P <= entries, and the code (n,) of each vector (n, D) float32."""
+def clustered(vectors: np.ndarray, weight: np.ndarray, entries: int, seed: int, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids (P, D) float32, halves in value, P <= entries, and the code (n,) of each vector (n, D) float32.
+
+    samples  vectors that the centroids are found from, or 16 for each entry where those are more
+    """
     rng = np.random.Generator(np.random.Philox(key=seed))
-    sample = _sample(vectors, weight, max(SAMPLES, 16 * entries), rng)
+    sample = _sample(vectors, weight, max(samples, 16 * entries), rng)
     centroids = _seeded(sample, entries, rng)
     for _ in range(ITERATIONS):
         found, distance = _nearest(sample, centroids)

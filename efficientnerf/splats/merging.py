@@ -84,14 +84,14 @@ def shown_voxels(tree: NerfTree, cameras: Sequence[Camera]) -> Shown:
     """The voxels that the cameras see."""
     weight = greatest_weights(tree, cameras)
     voxels = np.flatnonzero(weight > LEAST_WEIGHT)
-    keys = _spread_bits(voxel_coordinates(tree)[voxels].astype(np.int64)) | voxel_cascades(tree)[voxels].astype(np.int64) << 57
+    keys = morton_codes(voxel_coordinates(tree)[voxels].astype(np.int64)) | voxel_cascades(tree)[voxels].astype(np.int64) << 57
     voxels = voxels[np.argsort(keys, kind="stable")]
     centres, sides = voxel_centres(tree)[voxels], voxel_sides(tree)[voxels].astype(np.float64)
     width = _pixel_widths(tree, cameras, centres, sides)
     return Shown(voxels, np.sort(keys), centres, sides, np.maximum(weight[voxels] * width**2, 1e-9), width)
 
 
-def _spread_bits(at: np.ndarray) -> np.ndarray:
+def morton_codes(at: np.ndarray) -> np.ndarray:
     """(N,) Morton codes of coordinates (N, 3) below 2^19."""
     code = np.zeros(len(at), np.int64)
     for bit in range(19):

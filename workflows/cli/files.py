@@ -75,7 +75,7 @@ def export(
     **given: Any,
 ) -> None:
     """Export RUN or ASSET: a mesh as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl; with --points a point cloud as .ply, .xyz, .las or .laz; with
-    --splats 3D Gaussians as .ply, .spz or .glb; the voxels as a volume (.vdb); a viewer page (.html); or the cameras of RUN as .json (nerfstudio).
+    --splats 3D Gaussians as .ply, .spz, .sog or .glb; the voxels as a volume (.vdb); a viewer page (.html); or the cameras of RUN as .json (nerfstudio).
 
     Each file is written completely or not at all. An existing file is replaced only with --force, a file of a run never. Results of the run's stages mesh
     and splats are reused if their settings are the same. Settings of the stages mesh, points and splats apply: '--set mesh.max_faces=...'.
@@ -208,7 +208,7 @@ def _restricted_with_cameras(
 @common_options
 def inspect(what: Path, as_json: bool) -> None:
     """Describe an asset, a run, a data set or a folder of photographs: number of images, resolution, camera model, bounds, warnings; or a mesh, points or
-    3D Gaussians (.ply, .spz, .glb), also from other programs."""
+    3D Gaussians (.ply, .spz, .sog, .glb), also from other programs."""
     found = describe(what)
     if as_json:
         write_json(found, indent=1)

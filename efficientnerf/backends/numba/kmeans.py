@@ -12,6 +12,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 
 LANES = 64  # vectors that are compared together
+ALONE = 64 * LANES  # vectors that one thread has compared before others have begun
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -58,16 +59,23 @@ def sum_clusters(vectors, index, total, count):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-def]
     """Lower distance (n,) to the squared distance from `centroid` (D,) to each of vectors_t (D, n) where that is less."""
-    size, count = vectors_t.shape
-    for block in numba.prange((count + 16 * LANES - 1) // (16 * LANES)):
-        begin = block * 16 * LANES
-        lanes = min(16 * LANES, count - begin)
-        squared = np.zeros(lanes, np.float32)
-        for d in range(size):
-            x = centroid[d]
-            row = vectors_t[d, begin : begin + lanes]
-            for lane in range(lanes):
-                difference = row[lane] - x
-                squared[lane] += difference * difference
+    count = vectors_t.shape[1]
+    if count <= ALONE:
+        _lower(vectors_t, centroid, distance, 0, count)
+    else:
+        for block in numba.prange((count + 16 * LANES - 1) // (16 * LANES)):
+            begin = block * 16 * LANES
+            _lower(vectors_t, centroid, distance, begin, min(16 * LANES, count - begin))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _lower(vectors_t, centroid, distance, begin, lanes):  # type: ignore[no-untyped-def]
+    squared = np.zeros(lanes, np.float32)
+    for d in range(vectors_t.shape[0]):
+        x = centroid[d]
+        row = vectors_t[d, begin : begin + lanes]
         for lane in range(lanes):
-            distance[begin + lane] = min(distance[begin + lane], squared[lane])
+            difference = row[lane] - x
+            squared[lane] += difference * difference
+    for lane in range(lanes):
+        distance[begin + lane] = min(distance[begin + lane], squared[lane])

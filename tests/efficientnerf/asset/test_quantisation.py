@@ -40,7 +40,7 @@ def seen(tree: NerfTree) -> np.ndarray:
 # k-means
 
 
-@pytest.mark.parametrize(("count", "size", "entries"), [(1, 1, 1), (200, 3, 7), (130, 24, 64), (64, 9, 300)])
+@pytest.mark.parametrize(("count", "size", "entries"), [(1, 1, 1), (200, 3, 7), (130, 24, 64), (64, 9, 300), (5000, 3, 5)])
 def test_the_nearest_is_the_nearest(count: int, size: int, entries: int) -> None:
     rng = np.random.default_rng(count)
     vectors, centroids = rng.normal(size=(count, size)).astype(np.float32), rng.normal(size=(entries, size)).astype(np.float32)

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import gzip
+import io
+import json
+import math
 import struct
+import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from efficientnerf.splats.gaussians import Gaussians
 from tests.stages.io.meshes import accessor, glb_document
@@ -78,3 +84,42 @@ def read_glb_splats(path: Path) -> tuple[dict, Gaussians]:
     rotations = attributes[f"{prefix}ROTATION"][:, [3, 0, 1, 2]].copy()
     arrays = (attributes["POSITION"], attributes[f"{prefix}SCALE"], rotations, attributes[f"{prefix}OPACITY"][:, 0], harmonics)
     return document, Gaussians(*(np.ascontiguousarray(array) for array in arrays))
+
+
+def read_sog(path: Path) -> tuple[dict, Gaussians]:
+    """meta.json and the Gaussians, one after the other, in the order of the file."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"])
+    pictures = {name: Image.open(io.BytesIO(data)) for name, data in files.items() if name != "meta.json"}
+    assert all(picture.format == "WEBP" for picture in pictures.values())
+
+    def pixel(part: str, index: int, which: int = 0) -> tuple[int, ...]:
+        picture = pictures[meta[part]["files"][which]]
+        return picture.getpixel((index % picture.width, index // picture.width))
+
+    rows = [_sog_gaussian(meta, pixel, index, pictures) for index in range(meta["count"])]
+    return meta, Gaussians(*(np.array([row[k] for row in rows], np.float32) for k in range(5)))
+
+
+def _sog_gaussian(meta: dict, pixel: Callable[..., tuple[int, ...]], index: int, pictures: dict) -> list:
+    """Position, scales, rotation w x y z, opacity, harmonics."""
+    place = []
+    for low, high, below, above in zip(meta["means"]["mins"], meta["means"]["maxs"], pixel("means", index), pixel("means", index, 1)):
+        shrunk = low + (high - low) * (256 * above + below) / 65535
+        place.append(math.copysign(math.exp(abs(shrunk)) - 1, shrunk))
+    *rest, mode = pixel("quats", index)
+    smaller = [(code / 255 * 2 - 1) / 2**0.5 for code in rest]
+    turn = [*smaller[: mode - 252], max(0, 1 - sum(x * x for x in smaller)) ** 0.5, *smaller[mode - 252 :]]
+    *colour, opacity = pixel("sh0", index)
+    harmonics = [[meta["sh0"]["codebook"][code] for code in colour]]
+    if "shN" in meta:
+        low, high, _ = pixel("shN", index, 1)
+        entry, each = 256 * high + low, (meta["shN"]["bands"] + 1) ** 2 - 1
+        assert entry < meta["shN"]["count"]
+        palette = pictures[meta["shN"]["files"][0]]
+        assert palette.width == 64 * each
+        codes = [palette.getpixel((entry % 64 * each + k, entry // 64)) for k in range(each)]
+        harmonics += [[meta["shN"]["codebook"][code] for code in three] for three in codes]
+    scales = [math.exp(meta["scales"]["codebook"][code]) for code in pixel("scales", index)]
+    return [place, scales, turn, min(max(opacity / 255, 1e-3), 1 - 1e-3), harmonics]

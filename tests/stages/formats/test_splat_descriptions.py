@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import random
 import struct
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,9 @@ def same(facts: dict[str, Any] | None, gaussians: Gaussians, coded: bool) -> Non
     np.testing.assert_allclose(facts["bounds"], [gaussians.means.min(axis=0), gaussians.means.max(axis=0)], atol=2.0**-12 if coded else 1e-6)
     scales = [gaussians.scales.min(), gaussians.scales.max()]
     np.testing.assert_allclose(np.log(facts["scales"]), np.log(scales), atol=1 / 32 + 1e-6 if coded else 1e-5)
+    if facts["format"] == "SOG 2":
+        assert facts["opacities"] is None
+        return
     opacities = [gaussians.opacities.min(), gaussians.opacities.max()]
     np.testing.assert_allclose(facts["opacities"], opacities, atol=0.5 / 255 + 1e-6 if coded else 1e-6)
 
@@ -45,7 +50,7 @@ def test_what_was_written_is_described(extension: str, degree: int, frame: Any, 
     monkeypatch.setattr(description, "AT_ONCE", at_once)
     gaussians = scattered(COUNT, degree)
     facts = describe_splats(written(tmp_path / f"a{extension}", gaussians, frame))
-    same(facts, gaussians if extension == ".ply" else with_y_up(gaussians, frame), extension == ".spz")
+    same(facts, gaussians if extension == ".ply" else with_y_up(gaussians, frame), extension in (".spz", ".sog"))
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
@@ -126,9 +131,9 @@ def test_what_is_cut_short_is_named(extension: str, tmp_path: Path) -> None:
     """At every byte; a header that is cut leaves nothing that could be told from another file of that extension."""
     path = written(tmp_path / f"a{extension}", scattered(2, 1))
     whole = path.read_bytes()
-    begin = {".ply": whole.find(b"end_header\n") + 11, ".glb": whole.find(b"BIN\0") + 4, ".spz": 0}[extension]
+    begin = {".ply": whole.find(b"end_header\n") + 11, ".glb": whole.find(b"BIN\0") + 4, ".spz": 0, ".sog": 0}[extension]
     assert begin >= 0
-    for end in range(0, len(whole), 3 if extension != ".glb" else 37):
+    for end in range(0, len(whole), 37 if extension in (".glb", ".sog") else 3):
         path.write_bytes(whole[:end])
         if end >= begin:
             with pytest.raises(BadInput, match=rf"a\{extension}"):
@@ -177,6 +182,31 @@ def replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
     return damaged
 
 
+def sog_with(change: Callable[[dict[str, Any]], None], compression: int = zipfile.ZIP_STORED, **others: bytes) -> Callable[[bytes], bytes]:
+    """With another meta.json, or other images."""
+
+    def damaged(whole: bytes) -> bytes:
+        out = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(whole)) as archive, zipfile.ZipFile(out, "w", compression) as made:
+            for name in archive.namelist():
+                content = others.get(name.partition(".")[0], archive.read(name))
+                if name == "meta.json":
+                    meta = json.loads(content)
+                    change(meta)
+                    content = json.dumps(meta).encode()
+                made.writestr(name, content)
+        return out.getvalue()
+
+    return damaged
+
+
+def test_a_deflated_sog_of_others_is_described(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.sog", scattered(COUNT, 1))
+    before = describe_splats(path)
+    path.write_bytes(sog_with(lambda meta: meta.update(antialias=True), zipfile.ZIP_DEFLATED)(path.read_bytes()))
+    assert describe_splats(path) == {**before, "notes": ["antialiased", *before["notes"]]}
+
+
 PREFIX = "KHR_gaussian_splatting"
 HOSTILE: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "more Gaussians than bytes": (".ply", replaced(b"vertex 4", b"vertex 999999999999"), "expected"),
@@ -202,6 +232,21 @@ HOSTILE: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "too few streams": (".spz", lambda whole: spz4(streams=1), "table of 1 streams"),
     "streams beyond the end": (".spz", lambda whole: spz4(stored=b""), "for its streams"),
     "places of another size": (".spz", lambda whole: spz4(places=7), "places of 7 bytes"),
+    "no zip": (".sog", lambda whole: b"\0" * 50, "BadZipFile"),
+    "version 1": (".sog", sog_with(lambda meta: meta.pop("version")), "KeyError"),
+    "version 3": (".sog", sog_with(lambda meta: meta.update(version=3)), "no SOG of version 2"),
+    "an image that is not there": (".sog", sog_with(lambda meta: meta["quats"].update(files=["other.webp"])), "KeyError"),
+    "an image that is none": (".sog", sog_with(lambda meta: None, sh0=b"GIF89a"), "sh0.webp is no WebP"),
+    "an image of another checksum": (".sog", replaced(b"WEBPVP8L", b"WEBPVP8M"), "Bad CRC"),
+    "a deflated bomb": (".sog", sog_with(lambda meta: None, zipfile.ZIP_DEFLATED, sh0=bytes(10_000_000)), "10000000 bytes"),
+    "packed as bzip2": (".sog", sog_with(lambda meta: None, zipfile.ZIP_BZIP2), "compression 12"),
+    "a million Gaussians": (".sog", sog_with(lambda meta: meta.update(count=10**8)), "not as many"),
+    "a number of Gaussians in words": (".sog", sog_with(lambda meta: meta.update(count="many")), "not as many"),
+    "four bands": (".sog", sog_with(lambda meta: meta["shN"].update(bands=4)), "degree 4"),
+    "a short codebook": (".sog", sog_with(lambda meta: meta["scales"].update(codebook=[1.0])), "expected 256 numbers"),
+    "a range of words": (".sog", sog_with(lambda meta: meta["means"].update(mins=["a", 1, 2])), "expected 3 numbers"),
+    "a range beyond all numbers": (".sog", sog_with(lambda meta: meta["means"].update(mins=[10**400, 1, 2])), "OverflowError"),
+    "a list for meta.json": (".sog", sog_with(lambda meta: meta.update(means=[])), "TypeError"),
     "an accessor that is not there": (".glb", glb_with(lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(POSITION=99)), "IndexError"),
     "a list for a document": (".glb", glb_with(lambda d: d.update(meshes=3)), "TypeError"),
     "a view beyond the end": (".glb", glb_with(lambda d: d["bufferViews"][0].update(byteOffset=10**9)), "beyond the binary part"),

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import gzip
+import io
+import json
 import os
 import shutil
 import subprocess
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
+from PIL import Image
 
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.rendering.colour import linear_from_srgb
@@ -20,12 +25,14 @@ from efficientnerf.splats.gaussians import Gaussians, covariances
 from pipeline.errors import BadInput, CorruptArtifact
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
+from stages.formats.exporters.splats import sog
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import property_names, read_splats
 from stages.formats.exporters.writing import SourceFrame
-from tests.stages.formats.gaussians import read_glb_splats, read_spz, scattered
+from tests.stages.formats.gaussians import read_glb_splats, read_sog, read_spz, scattered
 from tests.stages.io.meshes import Y_DOWN, Z_UP, accessor, glb_document
 
+Y_UP = SourceFrame(Similarity(1, np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3)))
 SPLAT_TRANSFORM = os.environ.get("SPLAT_TRANSFORM") or shutil.which("splat-transform")
 def turn(seed: int) -> np.ndarray:
     found, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
@@ -76,10 +83,13 @@ def from_y_up(gaussians: Gaussians, frame: SourceFrame) -> Gaussians:
 READERS: dict[str, Callable[[Path, SourceFrame], Gaussians]] = {
     ".ply": lambda path, _: read_splats(path),
     ".spz": lambda path, frame: from_y_up(read_spz(path)[1], frame),
+    ".sog": lambda path, frame: from_y_up(read_sog(path)[1], frame),
     ".glb": lambda path, frame: from_y_up(read_glb_splats(path)[1], frame),
 }
 # What a format keeps: places, the logarithms of scales, opacities, first harmonics, those above.
 FINE, CODED = (1e-6, 1e-6, 1e-6, 1e-6, 2e-6), (2.0**-12, 1 / 32 + 1e-3, 0.5 / 255 + 1e-3, 0.5 / 255 / 0.15 + 1e-3, 4 / 128)
+LIMITS = {".ply": FINE, ".spz": CODED, ".sog": (2.0**-11, 1e-3, 0.5 / 255 + 1e-6, 1e-3, 0.06), ".glb": FINE}
+ANGLES = {".ply": 0.1, ".spz": 0.4, ".sog": 1.0, ".glb": 0.1}  # degrees
 
 
 def differs_by(found: Gaussians, expected: Gaussians) -> tuple[float, ...]:
@@ -88,6 +98,13 @@ def differs_by(found: Gaussians, expected: Gaussians) -> tuple[float, ...]:
         (found.harmonics[:, 0], expected.harmonics[:, 0]), (found.harmonics[:, 1:], expected.harmonics[:, 1:]),
     ]  # fmt: skip
     return tuple(float(np.abs(a - b).max(initial=0)) for a, b in pairs)
+
+
+def in_order_of(found: Gaussians, gaussians: Gaussians) -> Gaussians:
+    """Each where the nearest one is."""
+    order = np.linalg.norm(found.means[:, None] - gaussians.means, axis=2).argmin(axis=1)
+    assert sorted(order) == list(range(len(gaussians)))
+    return gaussians.subset(order)
 
 
 @pytest.mark.parametrize(("degree", "frame"), [(0, Z_UP), (2, Z_UP), (3, Y_DOWN)], ids=["0", "2", "3, y down"])
@@ -99,10 +116,12 @@ def test_what_was_written_is_read_again(extension: str, degree: int, frame: Sour
         SPLAT_EXPORTERS[extension](gaussians, tmp_path / f"{name}{extension}", frame)
     found = READERS[extension](tmp_path / f"a{extension}", frame)
     assert (len(found), found.degree) == (40, degree)
-    limits = CODED if extension == ".spz" else FINE
+    if extension == ".sog":
+        gaussians = in_order_of(found, gaussians)
+    limits = LIMITS[extension]
     assert all(off <= limit for off, limit in zip(differs_by(found, gaussians), limits, strict=True)), (differs_by(found, gaussians), limits)
     angles = np.abs((found.rotations.astype(float) * gaussians.rotations).sum(axis=1))
-    assert np.degrees(2 * np.arccos(np.minimum(angles, 1))).max() < (0.4 if extension == ".spz" else 0.1)
+    assert np.degrees(2 * np.arccos(np.minimum(angles, 1))).max() < ANGLES[extension]
     assert (tmp_path / f"a{extension}").read_bytes() == (tmp_path / f"b{extension}").read_bytes()
     assert len([*tmp_path.iterdir()]) == 2
 
@@ -114,7 +133,7 @@ def test_spz_codes_are_niantic_s(tmp_path: Path) -> None:
     some = replace(scattered(6, degree=2), rotations=turns)
     some.harmonics[:, 0], some.harmonics[:, 1:4], some.harmonics[:, 4:] = 3.4, 5.0, -0.05
     some.scales[:], some.opacities[:] = np.exp(-10), 1 - 2**-24
-    SPLAT_EXPORTERS[".spz"](some, tmp_path / "a.spz", SourceFrame(Similarity(1, np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3))))  # y is up
+    SPLAT_EXPORTERS[".spz"](some, tmp_path / "a.spz", Y_UP)
     data = (tmp_path / "a.spz").read_bytes()
     assert data[:10] == bytes.fromhex("1f8b08000000000002ff")
     raw = gzip.decompress(data)
@@ -149,6 +168,63 @@ def test_spz_refuses_what_lies_beyond_its_places(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"\.ply or \.glb"):
         SPLAT_EXPORTERS[".spz"](far, tmp_path / "a.spz", Z_UP)
     assert not list(tmp_path.iterdir())
+
+
+def test_sog_codes_are_playcanvas_s(tmp_path: Path) -> None:
+    """By hand: no turn, a quarter about x in both senses; the ends of positions, opacities of 0 and 1; images of four Gaussians a row."""
+    h = 0.5**0.5
+    turns = np.array([[1, 0, 0, 0], [h - 1e-3, h + 1e-3, 0, 0], [h + 1e-3, 1e-3 - h, 0, 0]], np.float32)
+    places = np.array([[0, 0, 0], [np.e - 1, 0, 0], [1 - np.e, 0, 0]], np.float32)
+    some = replace(scattered(3, degree=1), rotations=turns, means=places, opacities=np.array([1e-6, 0.5, 1 - 2**-24], np.float32))
+    SPLAT_EXPORTERS[".sog"](some, tmp_path / "a.sog", Y_UP)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert {(each.compress_type, each.date_time) for each in archive.infolist()} == {(zipfile.ZIP_STORED, (1980, 1, 1, 0, 0, 0))}
+        meta = json.loads(archive.read("meta.json"))
+        pixels = {name: np.asarray(Image.open(io.BytesIO(archive.read(name)))) for name in archive.namelist() if name != "meta.json"}
+    assert (meta["version"], meta["count"], meta["shN"]["bands"], meta["shN"]["count"]) == (2, 3, 1, 3)
+    np.testing.assert_allclose([meta["means"]["mins"], meta["means"]["maxs"]], [[-1, 0, 0], [1, 0, 0]], atol=1e-7)
+    assert pixels.pop("shN_centroids.webp").shape == (1, 192, 3)
+    assert {image.shape[:2] for image in pixels.values()} == {(4, 4)}
+    order = [2, 0, 1]  # by x
+    assert [pixels[f"means_{part}.webp"][0, :3, 0].tolist() for part in "lu"] == [[0, 0, 255], [0, 128, 255]]
+    assert pixels["quats.webp"][0, :3].tolist() == [[[128, 128, 128, 252], [255, 128, 128, 253], [0, 128, 128, 252]][k] for k in order]
+    assert pixels["sh0.webp"][0, :3, 3].tolist() == [[0, 128, 255][k] for k in order]
+    for axis in range(3):
+        exact = [some.harmonics[k, 0, axis] for k in order]
+        np.testing.assert_allclose([meta["sh0"]["codebook"][code] for code in pixels["sh0.webp"][0, :3, axis]], exact, atol=1e-6)
+
+
+def test_sog_shares_harmonics_in_a_palette_on_any_number_of_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many entries as are allowed, few Gaussians far from theirs; the same bytes."""
+    monkeypatch.setattr(sog, "PALETTE", 200)
+    monkeypatch.setattr(sog, "BRANCHES", 8)
+    some, threads = scattered(1000, degree=1), numba.get_num_threads()
+    kinds = np.random.default_rng(3).normal(0, 0.3, (150, 3, 3))
+    some.harmonics[:, 1:] = np.repeat(kinds, 7, axis=0)[:1000] + np.random.default_rng(4).normal(0, 0.01, (1000, 3, 3))
+    contents = []
+    for number in (1, threads):
+        numba.set_num_threads(number)
+        SPLAT_EXPORTERS[".sog"](some, tmp_path / "a.sog", Z_UP)
+        contents.append((tmp_path / "a.sog").read_bytes())
+    assert contents[0] == contents[1]
+    meta, found = read_sog(tmp_path / "a.sog")
+    assert 150 < meta["shN"]["count"] <= 200
+    found = from_y_up(found, Z_UP)
+    off = np.linalg.norm(found.harmonics[:, 1:] - in_order_of(found, some).harmonics[:, 1:], axis=(1, 2))
+    assert np.median(off) < 0.05
+    assert np.quantile(off, 0.9) < 0.5
+
+
+@pytest.mark.parametrize("values", [[0.25], [1.0, 1.0, 3.0], [*np.linspace(-2, 2, 200)], [*np.random.default_rng(0).normal(size=5000), 40.0]])
+def test_a_codebook_of_sog_has_each_value_s_nearest_level(values: list[float]) -> None:
+    """Few values are exact; an outlier does not coarsen the others."""
+    levels, codes = sog.coded(np.array(values))
+    assert len(levels) == 256
+    assert levels == sorted(levels)
+    off = np.abs(np.array(levels)[codes] - values)
+    np.testing.assert_allclose(off, np.abs(np.array(levels) - np.array(values)[:, None]).min(axis=1), atol=1e-12)
+    assert off.max() < (0.2 if len(values) > 256 else 1e-6)
+    assert np.sqrt(np.mean(off**2)) < 0.01
 
 
 def test_glb_has_the_extension_by_its_letter(tmp_path: Path) -> None:
@@ -224,7 +300,7 @@ def read_any_ply(path: Path) -> Gaussians:
 
 
 @pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="needs PlayCanvas' reader: npm install -g @playcanvas/splat-transform, or SPLAT_TRANSFORM=its path")
-@pytest.mark.parametrize(("extension", "to"), [(".ply", ".ply"), (".spz", ".ply"), (".ply", ".glb")])
+@pytest.mark.parametrize(("extension", "to"), [(".ply", ".ply"), (".spz", ".ply"), (".sog", ".ply"), (".ply", ".glb")])
 def test_splat_transform_reads_what_was_written(extension: str, to: str, tmp_path: Path) -> None:
     """Without a warning, and its own PLY and GLB hold the same. In a GLB it turns a PLY by half a turn about z, harmonics too."""
     some = scattered(200, degree=3)
@@ -241,6 +317,6 @@ def test_splat_transform_reads_what_was_written(extension: str, to: str, tmp_pat
         assert (theirs["extensions"], theirs["mode"], [*theirs["attributes"]]) == (ours["extensions"], ours["mode"], [*ours["attributes"]])
     else:
         found = read_any_ply(tmp_path / "b.ply")
-        expected = some if extension == ".ply" else read_spz(tmp_path / "a.spz")[1]
+        expected = some if extension == ".ply" else {".spz": read_spz, ".sog": read_sog}[extension](tmp_path / f"a{extension}")[1]
     assert max(differs_by(found, expected)) < 2e-3
     np.testing.assert_allclose(np.abs((found.rotations.astype(float) * expected.rotations).sum(axis=1)), 1, atol=1e-5)

@@ -1,4 +1,4 @@
-"""What a file of 3D Gaussians holds, whoever wrote it: PLY of 3DGS, SPZ 1 to 4, GLB with KHR_gaussian_splatting.
+"""What a file of 3D Gaussians holds, whoever wrote it: PLY of 3DGS, SPZ 1 to 4, SOG 2, GLB with KHR_gaussian_splatting.
 
 Nothing that a header says is believed before the file's size allows it, and no more than a piece of a file is in memory at a time.
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from pipeline.errors import BadInput
-from pipeline.files import Unreadable, open_plain
+from pipeline.files import Unreadable, json_value, open_plain
 from pipeline.text import printable
 from stages.formats.exporters.splats import gltf, spz
 from stages.io.meshes.geometry import AT_ONCE, Damaged, exactly
@@ -27,6 +28,7 @@ from stages.io.meshes.glb import Glb
 from stages.io.meshes.ply import Element, read_header
 
 MAX_GLTF_JSON = 2**24  # bytes; of Gaussians it takes a few thousand
+MAX_SOG_JSON = 2**20  # bytes; it takes ten thousand
 DENSEST = 1032  # bytes that one byte of deflate, or of a zstd frame as SPZ writes them, can stand for
 FEW, USUAL = 2**20, 64  # Gaussians that any file may hold; and bytes that one byte stands for in larger ones at most: those of scenes have 3
 SPZ_DEGREES = range(5)
@@ -86,7 +88,7 @@ class _Found:
 def describe_splats(path: Path) -> dict[str, Any] | None:
     """Format, number, degree of the harmonics, bounds, least and greatest standard deviation and opacity of the Gaussians in a file; None where the file is
     something else, as a mesh may be. In the file's own frame. Raises BadInput."""
-    readers: dict[str, Callable[[BinaryIO, int], _Found | None]] = {".ply": _ply, ".spz": _spz, ".glb": _glb}
+    readers: dict[str, Callable[[BinaryIO, int], _Found | None]] = {".ply": _ply, ".spz": _spz, ".sog": _sog, ".glb": _glb}
     try:
         with open(open_plain(path), "rb") as file:
             found = readers[path.suffix.lower()](file, os.fstat(file.fileno()).st_size)
@@ -230,6 +232,61 @@ class _Inflated:
             left -= len(self._part(AT_ONCE))
             if left < 0:
                 raise Damaged("it goes on after its last Gaussian")
+
+
+# SOG
+
+
+def _sog(file: BinaryIO, size: int) -> _Found:
+    """What meta.json says, and that the images are there and whole. They are not decoded."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            meta = _sog_member(archive, "meta.json", MAX_SOG_JSON)
+            found = _sog_meta(json_value(meta), size, lambda name: _sog_member(archive, name, size))
+    except (Damaged, Unreadable):
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
+        raise Damaged(f"no SOG of version 2, or a damaged one ({type(error).__name__}: {printable(error, 80)})") from error
+    found.notes.append("opacities are not read: they are in an image")
+    return found
+
+
+def _sog_member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    """The beginning of a file in the zip, all of which is read for its checksum."""
+    info = archive.getinfo(name)
+    if info.file_size > most or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise Damaged(f"{printable(name, 80)}: {info.file_size} bytes, compression {info.compress_type}; expected at most {most}, stored or deflated")
+    with archive.open(info) as member:
+        begin = member.read(most if name == "meta.json" else 16)
+        while member.read(AT_ONCE):
+            pass
+    return begin
+
+
+def _sog_meta(meta: Any, size: int, image: Callable[[str], bytes]) -> _Found:
+    if meta["version"] != 2:
+        raise Damaged("no SOG of version 2 (convert it: splat-transform in.sog out.sog)")
+    count, above = meta["count"], meta.get("shN")
+    degree = 0 if above is None else above["bands"]
+    if not (type(count) is type(degree) is int and 1 <= 9 * count <= (DENSEST if count <= FEW else USUAL) * size and 0 <= degree <= 3):
+        raise Damaged(f"Gaussians {printable(count, 40)}, degree {printable(degree, 40)}; {size} bytes hold none, or not as many")
+    for part, number in (("means", 2), ("scales", 1), ("quats", 1), ("sh0", 1), *((("shN", 2),) if degree else ())):
+        for name in meta[part]["files"][:number]:
+            begin = image(name)
+            if begin[:4] + begin[8:12] != b"RIFFWEBP":
+                raise Damaged(f"{printable(name, 80)} is no WebP")
+    found = _Found("SOG 2", count, degree, notes=["antialiased"] if meta.get("antialias") is True else [])
+    ranges, scales = np.array([_sog_numbers(meta["means"][end], 3) for end in ("mins", "maxs")]), _sog_numbers(meta["scales"]["codebook"], 256)
+    with np.errstate(over="ignore"):
+        found.places.add(np.sign(ranges) * np.expm1(np.abs(ranges)))
+        found.scales.add(np.exp(scales)[:, None])
+    return found
+
+
+def _sog_numbers(given: Any, count: int) -> np.ndarray:
+    if not isinstance(given, list) or len(given) != count or not all(type(each) in (int, float) for each in given):
+        raise Damaged(f"a range or a codebook in meta.json; expected {count} numbers")
+    return np.array(given, np.float64)
 
 
 # GLB
