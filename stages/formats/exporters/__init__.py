@@ -96,7 +96,7 @@ _SPLATS = (
            "PlayCanvas, Spark, three.js, splat-transform; should: whatever reads 3DGS", "splats.ply", "write_splats"),
     Format(".spz", "the same in an eighth of the bytes; y up", "precision: colours, sizes and opacities of 8 bits; the capture's axes",
            "Spark, three.js, splat-transform; should: others of SPZ 3", "splats.spz", "write_splats"),
-    Format(".sog", "the same in an eighth of the bytes or less; y up",
+    Format(".sog", "the same in an eighth of the bytes or less; y down, as its programs have it",
            "precision: harmonics by a palette, colours, sizes and opacities of 8 bits; the capture's axes",
            "splat-transform; should: SuperSplat, PlayCanvas, Babylon.js, Spark", "splats.sog", "write_splats"),
     Format(".glb", "the same, in single precision (KHR_gaussian_splatting); y up; points where the extension is unknown",

@@ -80,10 +80,14 @@ def from_y_up(gaussians: Gaussians, frame: SourceFrame) -> Gaussians:
     return moved(gaussians, Similarity(1.0, gltf_from_capture(frame.up).T, np.zeros(3)))
 
 
+def from_y_down(gaussians: Gaussians, frame: SourceFrame) -> Gaussians:
+    return from_y_up(moved(gaussians, Similarity(1.0, np.diag([1.0, -1, -1]), np.zeros(3))), frame)
+
+
 READERS: dict[str, Callable[[Path, SourceFrame], Gaussians]] = {
     ".ply": lambda path, _: read_splats(path),
     ".spz": lambda path, frame: from_y_up(read_spz(path)[1], frame),
-    ".sog": lambda path, frame: from_y_up(read_sog(path)[1], frame),
+    ".sog": lambda path, frame: from_y_down(read_sog(path)[1], frame),
     ".glb": lambda path, frame: from_y_up(read_glb_splats(path)[1], frame),
 }
 # What a format keeps: places, the logarithms of scales, opacities, first harmonics, those above.
@@ -176,7 +180,7 @@ def test_sog_codes_are_playcanvas_s(tmp_path: Path) -> None:
     turns = np.array([[1, 0, 0, 0], [h - 1e-3, h + 1e-3, 0, 0], [h + 1e-3, 1e-3 - h, 0, 0]], np.float32)
     places = np.array([[0, 0, 0], [np.e - 1, 0, 0], [1 - np.e, 0, 0]], np.float32)
     some = replace(scattered(3, degree=1), rotations=turns, means=places, opacities=np.array([1e-6, 0.5, 1 - 2**-24], np.float32))
-    SPLAT_EXPORTERS[".sog"](some, tmp_path / "a.sog", Y_UP)
+    SPLAT_EXPORTERS[".sog"](some, tmp_path / "a.sog", Y_DOWN)
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         assert {(each.compress_type, each.date_time) for each in archive.infolist()} == {(zipfile.ZIP_STORED, (1980, 1, 1, 0, 0, 0))}
         meta = json.loads(archive.read("meta.json"))
@@ -209,7 +213,7 @@ def test_sog_shares_harmonics_in_a_palette_on_any_number_of_threads(tmp_path: Pa
     assert contents[0] == contents[1]
     meta, found = read_sog(tmp_path / "a.sog")
     assert 150 < meta["shN"]["count"] <= 200
-    found = from_y_up(found, Z_UP)
+    found = from_y_down(found, Z_UP)
     off = np.linalg.norm(found.harmonics[:, 1:] - in_order_of(found, some).harmonics[:, 1:], axis=(1, 2))
     assert np.median(off) < 0.05
     assert np.quantile(off, 0.9) < 0.5

@@ -39,6 +39,11 @@ def with_y_up(gaussians: Gaussians, frame: SourceFrame) -> Gaussians:
     return moved(gaussians, Similarity(1.0, gltf_from_capture(frame.up), np.zeros(3)))
 
 
+def with_y_down(gaussians: Gaussians, frame: SourceFrame) -> Gaussians:
+    """The same turned by half a turn about x, as in COLMAP's cameras."""
+    return moved(gaussians, Similarity(1.0, np.diag([1.0, -1, -1]) @ gltf_from_capture(frame.up), np.zeros(3)))
+
+
 def moved(gaussians: Gaussians, target_from_source: Similarity) -> Gaussians:
     """The same Gaussians in another frame: each looks the same to an eye that moves along. Raises ValueError where they are not finite there."""
     rotation, scale = target_from_source.rotation, target_from_source.scale

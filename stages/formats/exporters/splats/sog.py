@@ -1,4 +1,5 @@
-"""SOG of PlayCanvas, version 2: 3D Gaussians as lossless WebP images in a zip that is not compressed again, right-handed with y up. A pixel is a Gaussian.
+"""SOG of PlayCanvas, version 2: 3D Gaussians as lossless WebP images in a zip that is not compressed again, right-handed. A pixel is a Gaussian. y is down: so
+PlayCanvas' tools and Babylon.js take such files, which turn them over, whatever the format's page says.
 
     meta.json             number, ranges of positions, codebooks
     means_l, means_u      the low and the high bytes of positions: sign(v) log(1 + |v|), 16 bits within its range on each axis
@@ -30,7 +31,7 @@ from efficientnerf.asset.quantisation import clustered
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.merging import morton_codes
 from pipeline.files import atomic
-from stages.formats.exporters.splats.frames import check_gaussians, with_y_up
+from stages.formats.exporters.splats.frames import check_gaussians, with_y_down
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame
 
 VERSION = 2
@@ -44,7 +45,7 @@ OLDEST = (1980, 1, 1, 0, 0, 0)  # no time: the same Gaussians give the same byte
 def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write Gaussians given in the capture's frame. Raises BadInput."""
     check_gaussians(gaussians, path)
-    files = files_of(with_y_up(gaussians, frame))
+    files = files_of(with_y_down(gaussians, frame))
     with atomic(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():
             entry = zipfile.ZipInfo(name, OLDEST)
