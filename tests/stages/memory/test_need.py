@@ -100,7 +100,7 @@ def test_training_that_does_not_fit_is_refused_before_it_begins(made: dict[str, 
         (turntable, TurntableSettings(width=8192, height=8192), "turntable.width"),
         (points, PointsSettings(num_points=10**9), "points.num_points"),
         (mesh, MeshSettings(), "bake.max_mib"),
-        (splats, SplatsSettings(make="on"), "splats.count (200000)"),
+        (splats, SplatsSettings(make="on"), "splats.count (300000)"),
         (evaluate, EvaluateSettings(), "poses.max_image_size"),
     ],
 )
