@@ -70,6 +70,7 @@ def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-d
 
 @numba.njit(cache=True, error_model="numpy")
 def _lower(vectors_t, centroid, distance, begin, lanes):  # type: ignore[no-untyped-def]
+    """The same for so many vectors from `begin` on."""
     squared = np.zeros(lanes, np.float32)
     for d in range(vectors_t.shape[0]):
         x = centroid[d]

@@ -200,6 +200,7 @@ class KernelCache(caching.FunctionCache):
         super().__init__(function)
         found = self._impl.locator
         self._module = found.module if isinstance(found, KernelLocator) else None
+        self._bound: dict[Any, tuple[str | None, set[str]]] = {}
         if self._module is not None:
             self._cache_file = KernelFiles(self._cache_path, self._impl.filename_base, found.get_source_stamp())
 
@@ -207,7 +208,7 @@ class KernelCache(caching.FunctionCache):
         key = super()._index_key(signature, codegen)
         if self._module is None:
             return key
-        text, modules = bound(self._py_func, signature)
+        text, modules = self._bound_to(signature)
         return (*key, text, kernel_cache.SOURCES.key({self._module, *modules}))
 
     def _load_overload(self, signature: Any, target_context: Any) -> Any:
@@ -223,8 +224,13 @@ class KernelCache(caching.FunctionCache):
         """Whether what this process compiles is made of the sources as they are."""
         if self._module is None:
             return True
-        text, modules = bound(self._py_func, signature)
+        text, modules = self._bound_to(signature)
         return text is not None and not kernel_cache.SOURCES.changed_since({self._module, *modules}, BEGAN)
+
+    def _bound_to(self, signature: Any) -> tuple[str | None, set[str]]:
+        if signature not in self._bound:
+            self._bound[signature] = bound(self._py_func, signature)
+        return self._bound[signature]
 
 
 class _Compilations(event.Listener):
