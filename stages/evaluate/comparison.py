@@ -81,8 +81,8 @@ def evaluate_view(
     metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(perceptual or {}, image, truth)}
     if unbounded and asset.inner is None:
         metrics["asset"]["background_scale"] = 1.0 / stride
-    drawn, plain, covered = mesh_image(mesh, asset, scene, view, seen, stride)
-    metrics["mesh"] = mesh_metrics(shown(drawn, "the mesh"), shown(plain, "the mesh"), covered, image, truth)
+    drawn, plain, covered, depth = mesh_image(mesh, asset, scene, view, seen, stride)
+    metrics["mesh"] = mesh_metrics(shown(drawn, "the mesh"), shown(plain, "the mesh"), covered, depth, image, truth, view.camera)
     if splats is not None:
         drawn = shown(splats_image(splats, asset, scene, view), "the Gaussians")
         metrics["splats"] = {"psnr": truth.psnr(drawn), "ssim": truth.ssim(drawn)}

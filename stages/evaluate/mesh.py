@@ -5,6 +5,7 @@ mesh), or what the field shows before and behind the box of an asset that holds 
 
 psnr_covered        over the pixels that the mesh covers by half or more; asset_psnr_covered: the asset's on the same
 covered             their share of the pixels that count
+roughness           `efficientnerf.surface.roughness`
 ..._vertex_colours  the same of the mesh in the colours of its vertices
 """
 
@@ -20,7 +21,9 @@ import numpy as np
 from efficientnerf.asset.region import surroundings
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.surface.mesh import Mesh, moved
+from efficientnerf.surface.roughness import roughness
 from efficientnerf.surface.shading import ColouredImage, Shader
 from stages.artifacts import MeshOutputs
 from stages.evaluate.asset import EvaluatedAsset, RenderTree
@@ -30,7 +33,7 @@ from stages.io.pictures import read_header
 from stages.io.scene import Scene, View
 from stages.mesh.files import read_mesh
 
-FIGURES = ("psnr", "ssim", "psnr_covered", "psnr_vertex_colours", "ssim_vertex_colours", "asset_psnr_covered", "covered")
+FIGURES = ("psnr", "ssim", "psnr_covered", "psnr_vertex_colours", "ssim_vertex_colours", "asset_psnr_covered", "covered", "roughness")
 MARGIN = 0.03  # of the depth, that surroundings have to be nearer to hide the mesh: it ends where they begin
 
 
@@ -76,8 +79,11 @@ def _size(path: Path) -> int:
     return path.stat().st_size if path.is_file() else 0
 
 
-def mesh_image(mesh: EvaluatedMesh, asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The image of a view (H, W, 3) with the mesh in its texture, that with it in the colours of its vertices, and the mesh's share of each pixel (H, W).
+def mesh_image(
+    mesh: EvaluatedMesh, asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The image of a view (H, W, 3) with the mesh in its texture, that with it in the colours of its vertices, the mesh's share of each pixel (H, W), and
+    its depth along the view axis (H, W), infinite where it is not seen.
 
     seen  the field's rendering on every stride-th pixel, where the asset is composited with it; else it is not used
     """
@@ -99,14 +105,16 @@ def mesh_image(mesh: EvaluatedMesh, asset: EvaluatedAsset, scene: Scene, view: V
         middle = np.where(hidden[..., None], rest, drawn.colour + (1 - drawn.covered[..., None]) * rest)
         return np.asarray(middle if before is None else before[..., :3] + (1.0 - before[..., 3:]) * middle, np.float32)
 
-    return image(textured), image(plain), np.where(hidden, 0, textured.covered)
+    return image(textured), image(plain), np.where(hidden, 0, textured.covered), np.where(hidden, np.inf, textured.depth)
 
 
-def mesh_metrics(image: np.ndarray, plain: np.ndarray, covered: np.ndarray, asset: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
-    """FIGURES of a view; None where no pixel can be compared.
+def mesh_metrics(
+    image: np.ndarray, plain: np.ndarray, covered: np.ndarray, depth: np.ndarray, asset: np.ndarray, truth: GroundTruth, camera: Camera
+) -> dict[str, float | None]:
+    """FIGURES of a view; None where nothing can be compared.
 
-    image, plain, covered  of `mesh_image`, clipped
-    asset                  its image of the view, clipped
+    image, plain, covered, depth  of `mesh_image`, the images clipped
+    asset                         its image of the view, clipped
     """
     on_mesh = covered >= 0.5
     return {
@@ -117,4 +125,5 @@ def mesh_metrics(image: np.ndarray, plain: np.ndarray, covered: np.ndarray, asse
         "ssim_vertex_colours": truth.ssim(plain),
         "asset_psnr_covered": truth.psnr(asset, on_mesh),
         "covered": float((truth.used & on_mesh).sum() / truth.used.sum()) if truth.used.any() else None,
+        "roughness": roughness(truth.colour, np.where(truth.used, depth, np.inf), camera),
     }

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from efficientnerf.surface.roughness import BENT
 from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
 from stages.evaluate.trivial import BLURS, equivalent_blur
 from stages.formats.importers.source import abbreviated
@@ -33,6 +34,7 @@ FLOATERS, MANY_FLOATERS = 0.02, 0.15  # share of the asset's opacity, more than 
 SHORT = 0.5  # of the steps that are usual: a refinement with fewer comes before other causes
 AGREEING, LEAST_AGREEING = 0.6, 0.3  # share of the sparse points that the asset's depth agrees with
 MISSING, MOST_MISSING = 0.3, 0.6  # share of the subject's sparse points that the asset lies behind
+ROUGH = 0.2  # share of lines across plain regions of the photographs that the mesh bends, in two views or more
 OVERFIT = 5.0  # dB of views that training saw over those it did not
 
 RUN = EvaluateOutputs.stage
@@ -316,12 +318,19 @@ def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Res
     if metrics["mesh"]["faces"] == 0:
         remedy = "Train longer, or set mesh.density_threshold by hand."
         return [ResultProblem("mesh", "usable", "The mesh is empty.", "The asset has no clear surface.", remedy, picture)]
+    found = []
+    rough = [view["mesh"]["roughness"] for view in metrics["views"] if view["mesh"]["roughness"] is not None]
+    if len(rough) > 1 and (share := math.fsum(rough) / len(rough)) > ROUGH:
+        sentence = f"The mesh is rough: {100 * share:.0f} % of what photographs show as plain is bent by more than {BENT:.0f} degrees."
+        cause = "Photographs say little about walls and tables of one colour, which come out in rags; the asset shows them right from near the photographs."
+        remedy = "Photograph such surfaces with something on them that has texture (posters, newspapers, chalk); use the asset or the splats."
+        found.append(ResultProblem("rough mesh", "usable", sentence, cause, remedy, picture))
     if not _only_of_this(figures["mesh_blur"], figures):
-        return []
+        return found
     sentence = f"The mesh is far behind the asset: {metrics['mesh']['psnr']:.1f} dB, {blur_in_words(figures['mesh_blur'])}."
     cause = "Its surface is not where the asset's is, or what it shows has none (fur, leaves, glass)."
     remedy = "Raise mesh.max_faces, or set mesh.density_threshold by hand; use the asset or the splats."
-    return [ResultProblem("mesh", "usable", sentence, cause, remedy, picture)]
+    return [*found, ResultProblem("mesh", "usable", sentence, cause, remedy, picture)]
 
 
 def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[ResultProblem]:

@@ -17,7 +17,7 @@ def a_result(psnr: float = 29.4, *, fitted: float | None = None, mean_colour: fl
     blurred, fitted = blurred or BLURRED, psnr if fitted is None else fitted
     quality = {"psnr": psnr, "ssim": 0.9, "psnr_colour_fitted": fitted}
     views = [
-        {"name": f"v{k}.jpg", "asset": dict(quality), "network": dict(quality), "mesh": {"psnr": psnr - 1}, "splats": {"psnr": psnr},
+        {"name": f"v{k}.jpg", "asset": dict(quality), "network": dict(quality), "mesh": {"psnr": psnr - 1, "roughness": 0.05}, "splats": {"psnr": psnr},
          "trivial": {"mean_colour": mean_colour, "blurred": list(blurred)}} for k in range(5)
     ]  # fmt: skip
     return {
@@ -74,6 +74,7 @@ WORSE: dict[str, Callable[[dict[str, Any]], None]] = {
     "points nearer": lambda found: _shares(found, "nearer", 0.1),
     "points farther": lambda found: _shares(found, "farther", 0.1),
     "subject": lambda found: _put(found, "sparse_points.subject_farther", min(1.0, found["sparse_points"]["subject_farther"] + 0.2)),
+    "rough mesh": lambda found: [_put(view, "mesh.roughness", min(1.0, view["mesh"]["roughness"] + 0.06)) for view in found["views"]] and None,
     "mesh gone": lambda found: _put(found, "mesh.faces", 0),
     "nothing held out": lambda found: found.update(split="train"),
 }

@@ -82,7 +82,7 @@ def test_surroundings_that_are_nearer_hide_the_mesh(tmp_path: Path, depth: float
     """The cameras are three away from the middle of the ball."""
     scene: Scene = load(make_scene(tmp_path / "poses", "t"))
     around = replace(BALL_MESH, surroundings=flat((0.0, 1.0, 0.0), depth))
-    image, plain, covered = mesh_image(around, TREE.evaluated(), scene, scene.views[0], None, 1)
+    image, plain, covered, _ = mesh_image(around, TREE.evaluated(), scene, scene.views[0], None, 1)
     middle = image[22, 30]
     np.testing.assert_allclose(image[0, 0], [0, 1, 0])
     assert (covered[22, 30], bool(abs(middle - [0, 1, 0]).max() > 0.2)) == (float(shown), shown)
