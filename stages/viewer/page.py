@@ -61,7 +61,7 @@ def viewer_page(
     """The page of the bytes of an asset in the layout `compact`, which the page checks.
 
     cameras      captured cameras, training frame, to jump to; none: those of the asset's captured path
-    photographs  JPEG of the image of a camera, by the camera's name; as a pinhole camera of the same lens takes it
+    photographs  WebP of the image of a camera, by the camera's name; as a pinhole camera of the same lens takes it
     """
     packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9)
     packed = packer.compress(asset) + packer.flush()
@@ -144,7 +144,7 @@ def _camera(camera: Camera, photograph: bytes | None) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         **{key: float(lens[key]) for key in ("fx", "fy", "cx", "cy")},
-        "photograph": None if photograph is None else "data:image/jpeg;base64," + base64.b64encode(photograph).decode("ascii"),
+        "photograph": None if photograph is None else "data:image/webp;base64," + base64.b64encode(photograph).decode("ascii"),
     }
 
 

@@ -35,12 +35,12 @@ def test_a_run_gets_a_page_with_its_cameras_and_photographs(run: Run) -> None:
     path = write_run_viewer(run)
     assert path == run.path / "viewer.html"
     text = path.read_text(encoding="utf-8")
-    assert text.count("data:image/jpeg;base64,") == 8
+    assert text.count("data:image/webp;base64,") == 8
     assert "<title>run</title>" in text
     (run.path / "poses/scene.json").write_text("{")
     path = write_run_viewer(run, anew=True)
     assert path is not None
-    assert "data:image/jpeg" not in path.read_text(encoding="utf-8"), "without cameras, too"
+    assert "data:image/webp" not in path.read_text(encoding="utf-8"), "without cameras, too"
 
 
 def test_a_page_is_made_again_when_the_asset_is_another(run: Run) -> None:
