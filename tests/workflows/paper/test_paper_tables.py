@@ -7,13 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.paper import document as paper
+from benchmarks.paper import tables
+from benchmarks.paper.document import PAPER, Request
+from benchmarks.paper.runs import Figures, Row, settings_of
 from tests.efficientnerf.balls import cameras, picture
 from tests.stages.captures import write_picture
-from workflows.cli.main import main
-from workflows.paper import document as paper
-from workflows.paper import tables
-from workflows.paper.document import PAPER, Request
-from workflows.paper.runs import Figures, Row, _pace, settings_of
 
 
 def ball(folder: Path) -> Path:
@@ -47,19 +46,6 @@ def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
     assert differ == {"field", "sampling", "num_coarse_samples", "coarse_hidden_dim", "coarse_num_layers"}  # so the rest is shared
 
 
-def test_the_pace_is_that_of_the_log() -> None:
-    lines = [
-        {"step": step, "step_seconds": 2.0 if step <= 50 else 1.0, "preview_psnr": None if step % 50 else 20.0 + step, "rays": 10, "valid": 30, "fine": 50}
-        for step in range(10, 101, 10)
-    ]
-    pace = _pace(lines)
-    assert pace["step"] == pytest.approx(1.5)
-    assert pace["steady"] == 1.0
-    assert pace["hours"] == pytest.approx(150 / 3600)
-    assert (pace["coarse"], pace["fine"]) == (3.0, 5.0)
-    assert pace["curve"] == ([100.0, 150.0], [70.0, 120.0])
-
-
 def made_up(steady: float, psnr: float) -> Figures:
     tree = {"psnr": psnr - 0.5, "ssim": 0.9, "fps": 20.0, "frame": "100x100", "mib": 3.0}
     return Figures(psnr, 0.95, 2 * steady, steady, 1.0, 12.0, 24.0, 0.1, 0.04, ([1.0, 2.0], [20.0, psnr]), tree)
@@ -87,21 +73,13 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         assert document["rows"][0]["valid %" + PAPER] == 9.58
 
 
-def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data, out = ball(tmp_path / "ball"), tmp_path / "out"
-    command = ["paper", "1", "--data", str(data), "--out", str(out), "--scale", "0.00001", "--device", "cpu", "--json"]
-    assert main(command) == 0
-    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert events[-1]["event"] == "summary"
+def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path) -> None:
+    request = Request(ball(tmp_path / "ball"), tmp_path / "out", 0.00001, report=(events := []).append)
+    written = paper.make("1", request)
     assert sum(event["event"] == "stage_done" and event["stage"] == "train" for event in events) == 2
-    assert any(event["event"] == "progress" and event["stage"] == "train" for event in events)  # hours go by without a word otherwise
-    nerf, ours = json.loads((out / "table_1.json").read_text())["rows"]
+    nerf, ours = json.loads(written["json"].read_text())["rows"]
     assert 0 < ours["pivotal %"] <= ours["valid %"] < 100
     assert 0 < nerf["pivotal %"] < 100
-    assert min(nerf["PSNR"], ours["PSNR"]) > 10
-    field = out / "runs/ball/n4/train/field.safetensors"
-    made = field.stat().st_mtime_ns
-    assert main(command) == 0
-    assert field.stat().st_mtime_ns == made
-    (tmp_path / "none").mkdir()
-    assert main([*command, "--data", str(tmp_path / "none")]) == 2
+    events.clear()
+    paper.make("1", request)
+    assert not any(event["event"] == "stage_done" for event in events)
