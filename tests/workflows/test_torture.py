@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -21,7 +18,6 @@ from tests.workflows.torment import torment
 from tests.workflows.toys import TOYS
 from workflows.workflow import Workflow
 
-ROOT = Path(__file__).resolve().parents[2]
 STAGES = tuple(stage.name for stage in TOYS)
 
 
@@ -73,39 +69,6 @@ def test_failing_operations_of_toy_runs_lose_nothing(toy: tuple[Prepared, Workfl
         for where, *operation in FAULTS:
             assert cases.carry_out(Case("toy", where if where in STAGES else NEW, where, *operation)) == []
     assert all(json.loads(line)["reached"] for line in (tmp_path / "book").read_text().splitlines())
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_the_library_and_the_hooks_of_python_see_the_same_operations(tmp_path: Path) -> None:
-    library = trap.build(tmp_path)
-    assert library is not None
-    program = """
-import os, sys
-from pathlib import Path
-if sys.argv[2] == "python":
-    from benchmarks.torture.audit import arm
-    arm()
-run = Path(sys.argv[1])
-(run / "train").mkdir()
-(run / "train" / "a").write_text("words")
-os.rename(run / "train" / "a", run / "train" / "b")
-descriptor = os.open(run / "train" / "b", os.O_RDONLY)
-os.fsync(descriptor)
-os.close(descriptor)
-(run / "train" / "b").unlink()
-(run / "train").rmdir()
-(run / "run.json").write_bytes(b"{}")
-"""
-    seen = []
-    for watcher in ("library", "python"):
-        run = tmp_path / watcher
-        run.mkdir()
-        armed = Armed(Trap(), run, tmp_path / "source", tmp_path / "state", tmp_path / f"{watcher}.log")
-        environment = processes.single_threaded_environment(library if watcher == "library" else None) | armed.environment
-        subprocess.run([sys.executable, "-c", program, str(run), watcher], env=environment, check=True, cwd=ROOT)
-        seen.append([(operation.stage, operation.kind, Path(operation.path).name) for operation in trap.operations(armed.log or run)])
-    assert seen[0] == seen[1]
-    assert [kind for _, kind, _ in seen[0]] == ["mkdir", "open", "write", "rename", "read", "fsync", "unlink", "rmdir", "open", "write"]
 
 
 @pytest.mark.slow

@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import socket
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +15,6 @@ from pipeline.fleet import requests
 from tests.pipeline.toy import contents
 from tests.workflows.command import Enerf
 from workflows.fleet.running import held
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -135,27 +130,6 @@ def test_a_second_fleet_says_who_holds_it(enerf: Enerf, scenes: Path, tmp_path: 
         assert len(list((fleet / ".requests").iterdir())) == 1
     assert enerf("fleet", "cancel", fleet).code == 2
     assert enerf(*command).code == 0  # requests to a process that has ended are not heeded
-
-
-def test_of_two_fleets_at_once_the_second_says_who_holds_it(toys: Path, scenes: Path, tmp_path: Path) -> None:
-    """Two processes by the same command; the first waits in a stage until the second has ended."""
-    fleet, code = tmp_path / "fleet", "import sys; from tests.workflows.fleet_child import run; sys.exit(run(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "fleet", str(manifest(scenes, s1="slow")), "--out", str(fleet), "--quiet"]
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE) as first:
-        try:
-            deadline = time.monotonic() + 120.0
-            while not list(tmp_path.glob("train in *")):
-                assert first.poll() is None
-                assert time.monotonic() < deadline
-                time.sleep(0.05)
-            second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-            assert second.returncode == 5, second.stderr
-            assert f"process {first.pid} on {socket.gethostname()}" in second.stderr
-            assert first.poll() is None, "it is not disturbed"
-        finally:
-            (tmp_path / "go on").touch()
-        assert first.wait(120) == 0
-    assert set(states(fleet).values()) == {"done"}
 
 
 @pytest.mark.parametrize("bad", [["--jobs", "0"], ["--cluster", "cloud"], ["--cluster-options", "x.toml"], ["--preset", "no"], ["--set", "train.no=1"]])

@@ -71,15 +71,3 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         assert "valid on chair" in " ".join(document["notes"]), "what has not converged does not count"
     if number == "1":
         assert document["rows"][0]["valid %" + PAPER] == 9.58
-
-
-def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path) -> None:
-    request = Request(ball(tmp_path / "ball"), tmp_path / "out", 0.00001, report=(events := []).append)
-    written = paper.make("1", request)
-    assert sum(event["event"] == "stage_done" and event["stage"] == "train" for event in events) == 2
-    nerf, ours = json.loads(written["json"].read_text())["rows"]
-    assert 0 < ours["pivotal %"] <= ours["valid %"] < 100
-    assert 0 < nerf["pivotal %"] < 100
-    events.clear()
-    paper.make("1", request)
-    assert not any(event["event"] == "stage_done" for event in events)
