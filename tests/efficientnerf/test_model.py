@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from efficientnerf.fields.bakeable import BakeableField
-from efficientnerf.geometry.spaces import BoundedSpace
-from efficientnerf.model import Model, model, render_rays, restore, state_of
-from efficientnerf.training.settings import TrainSettings
-from tests.efficientnerf.balls import BOUNDS, pixels, untrained
+from efficientnerf.model import Model, render_rays, restore, state_of
+from tests.efficientnerf.balls import pixels, untrained
 
 
 class Counting(BakeableField):
@@ -86,28 +84,6 @@ def test_the_same_settings_give_the_same_numbers(field: str) -> None:
     first, again, other = untrained(field=field), untrained(field=field), untrained(field=field, seed=1)
     assert all(torch.equal(a, b) for a, b in zip(state_of(first).values(), state_of(again).values(), strict=True))
     assert not torch.equal(dict(first.parameters())["fine.weights.0"], dict(other.parameters())["fine.weights.0"])
-
-
-def test_the_papers_model_has_the_papers_sizes() -> None:
-    paper = TrainSettings(
-        field="mlp",
-        sh_degree=3,
-        hidden_dim=256,
-        num_layers=8,
-        coarse_hidden_dim=128,
-        coarse_num_layers=4,
-        num_coarse_samples=64,
-        samples_per_pivot=2,
-        occupancy_resolution=384,
-        occupancy_rule="momentum",
-    )
-    m = model(BoundedSpace(BOUNDS), paper, (1.0, 1.0, 1.0))
-    assert m.fine(torch.rand(2, 3)).shape == (2, 49)
-    assert m.coarse(torch.rand(2, 3)).shape == (2, 49)
-    assert m.voxels.values.shape == (384, 384, 384)
-    assert m.voxels.threshold == 0
-    assert float(m.voxels.values.max()) == 10
-    assert m.step == pytest.approx(2 * math.sqrt(3) / 64)
 
 
 def test_states_are_restored_and_what_does_not_fit_is_named() -> None:

@@ -141,17 +141,6 @@ def test_recovery_from_each_state(tmp_path: Path, state: Callable[[Path], None],
     assert artifact.recover(run, ["train"]) == []
 
 
-def test_nothing_to_recover(tmp_path: Path) -> None:
-    assert artifact.recover(tmp_path, ["train"]) == []
-    (tmp_path / "run").mkdir()
-    place = sealed(tmp_path / "run", 2)
-    assert artifact.recover(tmp_path / "run", ["train"]) == []
-    assert not (tmp_path / "run" / "train").exists()
-    assert artifact.finished(place, "train") is not None
-    (place.out / "a.txt").write_text("number 9")
-    assert artifact.finished(place, "train") is None
-
-
 def test_publishing_killed_before_every_step(tmp_path: Path) -> None:
     """Whatever stands after recovery is whole, is the old or the new, and the other is gone."""
     seen = set()

@@ -14,13 +14,11 @@ import filelock
 import pytest
 
 from pipeline import artifact, files
-from pipeline.decide import decide
 from pipeline.errors import BadInput, DiskFull, Interrupted, PipelineError, StageFailed
 from pipeline.locks.lock import HOLDER
 from pipeline.run import Run
 from pipeline.runner import run_stages, verify
-from tests.pipeline.kills import run_and_kill
-from tests.pipeline.toy import COUNT, STAGES, Events, actions, make_run, raising, replaced
+from tests.pipeline.toy import STAGES, Events, actions, make_run, raising, replaced
 
 
 @pytest.fixture
@@ -103,18 +101,6 @@ def test_an_error_behind_any_step_of_publishing_leaves_nothing_for_ever(run: Run
         if left[0] > 0:
             break
     assert moment > 15
-
-
-def test_work_on_what_is_up_to_date_goes(run: Run) -> None:
-    """Killed while it was forced, and not forced again."""
-    run_stages(run, STAGES)
-    for moment in itertools.count(1):
-        run_and_kill(lambda: run_stages(run, STAGES, only="count", force=True), moment)
-        if (run.path / artifact.WORK / "count").is_dir():
-            break
-    assert decide(COUNT, run).fresh
-    assert actions(run_stages(run, STAGES))["count"] == "skipped"
-    assert os.listdir(run.path / artifact.WORK) == []
 
 
 def test_an_interruption_of_forced_stages_says_how_to_go_on_with_them(run: Run) -> None:

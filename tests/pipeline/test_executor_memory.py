@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from pipeline.errors import UsageError
-from pipeline.executors.memory import KEPT_BACK, PRIVATE, Limit, available_now, limit_for, parse_size, size_text, usable_memory
+from pipeline.executors.memory import KEPT_BACK, Limit, available_now, limit_for, parse_size, size_text, usable_memory
 
 GIB = 2**30
 
@@ -87,12 +84,3 @@ def test_run_json_can_lower_the_limit_and_not_lift_it(tmp_path: Path) -> None:
     assert limit_for(None, 2 * GIB, here) == Limit(2 * GIB, "--memory as run.json has it")
     assert limit_for(None, 2**60, here) == found
     assert limit_for(64 * GIB, 2 * GIB, here) == Limit(64 * GIB, "--memory")
-
-
-def test_a_limit_on_addresses_counts_less_what_libraries_reserve() -> None:
-    code = "import resource; resource.setrlimit(resource.RLIMIT_DATA, (2**30, -1)); import pipeline.executors.memory as m; print(m.usable_memory())"
-    if sys.platform != "linux":
-        pytest.skip("RLIMIT_DATA counts what is mapped on Linux alone")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "RLIMIT_DATA" in done.stdout
-    assert str(2**30 - PRIVATE - len(os.sched_getaffinity(0)) * 8 * 2**20) in done.stdout

@@ -68,18 +68,6 @@ def test_only_what_is_older_than_two_seconds_is_remembered(tmp_path: Path, monke
     assert bool(hashes._entries) == (age > 2)
 
 
-def test_another_size_time_or_inode_is_read(tmp_path: Path, later: None) -> None:
-    path = old_file(tmp_path / "a", b"one")
-    hashes = Hashes()
-    hashes.digest("k", path)
-    other = old_file(tmp_path / "b", b"two")
-    os.replace(other, path)
-    assert hashes.digest("k", path) == hashlib.sha256(b"two").hexdigest()
-    with open(path, "r+b") as file:
-        file.write(b"six")
-    assert hashes.digest("k", path) == hashlib.sha256(b"six").hexdigest()
-
-
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "other", "files": {}}', '{"format": "enerf-hashes-1", "files": {"k": [1, 2, 3, "x"], "l": 5}}'])
 def test_a_damaged_memory_is_ignored(tmp_path: Path, text: str) -> None:
     cache = tmp_path / "h.json"

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -86,12 +85,6 @@ def test_the_first_signal_sets_the_flag_and_the_handlers_are_restored() -> None:
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before[0])
-
-
-def test_outside_of_the_main_thread_nothing_is_touched(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
-    with ThreadPoolExecutor(1) as pool:
-        assert len(pool.submit(run_stages, run, STAGES).result()) == 4
 
 
 def test_a_worker_that_was_forked_ends_as_usual() -> None:

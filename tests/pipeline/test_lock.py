@@ -50,17 +50,6 @@ def test_a_second_writer_is_told_the_holder_and_a_dead_one_blocks_nobody(tmp_pat
     assert not (run.path / ".lock.json").exists()
 
 
-def test_the_lock_may_be_nested(tmp_path: Path) -> None:
-    run = Run.create(tmp_path / "run")
-    with run.locked():
-        with run.locked():
-            run.update(preset="high")
-        assert run.holder() is not None
-        with pytest.raises(RunLocked), Run.open(run.path).locked():
-            pass
-    assert run.holder() is None
-
-
 @pytest.mark.parametrize("text", ["", "[]", '{"pid": -5, "host": "x"}', '{"pid": "x", "host": "", "since": 1, "command": ""}'])
 def test_a_damaged_note_of_the_holder_is_ignored(tmp_path: Path, text: str) -> None:
     run = Run.create(tmp_path / "run")

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline import files
-from pipeline.errors import BadInput, CorruptArtifact, DiskFull
+from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.run import Run
 
 
@@ -26,26 +25,6 @@ def test_there_and_back(tmp_path: Path) -> None:
     assert os.stat(made.path / "run.json").st_ino == before, "nothing has changed"
     with pytest.raises(TypeError, match="colour"):
         made.update(colour="red")
-
-
-def test_paths_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    run = Run.create(Path("run"), Path("photos"))
-    assert run.path == tmp_path / "run"
-    assert run.source == tmp_path / "photos"
-    assert run.how_to_resume(until="count") == f"run the stages until count of {tmp_path}/run"
-
-
-def test_messages_name_the_command_that_a_workflow_gives(tmp_path: Path) -> None:
-    def command(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False, **more: Any) -> str:
-        return f"make {run.name} {until} {only} {with_source}"
-
-    run = Run.create(tmp_path / "run", resume_text=command)
-    assert run.how_to_resume(until="bake") == "make run bake None False"
-    assert run.how_to_resume(only="bake", with_source=True) == "make run None bake True"
-    with pytest.raises(BadInput, match="make run None None False"):
-        Run.open(run.path, command).check_free()
-    assert Run.open(run.path) == run
 
 
 def test_an_empty_folder_will_do_and_so_will_what_a_kill_left(tmp_path: Path) -> None:
@@ -109,16 +88,3 @@ def test_what_another_changed_is_read_under_the_lock(tmp_path: Path) -> None:
     other.update(settings={"train": {"iterations": 9}})
     with run.locked():
         assert run.settings == {"train": {"iterations": 9}}
-
-
-def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = Run.create(tmp_path / "run", tmp_path)
-
-    def full(path: Path, data: bytes) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(files, "write_atomically", full)
-    with pytest.raises(DiskFull):
-        run.update(preset="high")
-    monkeypatch.undo()
-    assert Run.open(run.path) == run

@@ -17,7 +17,7 @@ from pipeline.run import Run
 from pipeline.runner import run_stages, verify
 from pipeline.sharing import take_over
 from tests.pipeline.kills import run_and_kill
-from tests.pipeline.toy import COUNT, DOUBLE, LIST, STAGES, actions, contents, make_run, make_source, set_one
+from tests.pipeline.toy import LIST, STAGES, actions, make_run, set_one
 
 
 @pytest.fixture
@@ -46,17 +46,6 @@ def test_the_same_request_is_the_same_artifact(donor: Run, other: Run) -> None:
     assert not (other.path / WORK / "list").exists()
 
 
-def test_what_has_another_request_is_not_taken(donor: Run, other: Run, tmp_path: Path) -> None:
-    assert not take_over(other, DOUBLE, donor.path), "nobody knows its request before count is there"
-    assert take_over(other, LIST, donor.path)
-    assert not take_over(other, COUNT, donor.path)
-    assert not take_over(other, LIST, donor.path), "it is fresh"
-    assert not other.folder("count").exists()
-    source = make_source(tmp_path / "more")
-    (source / "0.jpg").write_bytes(b"another")
-    assert not take_over(Run.create(tmp_path / "run", source, donor.settings), LIST, donor.path)
-
-
 @pytest.mark.parametrize("damage", [lambda path: path.write_bytes(b"y"), lambda path: path.write_bytes(b"longer"), Path.unlink])
 def test_a_damaged_artifact_is_not_taken(donor: Run, other: Run, damage: Callable[[Path], object], tmp_path: Path) -> None:
     damage(donor.folder("list") / "images" / "0.jpg")
@@ -77,28 +66,6 @@ def test_a_donor_that_leads_elsewhere_is_refused(donor: Run, other: Run, tmp_pat
     path.symlink_to(tmp_path / "secret")
     with pytest.raises(CorruptArtifact):
         take_over(other, LIST, donor.path)
-
-
-def test_where_there_are_no_hard_links_files_are_copied(donor: Run, other: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object, **__: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "link", refused)
-    assert take_over(other, LIST, donor.path)
-    assert not os.path.samefile(other.folder("list") / "list.txt", donor.folder("list") / "list.txt")
-    verify(other, STAGES)
-
-
-def test_one_run_changes_nothing_of_the_other(donor: Run, other: Run) -> None:
-    """New settings replace shared artifacts, or a run is removed."""
-    assert take_over(other, LIST, donor.path)
-    run_stages(other, STAGES)
-    before = contents(donor.path)
-    set_one(other, "list", upper=True)
-    run_stages(other, STAGES)
-    assert contents(donor.path) == before
-    verify(donor, STAGES)
-    verify(other, STAGES)
 
 
 def test_kills_at_every_moment_of_taking_over(donor: Run, other: Run) -> None:

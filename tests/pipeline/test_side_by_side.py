@@ -52,12 +52,6 @@ def test_they_run_at_the_same_time_and_the_artifacts_are_the_same(tmp_path: Path
     assert actions(done(run)) == dict.fromkeys(actions(outcomes), "skipped")
 
 
-def test_a_child_goes_on_with_the_next_stage(tmp_path: Path) -> None:
-    (tmp_path / "place").mkdir()
-    done(make_run(tmp_path / "run", place=tmp_path / "place"), 2)
-    assert len({(tmp_path / "place" / name).read_text().split()[0] for name in MIDDLE}) <= 2
-
-
 @pytest.mark.parametrize(
     ("does", "kind", "text"),
     [
@@ -88,15 +82,6 @@ def test_what_a_stage_raises_is_raised_and_the_others_are_kept(tmp_path: Path, d
     run.update(settings=settings)
     found = actions(done(run))
     assert (found["left"], found["right"], found["bottom"]) == ("skipped", "ran", "ran")
-
-
-def test_no_stage_begins_after_one_has_failed(tmp_path: Path) -> None:
-    (tmp_path / "place").mkdir()
-    run = make_run(tmp_path / "run", place=tmp_path / "place", meets={"centre": ("left",)}, does={"left": "bad input"})
-    with pytest.raises(BadInput):
-        done(run, 2)
-    assert run.folder("centre").exists(), "it had begun"
-    assert not (run.folder("right").exists() and run.folder("bottom").exists())
 
 
 def test_a_signal_stops_all_of_them_and_the_run_goes_on_later(tmp_path: Path) -> None:
@@ -141,15 +126,3 @@ def test_they_run_at_the_same_time_only_where_the_stages_before_took_long(tmp_pa
         run_stages(run, STAGES, beside=sides)
     ours = {(tmp_path / "place" / name).read_text().split()[0] == str(os.getpid()) for name in MIDDLE}
     assert ours == {least > 0}
-
-
-def test_a_single_stage_runs_in_this_process(tmp_path: Path) -> None:
-    (tmp_path / "place").mkdir()
-    run = make_run(tmp_path / "run", place=tmp_path / "place")
-    done(run)
-    done(run, start="bottom")
-    for name in MIDDLE:
-        (tmp_path / "place" / name).unlink()
-    run.update(settings={**run.settings, "left": {**run.settings["left"], "meets": []}, "right": {**run.settings["right"], "does": "ends, again"}})
-    assert [name for name, action in actions(done(run)).items() if action == "ran"] == ["right"], "it made the same as before"
-    assert (tmp_path / "place" / "right").read_text().split()[0] == str(os.getpid())

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.decide import decide
 from pipeline.errors import CorruptArtifact
-from pipeline.run import NAME, Run, named
+from pipeline.run import NAME, Run
 from pipeline.runner import run_stages
 from pipeline.stage import Job
 from tests.pipeline.toy import LIST, STAGES, make_run, make_source
@@ -22,12 +22,6 @@ def run(tmp_path: Path) -> Run:
     one = make_run(tmp_path / "a")
     one.update(also=(make_source(tmp_path / "b" / "photos"), make_source(tmp_path / "c")))
     return one
-
-
-def test_names_are_those_of_folders_kept_apart() -> None:
-    assert named([Path("/x/photos")]) == {"": Path("/x/photos")}
-    paths = [Path("/x/photos"), Path("/y/photos"), Path("/y/clip.mp4"), Path("/photos (2)")]
-    assert named(paths) == dict(zip(("photos", "photos (2)", "clip.mp4", "photos (2) (2)"), paths, strict=True))
 
 
 def test_sources_are_recorded(run: Run, tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ import pytest
 from msgspec import Meta
 
 from pipeline.errors import Interrupted, UnknownSetting, UsageError
-from pipeline.stage import Job, Stage, settings_dict, settings_from
-from tests.pipeline.toy import Events, NoSettings
+from pipeline.stage import Job, settings_dict, settings_from
+from tests.pipeline.toy import Events
 
 
 @dataclass(frozen=True)
@@ -73,21 +73,6 @@ def test_an_unknown_setting_names_the_nearest() -> None:
         settings_from(Settings, {"qqq": 5})
     with pytest.raises(UsageError, match="train"):
         settings_from(Settings, [1], where="train")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("name", ["", "..", "a/b", ".work", "A", "1st", "old-train"])
-def test_a_stage_name_is_a_folder_name(name: str) -> None:
-    with pytest.raises(ValueError, match="name"):
-        Stage(name, 1, NoSettings, (), lambda job: None)
-
-
-def test_a_job_made_by_hand(tmp_path: Path) -> None:
-    job = Job(settings=Settings(), inputs={}, out=tmp_path / "out", work=tmp_path / "work")
-    job.say("hello")
-    job.warn("careful", file="a")
-    job.progress(1, 2)
-    job.safe_point()
-    assert (job.out.is_dir(), job.work.is_dir(), job.device) == (True, True, "cpu")
 
 
 def test_progress_is_thinned_but_the_first_and_the_last_arrive(tmp_path: Path) -> None:

@@ -10,12 +10,10 @@ import pytest
 from PIL import Image
 
 from efficientnerf.backends import kernel_cache
-from pipeline.errors import UsageError
 from pipeline.executors.memory import parse_size
 from workflows.asset import WORKFLOW
 from workflows.budget import FEW_PIXELS_TRAIN_SHARE, MIN_BAKE, MIN_TRAIN, TRAIN_SHARE, share_budget
 from workflows.cli.request import Options, plan_run
-from workflows.fleet.manifest import read_manifest
 from workflows.fleet.program import WorkflowProgram
 
 
@@ -39,17 +37,6 @@ def test_both_parts_make_up_the_budget(share: float) -> None:
         if seconds >= 240:
             assert parts["train"] == pytest.approx(share * seconds)
         former = parts
-
-
-def test_options_become_settings_of_both_stages(source: Path, tmp_path: Path) -> None:
-    settings = plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny", budget="10m", target_mib=7)).run.settings
-    assert settings["train"]["time_budget"] + settings["bake"]["time_budget"] == pytest.approx(600)
-    assert settings["bake"]["max_mib"] == 7
-    unset = plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny")).run.settings
-    assert (unset["train"]["time_budget"], unset["bake"]["time_budget"], unset["bake"]["max_mib"]) == ("off", "off", "auto")
-    for nothing, named in ((Options(source=source, budget="0s"), "--budget 0s"), (Options(source=source, target_mib=0), "--target-mib 0")):
-        with pytest.raises(UsageError, match=named):
-            plan_run(tmp_path / "run", WORKFLOW, nothing)
 
 
 def test_the_share_follows_the_pixels_of_the_source(source: Path, tmp_path: Path) -> None:
@@ -83,37 +70,6 @@ def _photographs(folder: Path, number: int, size: tuple[int, int]) -> Path:
     for index in range(number):
         Image.new("L", size).save(folder / f"{index:02}.png")
     return folder
-
-
-def test_a_fleet_shares_a_budget_as_a_run_does(tmp_path: Path) -> None:
-    _photographs(tmp_path / "scene", 20, (1400, 700))
-    manifest = tmp_path / "scenes.toml"
-    found = []
-    for preset, sets, line in (("tiny", (), ""), ("high", (), ""), ("tiny", ("poses.max_image_size=1400",), "poses.max_image_size = 1400\n")):
-        manifest.write_text(f'[scenes.a]\nsource = "scene"\npreset = "{preset}"\nbudget = "10m"\n{line}')
-        (scene,) = read_manifest([str(manifest)], WORKFLOW, tmp_path / "fleet")
-        run = plan_run(tmp_path / "run", WORKFLOW, Options(source=tmp_path / "scene", preset=preset, budget="10m", sets=sets)).run
-        found.append(scene.settings["train"]["time_budget"] / 600)
-        assert scene.settings["train"]["time_budget"] == run.settings["train"]["time_budget"]
-    assert found == [FEW_PIXELS_TRAIN_SHARE, TRAIN_SHARE, TRAIN_SHARE], "tiny reads small photographs"
-    manifest.write_text('[scenes.a]\nsource = "scene"\nbudget = "10m"\nposes.max_image_size = "big"\n')
-    with pytest.raises(UsageError, match=r"poses\.max_image_size"):
-        read_manifest([str(manifest)], WORKFLOW, tmp_path / "fleet")
-
-
-def test_steps_that_a_budget_takes_the_place_of_are_told(source: Path, tmp_path: Path) -> None:
-    def told(*sets: str, budget: str | None = None, config: str = "") -> list[str]:
-        (tmp_path / "a.toml").write_text(config)
-        options = Options(source=source, preset="tiny", budget=budget, sets=sets, config=tmp_path / "a.toml")
-        return plan_run(tmp_path / "run", WORKFLOW, options).warnings
-
-    assert told(budget="10m") == told("train.iterations=5", "bake.refine_steps=9") == []  # the preset has steps of its own
-    both = told("train.iterations=5", budget="10m", config="[bake]\nrefine_steps = 0")
-    assert [text.split()[0] for text in both] == ["train.iterations", "bake.refine_steps"]
-    assert all("--budget" in text for text in both)
-    (one,) = told("train.iterations=5", "train.time_budget=40")
-    assert "train.time_budget=off" in one
-    assert told("train.iterations=5", "bake.time_budget=40") == []
 
 
 @pytest.mark.parametrize(("memory", "compiled", "expected"), [("700m", False, 1), ("700m", True, 0), ("150m", False, 2), ("150m", True, 1), ("2g", False, 0)])

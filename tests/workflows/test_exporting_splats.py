@@ -12,15 +12,11 @@ import pytest
 
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
-from efficientnerf.geometry.cameras import Similarity
-from pipeline.errors import CorruptArtifact
 from pipeline.run import Run
 from pipeline.stage import settings_dict
-from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs
+from stages.artifacts import BakeOutputs, SplatsOutputs
 from stages.formats.exporters import SPLAT_EXPORTERS
-from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import source_frame
-from stages.framing.true_frame import TrueFrame, save_frame
 from stages.splats.settings import SplatsSettings
 from tests.stages.formats.gaussians import read_spz, scattered
 from workflows import exporting_splats
@@ -65,16 +61,6 @@ def test_what_the_stage_has_made_is_written_as_it_made_it(run: Path) -> None:
     assert read_spz(run.parent / "a.spz")[0].count == 50
 
 
-def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(run: Path) -> None:
-    PosesOutputs.of_run(run).folder.mkdir()
-    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
-    save_frame(TrueFrame(Similarity(3.0, np.eye(3), np.zeros(3)), 0.01, ()), run)
-    export(run, "a.ply")
-    before, after = read_splats(SplatsOutputs.of_run(run).ply), read_splats(run.parent / "a.ply")
-    np.testing.assert_allclose(after.means, 3 * before.means, rtol=1e-5)
-    np.testing.assert_allclose(after.scales, 3 * before.scales, rtol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("change", "more"),
     [({"count": 78}, {}), ({"sh_degree": 1}, {}), ({"pictures": "asset"}, {}), ({}, {"region": "foreground"}),
@@ -83,10 +69,3 @@ def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(ru
 def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dict[str, Any]) -> None:
     with pytest.raises(pytest.fail.Exception, match="made again"):
         export(run, "a.ply", chosen=replace(MADE, **change), **more)
-
-
-def test_a_damaged_file_of_the_stage_is_named(run: Path) -> None:
-    SplatsOutputs.of_run(run).ply.write_bytes(b"ply\n")
-    with pytest.raises(CorruptArtifact, match=r"splats\.ply"):
-        export(run, "a.ply")
-    assert not (run.parent / "a.ply").exists()

@@ -12,12 +12,9 @@ import pytest
 
 from pipeline.executors.local import Usage
 from pipeline.executors.memory import Limit
-from stages.formats.importers import colmap
-from stages.poses.settings import PosesSettings
 from workflows.asset import WORKFLOW
 from workflows.cli.resolve import Settings, read_preset, table_of
 from workflows.precompilation import start
-from workflows.precompilation.scene import POINTS, VIEWS, write_scene
 
 
 def settings(*sets: str) -> dict[str, dict[str, Any]]:
@@ -40,25 +37,6 @@ def test_the_choices_of_the_run_are_compiled_at_the_sizes_of_a_small_one() -> No
         assert {name: small[stage.name][name] for name in numbers} == {name: tiny[stage.name][name] for name in numbers}
 
 
-def test_kernels_of_other_choices_are_other_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start.kernel_cache, "folder_of", lambda *_: tmp_path)
-
-    def stamp(*sets: str) -> Path:
-        return start.stamp_of(start.small_settings(settings(*sets)))
-
-    assert stamp("train.iterations=7", "bake.resolution=300", "poses.mask_from=green", "mesh.max_faces=20k") == stamp()
-    assert stamp("bake.layout=packed") != stamp()
-
-
-def test_the_made_scene_is_read_as_it_was_made(tmp_path: Path) -> None:
-    write_scene(tmp_path / "scene")
-    capture = colmap.FORMAT.read(tmp_path / "scene", PosesSettings())
-    assert len(capture.photos) == VIEWS
-    assert capture.points is not None
-    assert len(capture.points.xyz) == POINTS
-    assert capture.warnings == ()
-
-
 def test_nothing_is_started_where_it_is_not_worth_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[Any] = []
     monkeypatch.setattr(start, "start", lambda table: started.append(table))
@@ -78,16 +56,6 @@ def test_nothing_is_started_where_it_is_not_worth_it(tmp_path: Path, monkeypatch
     assert not ran("cpu", None, 1, 1)
     assert not ran("cuda", None, 2, 1)
     assert not ran("cpu", Limit(start.MEMORY - 1, "this machine"), 2, 1)
-
-
-def test_nothing_is_started_where_it_is_switched_off_or_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start.kernel_cache, "folder_of", lambda *_: tmp_path)
-    monkeypatch.setattr(start.subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
-    monkeypatch.setenv(start.SWITCH, "off")
-    assert start.start(settings()) is None
-    monkeypatch.delenv(start.SWITCH)
-    start.stamp_of(start.small_settings(settings())).touch()
-    assert start.start(settings()) is None
 
 
 @pytest.mark.skipif(not hasattr(os, "nice"), reason="priorities are POSIX's")

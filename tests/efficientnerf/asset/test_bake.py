@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from efficientnerf.asset import bake
-from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_of, visible_voxels, voxel_values
+from efficientnerf.asset.bake import Visibility, chosen_voxels, grid_of, visible_voxels, voxel_values
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.fields.bakeable import BakeableField
@@ -78,20 +77,6 @@ def test_visible_voxels_are_the_balls_skin() -> None:
     assert weight[away < 0.2].max() < 1e-3  # nobody sees the inside
 
 
-@pytest.mark.parametrize("resolution", [15, 4])
-def test_of_a_coarser_grid_what_was_seen_of_a_finer_one(resolution: int) -> None:
-    """Each coarse voxel has the greatest of the fine ones whose centres it holds, and about what it would have shown itself."""
-    bounds = np.array([[0.0, 0.0, 0.0], [2.0, 1.5, 1.0]])
-    (shape, voxel), (coarse_shape, coarse_voxel) = grid_of(bounds, 16, 4), grid_of(bounds, resolution, 4)
-    fine = np.random.default_rng(3).random([4 * n for n in shape]).astype(np.float32) ** 8
-    made = dense(bake.coarsened(sparse(fine, 4), shape, voxel, coarse_shape, coarse_voxel, 4, 0.01), coarse_shape, 4)
-    expected = np.zeros_like(made)
-    for at in np.argwhere(fine > 0.01):
-        to = tuple(np.floor((at + 0.5) * voxel / coarse_voxel).astype(int))
-        expected[to] = max(expected[to], fine[tuple(at)])
-    np.testing.assert_array_equal(made, expected)
-
-
 def test_masked_pixels_are_not_looked_at_and_progress_ends_at_its_total() -> None:
     some = pixels(8, 24)
     some.usable = np.packbits(np.arange(len(some)) < 7)
@@ -140,22 +125,6 @@ def test_values_are_means_over_the_voxel() -> None:
     np.testing.assert_allclose(sh[0], expected, atol=0.01)
     # Where half of a voxel is empty, its colour is that of the other half.
     assert sh[2, 0, 0] < BOUNDS[0][0] + 11.5 / 8 + 0.01
-
-
-@pytest.mark.parametrize("first", [0, 2])
-def test_blocks_do_not_depend_on_where_one_begins(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
-    monkeypatch.setattr(bake, "POINTS_PER_BLOCK", 40)
-    m = model_of_a_ball()
-    indices = np.argwhere(np.ones((3, 3, 3), bool)).astype(np.int32)
-    assert blocks_of(27, 4) == 3
-    whole = list(voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 7))
-    assert [len(density) for density, _ in whole] == [10, 10, 7]
-    rest = list(voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 7, first=first))
-    for (a, b), (c, d) in zip(whole[first:], rest, strict=True):
-        assert np.array_equal(a, c)
-        assert np.array_equal(b, d)
-    other = next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 8)))
-    assert not np.array_equal(other[1], next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 7)))[1])
 
 
 def test_nothing_is_baked_that_the_coarse_field_hides() -> None:

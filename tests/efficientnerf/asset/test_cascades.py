@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from efficientnerf.asset.cascades import (
     brick_ranges,
@@ -15,17 +14,11 @@ from efficientnerf.asset.cascades import (
     cascades_of,
     check_cascades,
     nested,
-    subset,
     voxel_cascades,
     voxel_coordinates,
     voxel_sides,
 )
-from efficientnerf.asset.rendering import render_reference
-from tests.efficientnerf.trees import random_cascades, rays_at, uniform_tree
-
-
-def rendered(tree, origins, directions):  # type: ignore[no-untyped-def]
-    return [part.numpy() for part in render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))]
+from tests.efficientnerf.trees import random_cascades, uniform_tree
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -56,16 +49,6 @@ def test_cascades_come_apart_again() -> None:
     np.testing.assert_array_equal(again.voxel_index, tree.voxel_index)
     for one, other in zip(again.outer, tree.outer, strict=True):
         np.testing.assert_array_equal(one.brick_index, other.brick_index)
-
-
-def test_a_subset_renders_as_the_tree_with_the_others_emptied() -> None:
-    tree = random_cascades(4)
-    keep = np.random.default_rng(0).random(len(tree.density_values)) < 0.4
-    origins, directions = rays_at(tree, 40)
-    some = rendered(subset(tree, keep), origins, directions)[1]
-    emptied = rendered(replace(tree, density_values=np.where(keep, tree.density_values, 0).astype(np.float32)), origins, directions)[1]
-    np.testing.assert_allclose(some, emptied, atol=1e-6)
-    assert some.max() > 0.05
 
 
 @pytest.mark.parametrize("wrong", ["voxel", "shifted", "smaller"])

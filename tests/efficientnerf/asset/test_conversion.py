@@ -41,18 +41,6 @@ def test_fewer_harmonics_are_the_first_ones() -> None:
         with_degree(tree, 4)
 
 
-@pytest.mark.parametrize("resolution", [16, 5, 1])
-def test_an_even_block_stays_what_it_is_in_any_resolution(resolution: int) -> None:
-    tree = uniform_tree(sigma=3.0)
-    fewer = with_resolution(tree, resolution)
-    assert fewer.voxel == pytest.approx(tree.voxel * 16 / resolution)
-    at = voxel_coordinates(fewer)
-    assert ((at >= 0) & (at < resolution)).all()
-    assert len(at) == resolution**3
-    np.testing.assert_allclose(fewer.density_values, 3.0, rtol=1e-5)
-    np.testing.assert_allclose(fewer.sh, tree.sh[0, 0, 0], rtol=1e-5)
-
-
 def test_a_thin_wall_lets_as_much_light_through() -> None:
     """Every second column of an opaque sheet missing: half of the light passes, which no average of densities would tell."""
     at = np.argwhere(np.ones((8, 8, 8), bool))
@@ -107,24 +95,3 @@ def test_cascades_get_larger_voxels_in_smaller_bricks_and_keep_their_boxes() -> 
         assert np.array_equal(fewer.environment, tree.environment)  # type: ignore[arg-type]
     for name, found in zip(("colour", "opacity"), reference_images(with_resolution(tree, 16), tree), strict=True):
         np.testing.assert_allclose(found, dict(zip(("colour", "opacity"), reference_images(tree, tree), strict=True))[name], atol=1e-5)
-
-
-def test_the_bricks_of_a_region_follow_their_place() -> None:
-    """Of one grid in larger voxels: a point of a brick of the region is in one still."""
-    plain = random_tree(3, shape=(4, 3, 5), brick=2, share=0.6)
-    tree = replace(plain, region=Region(np.stack([plain.bounds_min, plain.bounds_max]), bricks=np.arange(len(plain.voxel_index)) % 3 == 0))
-    assert tree.region is not None
-    for resolution in (10, 7, 5, 3):
-        fewer = with_resolution(tree, resolution)
-        assert fewer.region.bricks is not None
-        assert len(fewer.region.bricks) == len(fewer.voxel_index)
-        # A voxel's centre, and the brick of the new tree that holds it.
-        at = voxel_coordinates(tree)
-        owner = np.zeros(len(at), np.int64)
-        for brick, row in enumerate(tree.voxel_index):
-            owner[row[row >= 0]] = brick
-        cell = np.floor((at + 0.5) * tree.voxel / (fewer.voxel * fewer.brick)).astype(int)
-        new = fewer.brick_index[tuple(cell.T)]
-        assert (new >= 0).all()
-        assert fewer.region.bricks[new[tree.region.bricks[owner]]].all()  # type: ignore[index]
-    assert with_resolution(replace(tree, region=Region(np.zeros((2, 3)))), 3).region is not None

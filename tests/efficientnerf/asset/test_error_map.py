@@ -8,7 +8,7 @@ import pytest
 from efficientnerf.asset.refinement import error_map
 from efficientnerf.asset.refinement.error_map import MOST, ErrorMap, count_cells
 from efficientnerf.training.patches import PatchGrid
-from tests.efficientnerf.small_views import SIZES, views
+from tests.efficientnerf.small_views import views
 
 
 def chances(drawn_by: ErrorMap) -> np.ndarray:
@@ -70,33 +70,3 @@ def test_recorded_errors_are_running_means_of_which_the_greatest_counts() -> Non
     np.testing.assert_array_equal(made.errors[0], made.errors[1])
     assert (made.errors[0] >= 0).sum() == len(set(drawn.patches.tile))
     assert chances(made).max() > 1.3 / len(grid)
-
-
-def test_a_map_goes_on_where_another_one_stopped() -> None:
-    grid = PatchGrid(views(), 2)
-    rng = np.random.default_rng(3)
-    whole = ErrorMap(grid)
-    for step in range(20):
-        if step == 12:
-            whole.set_chances()
-        drawn = whole.draw(50, np.random.default_rng(step))
-        whole.record(drawn, rng.random(len(drawn.patches.pixels)))
-    resumed = ErrorMap(grid, None, whole.errors.copy())
-    np.testing.assert_array_equal(resumed.cumulative, whole.cumulative)
-    assert not np.array_equal(whole.errors[0], whole.errors[1])
-
-
-def test_no_more_patches_are_drawn_than_are_asked_for() -> None:
-    masks = [np.zeros((h, w), bool) for w, h in SIZES]
-    masks[1][5, 3] = True
-    grid = PatchGrid(views(masks), 2)
-    assert grid.usable_tiles is not None
-    usable = np.flatnonzero(grid.usable_tiles)
-    for met in (None, np.ones(len(grid), bool), ~grid.usable_tiles):  # the last: no ray of a usable pixel meets anything
-        made = ErrorMap(grid, met)
-        assert np.flatnonzero(chances(made)).tolist() == usable.tolist()
-        drawn = made.draw(1000, np.random.default_rng(0)).patches
-        assert 900 < len(drawn.pixels) < 1100
-        assert set(drawn.pixels) == {35 + 5 * 4 + 3}
-    one = np.arange(len(grid)) == usable[1]
-    assert np.flatnonzero(chances(ErrorMap(grid, one))).tolist() == [usable[1]]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.bake import chosen_voxels, spread_pixels, voxel_values
-from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, point_cascades, voxel_cascades, voxel_coordinates, voxels_around
+from efficientnerf.asset.cascades import cascade_grids, nested, voxel_coordinates
 from efficientnerf.asset.components import unsupported_components
 from efficientnerf.asset.field_samples import (
     FieldSamples,
@@ -18,7 +18,6 @@ from efficientnerf.asset.field_samples import (
     field_samples,
     seen_weights,
     surface_points,
-    weight_by_box,
 )
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -26,7 +25,6 @@ from efficientnerf.model import Model
 from efficientnerf.rendering import environment
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.surroundings import GROUND, RADIUS, WALL, around, photographs, surroundings
-from tests.efficientnerf.trees import random_cascades
 
 BOX = np.array([[-0.8] * 3, [0.8] * 3])
 BRICK = 4
@@ -114,16 +112,6 @@ def baked(made: Made, count: int = 4, voxel: float = 0.05) -> NerfTree:
     return nested(trees, environment_beyond(samples, boxes(count, voxel), 16, np.full(3, 0.5)))
 
 
-def test_a_sample_counts_in_the_first_box_that_holds_its_middle(made: Made) -> None:
-    samples, some = made[2], boxes(3)
-    ray = np.repeat(np.arange(len(samples.pixel)), np.diff(samples.first))
-    points = samples.points(np.arange(len(samples.start)), ray)
-    inside = np.stack([((points >= low) & (points < high)).all(axis=1) for low, high in some] + [np.ones(len(points), bool)])
-    wanted = np.bincount(inside.argmax(axis=0), weights=samples.weight, minlength=len(some) + 1)
-    assert (wanted > 0).all()
-    np.testing.assert_allclose(weight_by_box(samples, some), wanted, rtol=1e-6)
-
-
 def test_the_tree_shows_the_whole_scene_without_a_crack_at_its_borders(made: Made) -> None:
     """Every ray that the field is opaque on ends, those that end at borders between boxes too, and colours are the field's."""
     _, pixels, samples = made
@@ -144,29 +132,6 @@ def test_the_tree_shows_the_whole_scene_without_a_crack_at_its_borders(made: Mad
     assert (alone.opacity[opaque] < 0.5).mean() > 0.2  # as before, without what lies around
 
 
-def test_densities_are_as_rays_saw_them() -> None:
-    seen = np.array([[0.5, 0.9], [0.0, 0.1], [0.0, 0.0], [1.0, 1.0], [0.2, 0.4]], np.float32)
-    found = density_as_seen(np.array([0.0, 50.0, 3.0, 900.0, 2.0], np.float32), seen, 0.1)
-    absorbed = 1 - np.exp(-found * 0.1)
-    assert absorbed[0] == pytest.approx(0.35, abs=1e-5)  # hidden by the coarse stage
-    assert absorbed[1] == pytest.approx(0.3, abs=1e-5)  # fog that rays do not see
-    assert absorbed[2] == 0
-    assert found[3] == 900
-    assert found[4] == 2
-
-
-def test_what_lies_beyond_is_the_sky(made: Made) -> None:
-    _, _, samples = made
-    found = environment_beyond(samples, boxes(5), 16, np.full(3, 0.5))
-    assert found.shape == (16, 32, 3)
-    assert found.dtype == np.float32
-    sky = samples.behind[0].astype(np.float64)
-    np.testing.assert_allclose(found[:5], np.broadcast_to(sky, (5, 32, 3)), atol=0.02)  # what nobody sees has the colour of what is known
-    # With the wall beyond the last box it is in the map.
-    near = environment_beyond(samples, boxes(1), 16, np.full(3, 0.5))
-    assert np.abs(near[7] - sky).max() > 0.2
-
-
 def test_a_map_keeps_what_is_known_and_spreads_it() -> None:
     weight = np.zeros((8, 16))
     weight[3, 0] = weight[5, 8] = 1e4
@@ -177,22 +142,6 @@ def test_a_map_keeps_what_is_known_and_spreads_it() -> None:
     assert ((found >= 0.2 - 1e-6) & (found <= 1)).all()
     assert found[3, 15, 0] > 0.8  # columns wrap
     assert found[3, 1, 0] == pytest.approx(found[3, 15, 0], abs=1e-5)
-
-
-def test_voxels_around_points_are_those_that_they_are_interpolated_from() -> None:
-    tree = random_cascades(3)
-    rng = np.random.default_rng(0)
-    outer = tree.outer[-1].bounds(tree.brick)
-    points = rng.uniform(outer[0], outer[1], (300, 3))
-    around_them = voxels_around(tree, points)
-    coordinates = voxel_coordinates(tree)
-    which, of = point_cascades(tree, points), voxel_cascades(tree)
-    assert (around_them >= 0).any()
-    for point, n, found in zip(points, which, around_them, strict=True):
-        cascade = cascades_of(tree)[n]
-        local = (point - cascade.bounds_min) / cascade.voxel
-        wanted = np.flatnonzero((of == n) & (np.abs(coordinates + 0.5 - local) < 1).all(axis=1))
-        np.testing.assert_array_equal(np.sort(found[found >= 0]), wanted)
 
 
 def test_small_parts_go_unless_three_photographs_show_them(made: Made) -> None:

@@ -16,7 +16,7 @@ from efficientnerf.asset.file.container import Header
 from efficientnerf.asset.file.streams import Family
 from efficientnerf.asset.format import contents, describe, load, save, serialize
 from efficientnerf.asset.quantisation import compacted
-from efficientnerf.backends.numba.entropy import rans, walks
+from efficientnerf.backends.numba.entropy import rans
 from efficientnerf.backends.numba.runtime import numba
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.trees import TREES, random_cascades, random_tree
@@ -117,25 +117,6 @@ def test_frequencies_have_the_sum_of_a_table_and_leave_out_nothing(counts: list[
     assert found.sum() == rans.SLOTS
     assert ((found > 0) >= (padded > 0)).all()
     assert (found[1:] > 0).sum() == (padded[1:] > 0).sum()
-
-
-@pytest.mark.parametrize("each", [1, 7, 1000])
-def test_neighbours_are_those_one_step_back(each: int) -> None:
-    """By a dense grid: across bricks, but not across slices or the edge of the grid."""
-    from efficientnerf.asset.cascades import voxel_coordinates
-    from efficientnerf.asset.file.packed import _bricks_before, padded
-
-    tree = random_tree(2, brick=3)
-    stored = tree.voxel_index >= 0
-    before = _bricks_before([padded(tree.brick_index >= 0)], len(stored), each)
-    found = np.full((len(tree.density_values), 3), -7, np.int32)
-    walks.find_neighbours(tree.voxel_index, before, tree.brick, found, 0, len(stored))
-    brick = np.zeros(len(tree.density_values), int)
-    brick[tree.voxel_index[stored]] = np.nonzero(stored)[0]
-    number = {(brick[n] // each, *at): n for n, at in enumerate(voxel_coordinates(tree).tolist())}
-    for n, at in enumerate(voxel_coordinates(tree).tolist()):
-        steps = [(brick[n] // each, *(a - (axis == i) for i, a in enumerate(at))) for axis in range(3)]
-        assert found[n].tolist() == [number.get(step, -1) for step in steps]
 
 
 @pytest.mark.parametrize(("most", "wide"), [(1, False), (9, True), (40, False)])

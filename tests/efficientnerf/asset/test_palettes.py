@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.queries import colour_at
-from efficientnerf.asset.rendering import render_rays
-from tests.efficientnerf.trees import random_tree, rays_at
 
 
 def random_palette(count: int, groups: tuple[int, ...], *, entries: int = 7, seed: int = 0) -> PaletteHarmonics:
@@ -36,16 +31,3 @@ def test_each_coefficient_is_its_entry(groups: tuple[int, ...], entries: int) ->
     some = np.array([4, 0, 9])
     assert np.array_equal(codes.decoded(some), decoded[some])
     assert np.array_equal(codes.subset(some).decoded(), decoded[some])
-
-
-def test_a_tree_of_codes_is_asked_like_one_of_floats() -> None:
-    plain = random_tree(1, degree=2)
-    coded = replace(plain, harmonics=random_palette(len(plain.density_values), (1,) * 8))
-    assert (coded.degree, coded.harmonics_count) == (2, 9)
-    twin = replace(plain, harmonics=coded.sh)
-    assert np.array_equal(coded.sh, twin.sh)
-    origins, directions = rays_at(plain)
-    for name in ("colour", "opacity", "depth", "normal"):
-        np.testing.assert_allclose(getattr(render_rays(coded, origins, directions), name), getattr(render_rays(twin, origins, directions), name), atol=1e-5)
-    assert np.allclose(colour_at(coded, origins + directions), colour_at(twin, origins + directions), atol=1e-5)
-    assert coded.with_metadata(a=1).harmonics is coded.harmonics

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import format
-from efficientnerf.asset.format import WRITERS, describe, load, save, serialize
+from efficientnerf.asset.format import WRITERS, describe, load, save
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.quantisation import compacted, quantised_density
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -59,34 +58,7 @@ def test_the_nearest_is_the_nearest(count: int, size: int, entries: int) -> None
     np.testing.assert_allclose(approached, np.minimum(squared[:, 0], 1), rtol=1e-5, atol=1e-6)
 
 
-def test_codes_repeat_whatever_the_threads() -> None:
-    import numba
-
-    tree = smooth_tree()
-    first = serialize(tree, "small")
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        assert serialize(tree, "small") == first
-    finally:
-        numba.set_num_threads(before)
-
-
 # Values
-
-
-def test_densities_are_rounded_by_a_few_percent() -> None:
-    voxel = 0.01
-    density = np.concatenate([[0], np.geomspace(1e-6, 1e5, 5000)]).astype(np.float32)
-    rounded = quantised_density(density, voxel)
-    assert len(np.unique(rounded)) <= 256
-    depth = density.astype(np.float64) * voxel
-    middle = (depth > 1e-3) & (depth < 50)
-    np.testing.assert_allclose(rounded[middle], density[middle], rtol=0.022)
-    assert (rounded[depth < 5e-4] == 0).all()
-    assert np.allclose(rounded[depth > 50] * voxel, 50)
-    assert np.array_equal(quantised_density(rounded, voxel), rounded)
-    assert not quantised_density(np.linspace(0, 1e-5, 1000, dtype=np.float32), voxel).any()
 
 
 # Layouts
@@ -116,21 +88,6 @@ def test_a_compact_file_is_small_and_stays_small_in_memory(tmp_path: Path) -> No
     held = load(tmp_path / "a.nerftree").harmonics
     assert isinstance(held, PaletteHarmonics)
     assert held.base.nbytes + held.codes.nbytes == 11 * len(tree.density_values)
-
-
-def test_codes_are_written_as_they_are(tmp_path: Path) -> None:
-    """A tree of codes keeps them by default, whatever its groups; asked for another layout it is coded anew, from what its codes stand for."""
-    tree = compacted(random_tree(3, degree=2, shape=(6, 5, 4)), 300, (3, 5))
-    save(tree, tmp_path / "a.nerftree")
-    again = load(tmp_path / "a.nerftree")
-    assert again.harmonics.groups == (3, 5)  # type: ignore[union-attr]
-    assert np.array_equal(again.sh, tree.sh)
-    assert np.array_equal(again.density_values, tree.density_values)
-    assert describe(tmp_path / "a.nerftree")["sh_groups"] == [3, 5]
-    save(again, tmp_path / "b.nerftree", "compact")
-    assert describe(tmp_path / "b.nerftree")["sh_groups"] == [1] * 8
-    save(again, tmp_path / "c.nerftree", "sparse")
-    assert np.array_equal(load(tmp_path / "c.nerftree").sh, tree.sh.astype(np.float16))
 
 
 def test_full_bricks_hold_what_was_stored_and_zero_density_beside_it(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascade_tree, cascades_of, check_cascades, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.cascades import check_cascades, voxel_cascades
 from efficientnerf.asset.region import cropped, foreground, inside_distance, inside_share, voxel_centres
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Similarity
@@ -27,16 +27,6 @@ def listed(tree: NerfTree) -> dict[tuple[float, ...], tuple[float, bytes]]:
     """Density and harmonics of each voxel by place and cascade."""
     places = np.column_stack([voxel_cascades(tree) if tree.outer else np.zeros(len(tree.density_values)), np.round(voxel_centres(tree), 6)])
     return {tuple(place): (float(sigma), row.tobytes()) for place, sigma, row in zip(places, tree.density_values, tree.sh, strict=True)}
-
-
-@pytest.mark.parametrize("tree", CASES)
-def test_centres_of_voxels_are_those_of_each_cascade(tree: NerfTree) -> None:
-    places = voxel_centres(tree)
-    for number, cascade in enumerate(cascades_of(tree)):
-        mine = voxel_cascades(tree) == number
-        assert places[mine] == pytest.approx(cascade.bounds_min + (voxel_coordinates(tree)[mine] + 0.5) * cascade.voxel)
-        alone = cascade_tree(tree, number)
-        assert np.sort(voxel_centres(alone), axis=0) == pytest.approx(np.sort(places[mine], axis=0))
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.1, 9.0])
@@ -69,13 +59,6 @@ def test_inside_nothing_changes_and_outside_is_nothing(tree: NerfTree, radius: f
         assert opacities[0] == pytest.approx(opacities[1] * share[place], rel=1e-4)
         if share[place] == 1:
             assert sigma == before[place][0]
-
-
-@pytest.mark.parametrize("tree", CASES)
-def test_doing_it_again_does_nothing(tree: NerfTree) -> None:
-    once = foreground(replace(tree, region=middle(tree, fade=0.1)))
-    assert foreground(once) is once
-    assert foreground(tree) is tree  # without a region all is foreground
 
 
 def test_outer_cascades_that_are_empty_are_dropped_and_the_others_stay() -> None:

@@ -43,16 +43,3 @@ def test_every_patch_with_a_ray_that_meets_the_tree_is_of_a_tile_that_does() -> 
         assert met[drawn.tile[any_hit]].all()
         hits += int(any_hit.sum())
     assert hits > 80
-
-
-def test_rays_along_the_axes_and_past_the_box() -> None:
-    from efficientnerf.backends.numba.tree_training.hits import come_near
-
-    leap = np.full((5, 5, 5), 9, np.uint8)
-    cells = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), axis=-1)
-    leap[:] = np.abs(cells - 2).max(axis=-1)  # the middle one alone is occupied
-    origins = np.array([[-3, 2.5, 2.5], [-3, 0.5, 2.5], [2.5, 2.5, 2.5], [9, 9, 9.0], [9, 9, 9.0], [2.5, 2.5, -1]])
-    directions = np.array([[1, 0, 0], [1, 0, 0], [0, 1, 0], [-1, -1, -1], [1, 1, 1], [0, 0, 1.0]])
-    found = np.empty(len(origins), bool)
-    come_near(origins, directions / np.linalg.norm(directions, axis=1, keepdims=True), leap, found)
-    np.testing.assert_array_equal(found, [True, False, True, True, False, True])

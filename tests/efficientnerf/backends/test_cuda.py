@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from efficientnerf.backends.torch.hash_grid import HashLevels, encode
+from efficientnerf.backends.torch.hash_grid import HashLevels
 from tests.efficientnerf.device import DEVICE
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.hash_grid")
@@ -29,14 +29,6 @@ def encoded(encode: object, x: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
     (out * grad).sum().backward()
     assert table.grad is not None
     return out.detach(), table.grad
-
-
-def test_more_points_than_a_programs() -> None:
-    x = points(1500)
-    grad = torch.randn(1500, 8, generator=torch.Generator().manual_seed(2)).to(DEVICE)
-    grad[750:] = 0  # as behind an opaque surface
-    for ours, theirs in zip(encoded(cuda.encode, x, grad), encoded(encode, x, grad), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
 def test_an_encoding_of_no_points() -> None:

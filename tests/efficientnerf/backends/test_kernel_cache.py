@@ -208,17 +208,6 @@ def damaged(content: bytes) -> dict[str, bytes]:
     return {"empty": b"", "cut": content[:middle], "zeros": bytes(len(content)), "garbage": b"\x80\x05K\x01.", "flipped": flipped}
 
 
-def test_an_empty_kernel_index_is_removed_and_compiled_again(package: Path, tmp_path: Path) -> None:
-    """As a power cut leaves it; numba alone would end with EOFError."""
-    cache = tmp_path / "cache"
-    folder = Path(run(package, ENERF_CACHE_DIR=str(cache))["folder"])
-    for path in folder.rglob("*.nbi"):
-        path.write_bytes(b"")
-    again = run(package, ENERF_CACHE_DIR=str(cache))
-    assert (again["result"], again["functions"]) == (16, 2)
-    assert "removed, and compiled again" in again["stderr"]
-
-
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -> None:
     from efficientnerf.backends.numba.runtime import KernelFiles
@@ -326,23 +315,6 @@ def test_who_needs_a_form_that_another_process_compiles_waits_for_it(tmp_path: P
             assert found == (["code"] if end == "saves" else None)
             second.kill()
         first.kill()
-
-
-def test_the_lock_of_a_form_that_cannot_be_compiled_is_given_back(package: Path, tmp_path: Path) -> None:
-    program = """
-import json
-from efficientnerf.backends import kernel_cache
-from efficientnerf.backends.numba import runtime
-from efficientnerf.backends.numba.inner import inner
-try:
-    inner("text")
-except Exception as error:
-    refused = type(error).__name__
-held = (len(runtime._locks._held), len(runtime._compilations._forms))
-print(json.dumps({"refused": refused, "held": held, "result": inner(3), "after": (len(runtime._locks._held), len(runtime._compilations._forms))}))
-"""
-    found = run(package, program, ENERF_CACHE_DIR=str(tmp_path / "cache"))
-    assert (found["refused"], found["held"], found["result"], found["after"]) == ("TypingError", [0, 0], 4, [0, 0])
 
 
 def test_a_disk_that_takes_no_kernels_is_no_error(package: Path, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import torch
 from torch import nn
 
 from efficientnerf.backends.numba import adam as cpu_adam
-from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.training.optimiser import BETA1, Adam, ParameterGroup
 from efficientnerf.training.pixels import Pixels
@@ -39,35 +38,6 @@ def test_adam_is_torchs() -> None:
         optimiser.param_groups[0]["lr"] = rate
         optimiser.step()
     torch.testing.assert_close(stepped(gradients()), theirs, rtol=2e-5, atol=1e-6)
-
-
-def test_table_entries_without_a_gradient_are_left_alone() -> None:
-    grads = gradients()
-    for grad in grads[1:]:
-        grad[10:20] = 0
-    sparse, dense = stepped(grads, sparse=True).detach(), stepped(grads).detach()
-    once = stepped([grads[0], *[torch.zeros(50, 2)] * 3], sparse=True).detach()
-    assert torch.equal(sparse[10:20], once[10:20])
-    assert (dense[10:20] != once[10:20]).all()
-    assert torch.equal(sparse[20:], dense[20:])
-
-
-def test_a_gradient_buffer_is_read_cleared_and_used_again() -> None:
-    p, buffer = nn.Parameter(torch.ones(50, 2)), GradientBuffer()
-    adam, grads = Adam([ParameterGroup({"p": p}, sparse=True, buffers={"p": buffer})]), gradients()
-    accumulators = set()
-    for number, (grad, rate) in enumerate(zip(grads, RATES, strict=True), 1):
-        for _ in range(2):  # two backward passes
-            accumulators.add(id(buffer.accumulator(p)))
-            buffer.accumulator(p).add_(grad / 2)
-        adam.step(number, rate)
-        assert not buffer.filled
-        assert not buffer.values.any()
-    assert len(accumulators) == 1
-    assert p.grad is None
-    assert torch.equal(p, stepped(grads, sparse=True))
-    adam.step(5, 0.1)  # nothing was added
-    assert torch.equal(p, stepped(grads, sparse=True))
 
 
 @pytest.mark.parametrize("size", [15, 8192 + 16])
@@ -102,40 +72,6 @@ def camera(n: int, model: str, params: tuple[float, ...], width: int = 9, height
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation(n), (n, -n, 0.5)
     return Camera(f"v{n}", width, height, model, params, pose)
-
-
-def test_bundles_hold_the_rays_of_their_cameras() -> None:
-    cameras = [
-        camera(0, "OPENCV", (8.0, 8.5, 4.4, 3.6, 0.05, -0.01, 0.002, 0.001)),
-        camera(1, "SIMPLE_PINHOLE", (9.0, 5.0, 4.0), 10, 8),
-        camera(2, "OPENCV", (8.0, 8.5, 4.4, 3.6, 0.05, -0.01, 0.002, 0.001)),  # shares the first one's lens
-    ]
-    rng = np.random.default_rng(0)
-    images = [rng.integers(0, 256, (c.height, c.width, 3), dtype=np.uint8) for c in cameras]
-    near, far = np.array([0.1, 0.2, 0.3]), np.array([4.0, 5.0, 6.0])
-    pixels = Pixels(cameras, images, [None, None, None], near, far)
-    assert len(pixels.lookup) == 9 * 7 + 10 * 8
-    order = rng.permutation(len(pixels))
-    origins, directions, enter, leave, colour = pixels.bundle(order)
-    expected = [rays(c) for c in cameras]
-    slant = np.concatenate([d @ c.forward for c, (_, d) in zip(cameras, expected, strict=True)])
-    view = np.repeat(np.arange(3), [63, 80, 63])
-    np.testing.assert_allclose(origins, np.concatenate([o for o, _ in expected])[order], atol=1e-6)
-    np.testing.assert_allclose(directions, np.concatenate([d for _, d in expected])[order], atol=1e-6)
-    np.testing.assert_allclose(enter, (near[view] / slant)[order], rtol=1e-5)
-    np.testing.assert_allclose(leave, (far[view] / slant)[order], rtol=1e-5)
-    np.testing.assert_allclose(colour, np.concatenate([i.reshape(-1, 3) for i in images])[order] / 255, rtol=1e-6)
-
-
-def test_masks_leave_pixels_out() -> None:
-    cameras = [camera(n, "SIMPLE_PINHOLE", (9.0, 4.5, 3.5)) for n in range(2)]
-    images = [np.zeros((7, 9, 3), np.uint8)] * 2
-    mask = np.zeros((7, 9), bool)
-    mask[3, 4] = True
-    pixels = Pixels(cameras, images, [mask, None], np.ones(2), np.full(2, 2.0))
-    chosen = pixels.choose(5000, np.random.default_rng(0))
-    assert len(chosen) == 5000
-    assert set(chosen.tolist()) == {3 * 9 + 4, *range(63, 126)}
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])

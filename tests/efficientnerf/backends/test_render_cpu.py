@@ -15,7 +15,6 @@ from efficientnerf.backends.numba.tree.rendering import ray_statistics
 from efficientnerf.geometry.cameras import Camera, rays, resized
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import in_codes, random_tree, rays_at, uniform_tree
-from tests.efficientnerf.walls import camera_at, wall
 
 FIELDS = ("colour", "opacity", "depth", "normal")
 LENSES = {
@@ -47,46 +46,6 @@ def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], en
     assert outputs.opacity.max() > 0.5
 
 
-@pytest.mark.parametrize("brick", [1, 5])
-def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
-    tree = in_codes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
-    origins, directions = rays_at(tree, 300)
-    colour, _ = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    np.testing.assert_allclose(render_rays(tree, origins, directions).colour, colour, atol=1e-3)
-
-
-@pytest.mark.parametrize("brick", [2, 4])
-def test_rows_of_two_numbers_render_like_those_of_one(brick: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    tree = random_tree(brick, shape=(5, 4, 6), brick=brick, degree=2, share=0.6, sigma=100.0)
-    camera = camera_of(tree)
-    narrow = render(tree, camera)
-    monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_BITS", 0)
-    other = replace(tree)
-    wide = render(other, camera)
-    assert packed_of(other).rows.shape[1] == 2 * packed_of(tree).rows.shape[1]
-    assert wide.opacity.max() > 0.5
-    for name in FIELDS:
-        assert np.array_equal(getattr(wide, name), getattr(narrow, name)), name
-
-
-def test_bands_of_an_ndc_image_share_the_colours_of_the_view(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are summed once for a view, and again for another; `rays_per_band` changes nothing."""
-    from efficientnerf.backends.numba.tree import rendering
-
-    tree, camera, calls, whole = wall(voxels=24), camera_at(0.1, 0.0, 0.0), [], rendering.compute_view_colours
-    monkeypatch.setattr(rendering, "VOXELS_PER_SLOPE_NDC", -100.0)
-    monkeypatch.setattr(rendering, "compute_view_colours", lambda *given: calls.append(len(calls)) or whole(*given))
-    usual, banded = render(tree, camera), render(tree, camera, rays_per_band=8 * camera.width)
-    assert len(calls) == 1
-    moved = camera_at(0.12, 0.0, 0.0)
-    again, fresh = render(tree, moved), render(replace(tree), moved)
-    assert len(calls) == 3
-    assert not np.array_equal(again.colour, usual.colour)
-    for name in FIELDS:
-        assert np.array_equal(getattr(usual, name), getattr(banded, name)), name
-        assert np.array_equal(getattr(again, name), getattr(fresh, name)), name
-
-
 def far_camera(tree: NerfTree, voxels: float) -> Camera:
     """A camera that many voxels away whose image the tree fills."""
     at = pose(0.7, 0.4, voxels * tree.voxel)
@@ -108,22 +67,6 @@ def test_images_match_the_torch_reference_from_near_and_far(degree: int, distanc
     np.testing.assert_allclose(outputs.colour.reshape(-1, 3), colour, atol=1e-3)
     np.testing.assert_allclose(outputs.opacity.reshape(-1), opacity, atol=1.01e-3)
     assert (outputs.opacity > 0.9).mean() > 0.1
-
-
-@pytest.mark.parametrize("kind", ["packed", "supersampled", "nearest", "ndc"])
-def test_images_without_normals_are_otherwise_the_same(kind: str) -> None:
-    tree = random_tree(3, share=0.6, degree=1)
-    camera, more = camera_of(tree), {"supersample": 2 if kind == "supersampled" else 1}
-    if kind == "nearest":
-        tree = replace(tree, lookup="nearest")
-    if kind == "ndc":
-        tree, camera = wall(voxels=24), camera_at(0.1, 0.0, 0.0)
-    usual, without = render(tree, camera, **more), render(tree, camera, normals=False, **more)
-    assert without.normal.shape == (0, 0, 3)
-    assert usual.normal.shape == (camera.height, camera.width, 3)
-    assert np.isfinite(usual.depth).any()
-    for name in FIELDS[:3]:
-        assert np.array_equal(getattr(usual, name), getattr(without, name)), name
 
 
 @pytest.mark.parametrize(("sigma", "share", "stop"), [(0.3, 0.9, 0.0), (3.0, 0.6, 0.0), (300.0, 0.6, 1e-3)])
@@ -175,21 +118,6 @@ def test_leaps_in_every_direction_alike_change_no_value(monkeypatch: pytest.Monk
     assert np.array_equal(work[..., 2:], more[..., 2:])
 
 
-def test_a_camera_inside_and_one_facing_away() -> None:
-    tree = uniform_tree(sigma=40.0)
-    inside = camera_of(tree, distance=0.05)
-    outputs = render(tree, inside)
-    assert (outputs.opacity > 0.99).all()
-    np.testing.assert_allclose(outputs.depth[11, 13], np.log(2) / 40, rtol=0.05)
-    away = inside.world_from_camera.copy()
-    away[:3, 3] += 30 * away[:3, 2]
-    empty = render(tree, replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
-    assert not empty.opacity.any()
-    assert np.isinf(empty.depth).all()
-    assert not empty.normal.any()
-    np.testing.assert_allclose(empty.colour, np.broadcast_to(np.float32([0.2, 0.4, 0.6]), empty.colour.shape))
-
-
 def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> None:
     from efficientnerf.backends.numba.tree.rendering import render_rays
 
@@ -203,24 +131,3 @@ def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> No
     colour, opacity, _, _ = render_rays(tree, origins, directions, sh_directions)
     expected = 1 / (1 + np.exp(-0.4886025119029199 * sh_directions[:, 2]))
     np.testing.assert_allclose(colour, (opacity * expected)[:, None] * np.ones(3), atol=1e-4)
-
-
-@pytest.mark.parametrize("layout", ["floats", "codes"])
-def test_the_order_of_voxels_does_not_change_images(layout: str) -> None:
-    tree = random_tree(1, brick=4, degree=2, share=0.6)
-    if layout == "codes":
-        tree = in_codes(tree, (1,) * 8, 200)
-    rng = np.random.default_rng(0)
-    bricks, voxels = rng.permutation(len(tree.voxel_index)), rng.permutation(len(tree.density_values))
-    other = replace(
-        tree,
-        brick_index=np.where(tree.brick_index >= 0, np.argsort(bricks)[tree.brick_index], -1).astype(np.int32),
-        voxel_index=np.where(tree.voxel_index >= 0, np.argsort(voxels)[tree.voxel_index], -1)[bricks].astype(np.int32),
-        density_values=tree.density_values[voxels],
-        harmonics=tree.harmonics.subset(voxels) if layout == "codes" else tree.sh[voxels],  # type: ignore[union-attr]
-    )
-    for distance in (40.0, 2000.0):
-        one, two = render(tree, far_camera(tree, distance)), render(other, far_camera(tree, distance))
-        assert one.opacity.max() > 0.5
-        for name in FIELDS:
-            assert np.array_equal(getattr(one, name), getattr(two, name)), name

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numba
 import numpy as np
 import pytest
 
 from efficientnerf.asset.cascades import voxel_coordinates
-from efficientnerf.asset.queries import density_block
 from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packed import packed_of
-from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, packed_pointers, sh_basis
+from efficientnerf.backends.numba.tree.view_colours import packed_pointers, sh_basis
 from efficientnerf.backends.numba.vector.maths import popcount
 from efficientnerf.rendering.harmonics import basis_numpy
-from tests.efficientnerf.trees import in_codes, random_tree
+from tests.efficientnerf.trees import random_tree
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -78,30 +75,6 @@ def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int, 
         assert bits.sum() == (eight > 0).any(axis=0).sum()
 
 
-@pytest.mark.parametrize(
-    ("layout", "degree", "brick"),
-    [(layout, degree, (1, 2, 4, 5)[(n + degree) % 4]) for n, layout in enumerate(["floats", "codes", "wide codes"]) for degree in range(5)],
-)
-def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, layout: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if layout == "wide codes":
-        monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_COORDINATES", 0)
-    tree = random_tree(brick, brick=brick, degree=degree, share=0.5)
-    if layout != "floats":
-        tree = in_codes(tree, (1,) * ((degree + 1) ** 2 - 1), 300 if layout == "wide codes" else 200)
-    centre, packed = np.array([-31.0, 12.5, 57.0]), packed_of(tree)
-    direction, bits = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.uint16)
-    assert packed.coordinates.dtype == (np.int32 if layout == "wide codes" else np.uint16)
-    count = len(tree.density_values)
-    for first, end in ((0, 5), (5, count)):
-        compute_view_colours(first, end, 0, packed, direction, np.zeros(5), np.float32(2), tree.degree, bits)
-    order, colours = packed.voxel_of[:-1], bits.view(np.float16)
-    assert np.array_equal(colours[:-1, 0], (2 * tree.density_values[order]).astype(np.float16))
-    away = voxel_coordinates(tree)[order] + 0.5 - centre
-    basis = basis_numpy(away / np.linalg.norm(away, axis=1, keepdims=True), degree)
-    np.testing.assert_allclose(colours[:-1, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[order]), atol=1e-4, rtol=2**-11)
-    assert not bits[-1].any()
-
-
 @pytest.mark.parametrize(("shape", "share"), [((7, 5, 6), 0.3), ((1, 9, 2), 0.0), ((270, 1, 1), 0.02)])
 def test_leaps_in_eight_directions_are_the_sides_of_empty_cubes(shape: tuple[int, int, int], share: float) -> None:
     occupied = np.random.default_rng(5).random(shape) < share
@@ -112,17 +85,3 @@ def test_leaps_in_eight_directions_are_the_sides_of_empty_cubes(shape: tuple[int
             ahead = (at - cell) * signs
             ahead = ahead[(ahead >= 0).all(axis=1)]
             assert leap[(octant, *cell)] == min(ahead.max(axis=1).min() if len(ahead) else 255, 255)
-
-
-def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> None:
-    tree = random_tree(7, shape=(8, 7, 6), brick=2, share=0.2)
-    dark = tree.density_values * (np.random.default_rng(1).random(len(tree.density_values)) < 0.1)
-    tree = replace(tree, density_values=dark.astype(np.float32))
-    absorbs = np.zeros(tree.shape, bool)
-    for cell in np.argwhere(tree.brick_index >= 0):
-        absorbs[tuple(cell)] = density_block(tree, tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
-    assert 0 < absorbs.sum() < (tree.brick_index >= 0).sum()
-    leap = packed_of(tree).leap.reshape(tree.shape)
-    assert not leap[absorbs].any()
-    for at in np.argwhere(~absorbs):
-        assert leap[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()

@@ -178,7 +178,7 @@ CONDITIONS = [(False, 0.2, 0.0), (False, 0.2, 0.01), (True, 0.2, 0.01), (True, 1
 
 @pytest.mark.parametrize(
     ("kind", "wall", "body", "height", "noise"),
-    [(kind, (None, 0.5, 4.0)[(n + k) % 3], *CONDITIONS[k]) for n, kind in enumerate(PARTS) for k in range(4)],
+    [(kind, (None, 0.5, 4.0)[n % 3], *CONDITIONS[n % 4]) for n, kind in enumerate(PARTS)],
 )
 def test_a_head_is_whole_whatever_it_wears(kind: str, body: bool, height: float, noise: float, wall: float | None) -> None:
     """What of it is in one plane is no support: rays pass between and beside its parts, and go on to a wall or to nowhere."""
@@ -222,37 +222,12 @@ def test_floaters_before_the_cameras_and_scattered_ends_change_little() -> None:
     assert np.abs(noisy.bounds - clean.bounds).max() < 0.25
 
 
-def test_several_things_on_a_table_belong_together() -> None:
-    cameras = ring(24, 3.0, 1.5)
-    things = [([0.5, 0.4, 0], 0.3), ([-0.5, 0.2, -0.1], 0.2), ([0, -0.6, 0.1], 0.4)]
-    found = region(cameras, [*(ball(*thing) for thing in things), box([-1.6, -1.6, -0.5], [1.6, 1.6, -0.3]), box([-9, -9, -3], [9, 9, 6], from_within=True)])
-    for centre, radius in things:
-        assert (inside_distance(found, on_ball(centre, radius)) > found.fade).all()
-    assert found.bounds[0, 2] > -1.5  # not the floor below the table
-
-
 def test_a_subject_seen_from_one_side_is_whole() -> None:
     cameras = ring(16, 2.2, 0.6, arc=90)
     found = region(cameras, [box([-0.4, -0.4, -0.5], [0.4, 0.4, 0.7]), ROOM])
     seen = in_box([-0.4, -0.4, -0.5], [0.4, -0.4, 0.7])
     assert (inside_distance(found, seen) > found.fade).all()
     assert (found.bounds[1] - found.bounds[0])[:2].max() < 3.5
-
-
-def test_a_street_is_the_well_observed_part() -> None:
-    """Cameras that go down a street: no subject; the region follows their way."""
-    cameras = [camera([0, y, 0], [4, y + 3, 0.2], 70) for y in np.linspace(-15, 15, 40)]
-    found = region(cameras, [box([4, -40, -1], [9, 40, 8]), box([-50, -50, -2], [50, 50, -1]), box([-9, -40, -1], [-4, 40, 8])])
-    assert found.bounds[0, 1] < -8
-    assert found.bounds[1, 1] > 13
-    assert found.bounds[1, 0] > 4
-    assert (found.bounds[1] - found.bounds[0]).max() < 80
-
-
-def test_a_facade_before_all_cameras_is_kept_whole() -> None:
-    cameras = [camera([x, -4, z], [x * 0.3, 0, 0], 60) for x in np.linspace(-1, 1, 5) for z in (-0.4, 0.4)]
-    found = region(cameras, [box([-20, 0, -20], [20, 1, 20]), box([-0.5, -0.15, -1], [0.5, 0.2, 1])])
-    assert (inside_distance(found, in_box([-0.5, -0.15, -1], [0.5, 0.0, 1])) > found.fade).all()
 
 
 def test_the_scale_of_the_scene_does_not_matter() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -51,22 +49,6 @@ def test_a_sharp_frame_is_not_left_for_being_near() -> None:
     assert chosen[2]
     assert chosen[[3, 6]].any()
     assert not chosen[[4, 5]].any()
-
-
-def test_time_in_which_nothing_moves_takes_no_frames_from_the_rest() -> None:
-    motion = np.linspace(0, 1, 60)
-    standing = np.concatenate([motion[:30], np.full(200, motion[29]), motion[30:]])
-    there = np.r_[0:30, 230:260]
-    assert (np.array(choose(standing, np.ones(260), 15))[there] == CHOSEN).tolist() == (np.array(choose(motion, np.ones(60), 15)) == CHOSEN).tolist()
-
-
-def test_a_long_blur_is_thinned_without_a_gap() -> None:
-    sharpness = np.ones(120)
-    sharpness[40:80] = 0.5
-    picked = [verdict for verdict in choose(np.linspace(0, 1, 120), sharpness, 24) if verdict in (CHOSEN, BLUR)]
-    assert 2 <= picked.count(BLUR) <= 5
-    assert all(CHOSEN in pair for pair in pairwise(picked))
-    assert choose(np.linspace(0, 1, 120), np.full(120, 0.5), 24).count(CHOSEN) == 24
 
 
 @pytest.mark.parametrize("motions", [[1.0, 1.0], [3.0, 1.0, 0.0], [0.0, 0.0], [5.0]])

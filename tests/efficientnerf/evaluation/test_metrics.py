@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio
 
-from efficientnerf.evaluation import metrics
 from efficientnerf.evaluation.metrics import colour_fitted, mean_squared_error, psnr, ssim, ssim_map
 from tests import reference
 
@@ -63,17 +62,6 @@ def test_a_mask_of_all_changes_nothing_and_what_it_hides_does_not_count() -> Non
 def test_what_cannot_be_compared_is_refused(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         ssim(image, truth, mask)
-
-
-@pytest.mark.parametrize("shape", [(40, 17, 3), (23, 30)])
-@pytest.mark.parametrize("band", [1, 7, 13])
-def test_ssim_is_the_same_to_the_bit_in_bands(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, ...], band: int) -> None:
-    rng = np.random.default_rng(0)
-    image, truth, mask = rng.random(shape, np.float32), rng.random(shape, np.float32), rng.random(shape[:2]) < 0.7
-    whole, masked, similarity = metrics.ssim(image, truth), metrics.ssim(image, truth, mask), metrics.ssim_map(image, truth)
-    monkeypatch.setattr(metrics, "BAND", band)
-    assert (metrics.ssim(image, truth), metrics.ssim(image, truth, mask)) == (whole, masked)
-    assert np.array_equal(metrics.ssim_map(image, truth), similarity)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from efficientnerf.asset.rendering import render_reference
-from efficientnerf.evaluation.surfaces import MARGIN_DEPTH, MARGIN_VOXELS, opacity_nearer, surface_limits
+from efficientnerf.evaluation.surfaces import MARGIN_VOXELS, opacity_nearer, surface_limits
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 from tests.efficientnerf.walls import DEPTH, NEAR, looking_along_y, wall
 
@@ -34,29 +34,6 @@ def test_without_a_limit_it_is_the_opacity_of_the_reference(make) -> None:  # ty
     found = opacity_nearer(tree, origins, directions, np.full(80, np.inf))
     assert np.abs(found - wanted).mean() < 0.03, "steps of a voxel in place of half of one"
     assert np.corrcoef(found, wanted)[0, 1] > 0.99
-
-
-def test_a_nearer_limit_never_sees_more_and_pieces_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    tree = random_cascades(1)
-    origins, directions = rays_at(tree, 40)
-    along = np.linspace(0, 12, 9)
-    found = np.stack([opacity_nearer(tree, origins, directions, np.full(40, t)) for t in along])
-    assert (np.diff(found, axis=0) > -0.02).all()  # steps differ a little
-    assert found[-1].max() > 0.5
-    monkeypatch.setattr("efficientnerf.evaluation.surfaces.POINTS_AT_ONCE", 7)
-    np.testing.assert_array_equal(opacity_nearer(tree, origins, directions, np.full(40, along[4])), found[4])
-
-
-def test_the_margin_is_the_wider_of_the_two_in_the_cascade_of_the_surface() -> None:
-    tree = random_cascades(0)
-    eye = (tree.bounds_min + tree.bounds_max) / 2
-    inner, outer = 0.05, 0.6 + 0.3  # in cascade 0, whose half side is 0.6, and in cascade 1
-    origins, directions = np.tile(eye, (4, 1)), np.tile([1.0, 0, 0], (4, 1))
-    distance = np.array([inner, outer, 1000.0, np.inf])
-    found = surface_limits(tree, origins, directions, distance)
-    voxels = [tree.voxel, 2 * tree.voxel, 4 * tree.voxel]
-    wanted = [max(0.0, inner - MARGIN_VOXELS * voxels[0]), outer - MARGIN_VOXELS * voxels[1], 1000 * (1 - MARGIN_DEPTH), np.inf]
-    np.testing.assert_allclose(found, wanted)
 
 
 def test_in_normalised_device_coordinates_limits_are_of_the_world() -> None:

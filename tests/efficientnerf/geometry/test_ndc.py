@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from efficientnerf.geometry.ndc import BEYOND, Ndc, ndc_distance, world_distance
-from efficientnerf.geometry.spaces import BoundedSpace, NdcSpace, space_from
 
 
 def some_pose(rng: np.random.Generator) -> np.ndarray:
@@ -89,19 +88,6 @@ def test_rays_are_the_appendix_s_and_end_at_infinity(ndc: Ndc) -> None:
     assert (world_distance(far * 1.001, begin, ds_dt, dlogz_dt) == np.inf).all()
 
 
-def test_rays_that_look_back_end_at_the_near_plane_or_nowhere(ndc: Ndc) -> None:
-    rotation, centre = ndc.world_from_camera[:3, :3], ndc.world_from_camera[:3, 3]
-    local = np.array([[0.3, 0.0, 6.0], [0.3, 0.0, 1.0], [0.0, 0.0, 6.0]])
-    direction = np.array([[0.6, 0.0, -0.8], [0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
-    start, along, begin, ds_dt, dlogz_dt = ndc.rays(local @ rotation.T + centre, direction @ rotation.T)
-    t = (6.0 - ndc.near) / 0.8
-    there = start[0] + ndc_distance(np.array([t]), begin[:1], ds_dt[:1], dlogz_dt[:1]) * along[0]
-    np.testing.assert_allclose(there[2], -1, atol=1e-9)
-    assert start[1, 2] == BEYOND
-    assert along[1].tolist() == [0, 0, 1]
-    np.testing.assert_allclose(along[2], [1, 0, 0], atol=1e-12)
-
-
 def test_normals_are_those_of_the_warped_surface(ndc: Ndc) -> None:
     """Of a plane of the world: its image's normal comes back as the plane's own."""
     rng = np.random.default_rng(4)
@@ -116,22 +102,6 @@ def test_normals_are_those_of_the_warped_surface(ndc: Ndc) -> None:
     image = np.cross(u, v)
     np.testing.assert_allclose(ndc.world_normals(ndc.points(points), image), normal, atol=1e-5)
     assert (ndc.world_normals(ndc.points(points), np.zeros_like(image)) == 0).all()
-
-
-def test_a_space_warps_rays_and_is_not_contracted(ndc: Ndc) -> None:
-    box = np.array([[-1.0, -1, -1], [1, 1, 1]])
-    with pytest.raises(ValueError, match="cannot be contracted"):
-        space_from(box, contracted=True, ndc=ndc)
-    origins, directions = (torch.from_numpy(a) for a in rays_of(ndc, np.random.default_rng(5), 20))
-    zero, far = torch.zeros(20, dtype=torch.float64), torch.full((20,), 9.0, dtype=torch.float64)
-    rays = NdcSpace(box, ndc).rays(origins, directions, zero, far)
-    distance = torch.linspace(8, 20, 20, dtype=torch.float64)
-    back = rays.world_distance(rays.frame_distance(distance), torch.arange(20))
-    torch.testing.assert_close(back, distance, rtol=1e-6, atol=0)
-    same = BoundedSpace(box).rays(origins, directions, zero, far)
-    assert same.warp is None
-    assert same.origins is origins
-    assert torch.equal(same.world_distance(distance, torch.arange(20)), distance)
 
 
 def test_the_kernels_are_the_functions(ndc: Ndc) -> None:

@@ -16,8 +16,6 @@ import torch
 
 from efficientnerf.asset.format import FormatError, describe, load
 from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays, render_reference
-from efficientnerf.geometry.cameras import Camera
-from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.hostile import HOSTILE, filled
@@ -55,13 +53,6 @@ def test_rays_along_a_face_of_cells_end(lookup: str, least: float) -> None:
         directions = np.full((3, 3), least)
         directions[:, axis], origins[:, axis] = 1.0, -2.0
         assert np.isfinite(render_rays(tree, origins, directions).opacity).all()
-
-
-def test_warped_rays_of_odd_reference_cameras_end() -> None:
-    for changes in ({"width": 1e30}, {"focal": 1e30}, {"near": 1e30}, {"near": 1e-30}, {"width": 1e-30, "height": 1e30}):
-        ndc = Ndc(np.eye(4), **{"focal": 400.0, "width": 504.0, "height": 378.0, "near": 1.0, **changes})
-        for lookup in ("trilinear", "nearest"):
-            render(random_tree(0, ndc=ndc, lookup=lookup), Camera("view", 20, 16, "SIMPLE_PINHOLE", (20.0, 10.0, 8.0), np.eye(4)))
 
 
 @pytest.mark.parametrize(
@@ -108,24 +99,6 @@ def test_a_signal_is_answered_while_an_image_is_rendered(lookup: str) -> None:
         signal.signal(signal.SIGALRM, before)
 
 
-def test_images_in_pieces_are_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.backends.numba.tree import rendering
-
-    calls, tree = [], random_tree(3, shape=(6, 6, 6), brick=4, sigma=0.5)
-    expected = render(tree, looking(tree, 60))
-
-    def in_small_pieces(*given: Any) -> bool:
-        calls.append(len(given))
-        return bool(whole(*given[:9], 500, *given[10:]))
-
-    whole = rendering.render_batch
-    monkeypatch.setattr(rendering, "render_batch", in_small_pieces)
-    found = render(tree, looking(tree, 60))
-    assert len(calls) > 20
-    for name in ("colour", "opacity", "depth", "normal"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-
-
 @pytest.mark.parametrize("which", ["one voxel in 2^27 cells", "large bricks of one voxel each"])
 def test_memory_that_a_file_would_take_is_known_before_it_is_taken(which: str, tmp_path: Path) -> None:
     import tracemalloc
@@ -170,7 +143,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has other units elsewhere")
-@pytest.mark.parametrize("made", [lambda: filled((320, 320, 320), 1), lambda: filled((25, 25, 25), 10000, brick=16), lambda: filled((128, 128, 128), 2**21)])
+@pytest.mark.parametrize("made", [lambda: filled((320, 320, 320), 1), lambda: filled((96, 96, 96), 96**3)])
 def test_memory_keeps_to_eight_times_the_file_and_200_mb(made: Any, tmp_path: Path) -> None:
     """Files that are nearly all empty, as large as the rule lets pass, and one whose bricks are all there."""
     path = tmp_path / "a.nerftree"

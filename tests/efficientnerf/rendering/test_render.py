@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,15 +89,6 @@ def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: i
     assert ((np.abs(length - 1) < 1e-3) | (length == 0)).all()
 
 
-@pytest.mark.parametrize(("lookup", "supersample"), [("trilinear", 3), ("nearest", 2)])
-def test_renders_do_not_depend_on_how_they_are_cut(lookup: str, supersample: int) -> None:
-    tree = replace(random_tree(0, share=0.7), lookup=lookup)
-    whole = render(tree, looking(tree), supersample=supersample)
-    cut = render(tree, looking(tree), supersample=supersample, rays_per_band=100)
-    for name in ("colour", "opacity", "depth", "normal"):
-        assert np.array_equal(getattr(whole, name), getattr(cut, name)), name
-
-
 @pytest.mark.gpu
 def test_the_torch_function_runs_on_the_device() -> None:
     if not torch.cuda.is_available():
@@ -135,30 +125,3 @@ def dense(*, contracted: bool) -> FieldRenderer:
     m.fine.weights[-1].data.mul_(30)
     m.fine.table.data.mul_(3e3)
     return FieldRenderer(m, 0.5, 30.0)
-
-
-def test_a_fields_picture_is_split_by_any_box() -> None:
-    field, camera = dense(contracted=True), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
-    usual = field.render(camera)
-    same = field.render(camera, box=np.asarray(field.model.space.bounds))
-    for name in ("colour", "before", "behind", "inside_opacity", "within"):
-        np.testing.assert_allclose(getattr(same, name), getattr(usual, name), atol=1e-5)
-    everything = field.render(camera, box=np.array([[-500.0] * 3, [500.0] * 3]))
-    assert np.array_equal(everything.colour, usual.colour)
-    assert not everything.before.any()
-    np.testing.assert_allclose(everything.inside_opacity, usual.opacity, atol=1e-5)
-    nothing = field.render(camera, box=np.array([[50.0] * 3, [51.0] * 3]))  # not in view
-    assert not nothing.inside_opacity.any()
-    assert not nothing.within.any()
-    np.testing.assert_allclose(nothing.behind, usual.colour, atol=1e-5)
-
-
-@pytest.mark.parametrize("contracted", [False, True])
-def test_opacity_nearer_than_the_depth_is_half_at_most(contracted: bool) -> None:
-    field, camera = dense(contracted=contracted), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
-    assert field.render(camera).nearer is None
-    at = field.render(camera, limits=lambda origins, directions, distance: distance)
-    assert (at.nearer[at.opacity >= 0.5] < 0.5).all()
-    none, everything = (field.render(camera, limits=lambda o, d, distance, limit=limit: np.full(len(distance), limit)) for limit in (0.0, np.inf))
-    assert not none.nearer.any()  # type: ignore[union-attr]
-    np.testing.assert_allclose(everything.nearer, everything.opacity, atol=1e-5)

@@ -14,8 +14,6 @@ from efficientnerf.sampling.occupancy import (
     density_voxels,
     mask_cells,
     random_cells,
-    reset_cells,
-    sweep_cells,
     update,
 )
 from tests import reference
@@ -54,22 +52,6 @@ def test_samples_tell_the_largest_in_one_go_as_they_do_step_by_step(activation: 
         torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("rule", ["momentum", "maximum"])
-@pytest.mark.parametrize("padding", [0, 1, 30])
-def test_padding_tells_the_voxels_nothing(rule: str, padding: int) -> None:
-    """Neither those that nothing else updates, nor those that something does."""
-    plain, padded = (density_voxels(SIDE, rule, initial=10.0, beta=0.1, threshold=1.0) for _ in range(2))
-    for count in (80, 1, 200):
-        cell, density = samples(count)
-        update(plain, cell, density)
-        nowhere = torch.tensor([0, int(cell[0]), SIDE**3 - 1])[torch.arange(padding) % 3]
-        more = torch.where(torch.arange(padding) % 2 == 0, torch.inf, torch.nan)
-        update(padded, torch.cat([cell, nowhere]), torch.cat([density, more]), torch.tensor(count))
-    torch.testing.assert_close(padded.values, plain.values, rtol=1e-6, atol=1e-6)
-    assert padded.values.reshape(-1)[-1] == padded.start
-    update(padded, cell[:0], density[:0], torch.tensor(0))
-
-
 def test_a_voxel_of_raw_density_minus_five_is_pruned_at_its_eleventh_visit() -> None:
     voxels = density_voxels(1, "momentum", initial=10.0, beta=0.1)
     visits = 0
@@ -106,31 +88,9 @@ def test_masked_voxels_stay_masked_and_change_no_others(rule: str, beta: float, 
     assert voxels.occupied == float((plain.values[~masked] > plain.threshold).sum()) / SIDE**3
 
 
-def test_a_reset_leaves_masked_voxels_masked() -> None:
-    voxels = density_voxels(SIDE, "maximum", threshold=1.0)
-    masked = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
-    masked[0, 1] = True
-    mask_cells(voxels, masked)
-    voxels.values[~masked] = 0.25
-    reset_cells(voxels, torch.tensor(False))
-    assert (voxels.values[~masked] == 0.25).all()
-    for wanted in (None, torch.tensor(True)):
-        voxels.values[~masked] = 0.25
-        reset_cells(voxels, wanted)
-        assert (voxels.values[~masked] == voxels.start).all()
-        assert torch.isneginf(voxels.values[masked]).all()
-
-
 def test_cells_hold_their_points_and_the_borders_belong_to_the_grid() -> None:
     point = torch.tensor([[0.0, 0.0, 0.0], [0.99, 0.0, 0.34], [1.0, 1.0, 1.0], [-0.1, 0.5, 1.2]])
     assert cell_of(point, SIDE).tolist() == [0, 19, 26, 5]
-
-
-def test_a_sweep_has_every_cell_once() -> None:
-    voxels = density_voxels(5, "momentum")
-    parts = [sweep_cells(voxels, part, 8, part) for part in range(3, 11)]
-    assert sorted(torch.cat([cell for cell, _ in parts]).tolist()) == list(range(125))
-    assert all(torch.equal(cell_of(point, 5), cell) for cell, point in parts)
 
 
 @pytest.mark.parametrize(("rule", "empty", "full", "threshold"), [("momentum", -40.0, 40.0, 0.0), ("maximum", 0.0, 40.0, 1.0)])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.training.exposure import model as module
 from efficientnerf.training.exposure.fit import fit_exposure
@@ -20,17 +19,14 @@ from efficientnerf.training.exposure.model import (
     Exposure,
     averaged,
     averaged_image,
-    camera_numbers,
     exposed,
     exposure_loss,
     exposure_of,
-    image_as_taken,
     squared_radius,
 )
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
-from stages.evaluate.views import subsample
 from tests.efficientnerf.balls import cameras, photograph, untrained
 
 
@@ -77,15 +73,6 @@ def test_averaged_undoes_exposed_beyond_white_too(strength: float) -> None:
     torch.testing.assert_close(averaged(exposed(colour, view, radius, e), view, radius, e), colour, rtol=1e-9, atol=1e-9)
 
 
-def test_without_differences_nothing_changes_whatever_the_response() -> None:
-    """Of one camera, whose photographs were exposed alike, the response has no effect, and the mean of the gains is of no consequence."""
-    colour, radius = torch.rand(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), torch.zeros(20, dtype=torch.float64) + 0.3
-    cameras = torch.tensor([[0.0, 0.0, 7.0, -3.0]], dtype=torch.float64)
-    e = Exposure(torch.full((3, 3), 4.0, dtype=torch.float64), cameras, torch.zeros(3, dtype=torch.int64))
-    torch.testing.assert_close(exposed(colour, torch.arange(20) % 3, radius, e), colour)
-    assert exposure_loss(Exposure(e.photographs, 0 * cameras, e.camera_of)) == 0 < exposure_loss(some())
-
-
 def test_gradients() -> None:
     view, radius, camera_of = torch.tensor([0, 1, 1, 3, 3, 3]), torch.rand(6, dtype=torch.float64), torch.tensor([0, 0, 1, 1])
 
@@ -95,15 +82,6 @@ def test_gradients() -> None:
 
     colour = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5)) * 0.9 + 0.05
     assert torch.autograd.gradcheck(both, (colour.requires_grad_(), random(4, 3).requires_grad_(), random(2, 4).requires_grad_()))
-
-
-def test_one_camera_upright_or_not_and_others_by_size_and_focal_length() -> None:
-    def camera(width: int, height: int, focal: float) -> Camera:
-        return Camera("a", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), np.eye(4))
-
-    numbers = camera_numbers([camera(80, 60, 90.0), camera(60, 80, 90.0), camera(80, 60, 91.0), camera(80, 60, 45.0), camera(90, 60, 90.0)])
-    assert numbers[0] == numbers[1] == numbers[2]
-    assert len({*numbers.tolist()}) == 3
 
 
 def test_a_photograph_as_if_exposed_like_the_others() -> None:
@@ -132,20 +110,6 @@ def test_a_photograph_has_the_bytes_of_averaged(strength: float) -> None:
         colour = torch.from_numpy(image.reshape(-1, 3).astype(np.float32) / np.float32(255))
         expected = torch.round(255 * averaged(colour, torch.full((2000,), number), radius, e).clamp(0, 1)).to(torch.uint8)
         assert np.array_equal(averaged_image(image, None, number, e)[0].reshape(-1, 3), expected.numpy())
-
-
-def test_a_render_as_its_camera_shows_it() -> None:
-    """With gains that are given; at every stride-th pixel the same as there of all."""
-    e = Exposure(torch.zeros(2, 3), torch.tensor([[-4.0, -1.0, 3.0, 0.0]]), torch.zeros(2, dtype=torch.int64))
-    image = np.random.default_rng(0).random((11, 8, 3), np.float32)
-    y, x = np.divmod(np.arange(88), 8)
-    gains = np.array([0.2, -0.1, 0.0])
-    own = Exposure(torch.tensor(np.array([gains, -gains])) / SCALE, e.cameras, e.camera_of)
-    expected = exposed(torch.from_numpy(image.reshape(-1, 3)), torch.zeros(88, dtype=torch.int64), torch.from_numpy(squared_radius(x, y, 8, 11)), own)
-    whole = image_as_taken(image, 1, e, gains, (8, 11))
-    np.testing.assert_allclose(whole, expected.clamp(0, 1).reshape(11, 8, 3), atol=1e-6)
-    assert np.abs(whole - image).max() > 0.05
-    np.testing.assert_allclose(image_as_taken(subsample(image, 3), 0, e, gains, (8, 11), 3), subsample(whole, 3), atol=1e-6)
 
 
 def test_the_exposure_of_a_held_back_photograph() -> None:

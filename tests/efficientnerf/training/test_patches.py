@@ -28,27 +28,6 @@ def test_every_pixel_lies_in_as_many_patches(side: int) -> None:
     assert grid.mean_pixels == pytest.approx(len(grid.pixels) / len(grid))
 
 
-def test_pixels_of_a_patch_are_neighbours_in_one_view_and_masks_hold() -> None:
-    keep = np.random.default_rng(0).random((9, 4)) < 0.4
-    pixels = views([None, keep, np.zeros((3, 1), bool)])
-    grid = PatchGrid(pixels, 3)
-    rng = np.random.default_rng(1)
-    assert grid.usable_tiles is not None
-    tiles = np.flatnonzero(grid.usable_tiles)
-    found = grid.drawn_from(rng.choice(tiles, round(4000 / grid.mean_pixels)), rng)
-    assert abs(len(found.pixels) - 4000) < 400
-    assert (np.diff(found.first) > 0).all()
-    assert found.first[-1] == len(found.pixels)
-    assert pixels.usable_at(found.pixels).all()
-    assert set(found.pixels) == set(np.flatnonzero(pixels.usable_at(np.arange(len(pixels)))))
-    for a, b in zip(found.first[:-1], found.first[1:], strict=True):
-        view = pixels.view_of(found.pixels[a:b])
-        assert len(set(view)) == 1
-        y, x = np.divmod(found.pixels[a:b] - pixels.offsets[view], pixels.width[view])
-        assert np.ptp(x) < 3
-        assert np.ptp(y) < 3
-
-
 @pytest.mark.parametrize(("side", "share"), [(1, 0.5), (2, 0.05), (4, 0.5), (16, 0.0), (16, 1.0)])
 def test_tiles_are_usable_where_some_patch_of_theirs_has_a_pixel(side: int, share: float) -> None:
     rng = np.random.default_rng(3)

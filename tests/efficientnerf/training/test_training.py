@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from dataclasses import replace
 
@@ -18,7 +17,7 @@ from efficientnerf.training.optimiser import Adam, parameter_groups
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.sparse_depth import AimedRays, SparseDepthRays, aimed_rays, sparse_depth_loss
-from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
+from tests.efficientnerf.balls import cameras, photograph, pixels, untrained
 
 MLP = {"field": "mlp", "hidden_dim": 24, "num_layers": 2, "coarse_num_layers": 1, "learning_rate": 1e-2}
 
@@ -95,14 +94,6 @@ def test_a_restored_trainer_goes_on_to_the_same_bytes(field: str, at: int) -> No
         assert torch.equal(tensor, state_of(resumed)[name]), name
 
 
-def test_the_number_of_rays_follows_the_samples_they_need() -> None:
-    steps = run(untrained(iterations=30, occupancy_warmup_steps=5, sample_batch_size=8192))
-    used = [step.valid + step.fine for step in steps[-10:]]
-    assert 0.7 * 8192 < np.mean(used) < 1.3 * 8192
-    assert steps[-1].rays > steps[0].rays  # at first, all intervals were expected to be sampled
-    assert run(untrained(iterations=1, max_rays_per_batch=70))[0].rays <= 70
-
-
 def test_transparent_pixels_teach_no_colour() -> None:
     """The colour under alpha 0 is anything; it must not be seen."""
     some = pixels()
@@ -158,37 +149,6 @@ def test_rays_to_sparse_points_count_alone_though_others_come_first(complete: bo
         torch.testing.assert_close(same, gradient, rtol=1e-3, atol=1e-6)
 
 
-def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
-    """No random background, momentum voxels with threshold 0, no updates at random cells but unpruned rays.
-
-    The middle of the images comes first, and pruning waits until the coarse field has found the object: without the first, or pruned after 80
-    steps, the ball fades away (opacity below 0.15 after as many steps).
-    """
-    paper = {
-        "background_color": "scene", "occupancy_rule": "momentum", "occupancy_update_fraction": 0.0,
-        "occupancy_update_ray_fraction": 0.05, "exploration_fraction": 0.0, "sample_batch_size": "off", "max_rays_per_batch": 256,
-    }  # fmt: skip
-    m = untrained(**paper, **MLP, iterations=300, occupancy_warmup_steps=220, precrop_steps=60)
-    thin = pixels(8, 20, 0.25)
-    steps = run(m, thin)
-    assert steps[-1].valid < 0.2 * steps[200].valid  # most is pruned
-    origins, directions, near, far = (torch.from_numpy(a) for a in thin.bundle(np.arange(len(thin)))[:4])
-    with torch.no_grad():
-        opacity = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), torch.ones(len(thin), 3)).fine_opacity.numpy()
-    on_ball = thin.images[:, 3] > 200
-    assert opacity[on_ball].mean() > 0.35
-    assert opacity[~on_ball].mean() < 0.02
-
-
-@pytest.mark.parametrize(("field", "strategy"), [("mlp", "uniform"), ("nerf", "hierarchical"), ("mlp", "valid")])
-def test_other_samplings_learn_and_only_pruning_ones_touch_voxels(field: str, strategy: str) -> None:
-    m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, num_importance_samples=16, sample_batch_size="off", max_rays_per_batch=128)
-    steps = run(m)
-    assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 1
-    assert {step.rays for step in steps} == {128}  # a fixed batch
-    assert bool((m.voxels.values == m.voxels.start).all()) == (strategy != "valid")
-
-
 def test_a_schedule_whose_iterations_are_revised_goes_on_from_where_it_was() -> None:
     first = Schedule(1000, hold=100, learning_rate=1e-2)
     second = first.with_iterations(3000, 400)
@@ -201,16 +161,6 @@ def test_a_schedule_whose_iterations_are_revised_goes_on_from_where_it_was() -> 
     assert fractions[:701] == [second.fraction(step) for step in range(701)]
     assert fractions[2000] == pytest.approx(1)
     assert last.learning_rate_at(2000) == pytest.approx(5e-4)
-
-
-def test_a_schedule_is_what_its_state_and_the_settings_say() -> None:
-    given = settings(iterations=20, learning_rate=3e-3, lr_final_ratio=0.2)
-    revised = replace(schedule_of(given), hold=4).with_iterations(12, 6)
-    state = json.loads(json.dumps(revised.state()))
-    assert schedule_of(given, state) == revised
-    for wrong in ({}, {"iterations": 3}, {"iterations": 3, "hold": 0, "aims": [3]}):
-        with pytest.raises((KeyError, TypeError, ValueError)):
-            schedule_of(given, wrong or {"hold": 1})
 
 
 def test_a_schedule_that_is_replaced_on_the_way_is_repeated_by_the_last_one() -> None:

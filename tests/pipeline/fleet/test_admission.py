@@ -53,19 +53,6 @@ def test_no_worker_exceeds_its_memory_and_every_scene_ends(tmp_path: Path) -> No
         assert all(workers.most[f"w{n}"][0] <= limit for n, limit in enumerate(limits) if f"w{n}" in workers.most)
 
 
-def test_small_stages_run_side_by_side_though_a_share_of_each_is_more(tmp_path: Path) -> None:
-    """Two slots: a large stage has more than its half, and small ones run beside it."""
-    needs = {(f"s{n}", stage): (11 if n % 2 else 3) * GIB for n in range(8) for stage in STAGES}
-    workers = Simulated([Worker("a", 4, 16 * GIB, slots=2)], taking(needs))
-    together: list[set[int]] = []
-    workers.between = lambda: together.append({int(scene_of(task)[1:]) % 2 for task in workers.running.values() if task.request["kind"] == "stage"})
-    assert run(tmp_path, workers, scenes(8)).state == "done"
-    assert {0, 1} in together
-    asked = {task.memory for task in workers.tasks if what(task.request) == "train"}
-    assert asked == {int(1.05 * 3 * GIB), int(1.05 * 11 * GIB)}
-    assert not [scene for scene in trainings(workers) if trainings(workers).count(scene) > 1], "none had to be refused first"
-
-
 @pytest.mark.parametrize("slots", [2, 8])
 def test_a_large_stage_does_not_wait_for_all_small_ones(tmp_path: Path, slots: int) -> None:
     workers = Simulated([Worker("a", 8, 16 * GIB, slots=slots)], taking({("s20", "train"): 15 * GIB}, others=3 * GIB))
@@ -170,44 +157,3 @@ def test_a_worker_that_is_kept_takes_what_leaves_room() -> None:
     admission.give(small)
     admission.look([worker], [2, 4])
     assert begin(4, 1) is not None
-
-
-def test_what_waits_no_longer_has_nothing_kept() -> None:
-    """It was cancelled, or waits for another scene's artifact; or the worker has gone."""
-    for alive, waiting in (("a", [2]), ("b", [1, 2])):
-        admission = Admission()
-        admission.look([Worker("a", 8, 16, slots=4)], [1])
-        admission.take(Task(0, "a", {}, 1, 10))
-        assert admission.place(1, Demand(memory=12)) is None
-        admission.look([Worker(alive, 8, 16, slots=4)], waiting)
-        assert admission.waited_for() == set()
-        assert admission.place(2, Demand(memory=5)) is not None
-
-
-def test_a_worker_that_lost_it_is_taken_again_where_no_other_is_large_enough() -> None:
-    admission = Admission()
-    workers = [Worker("large", 8, 16), Worker("small", 8, 4)]
-    admission.look(workers, [1])
-    place = admission.place(1, Demand(memory=12), avoided=("large",))
-    assert place is not None
-    assert place[0].name == "large"
-    admission.look(workers, [1])
-    place = admission.place(1, Demand(memory=3), avoided=("large",))
-    assert place is not None
-    assert place[0].name == "small"
-
-
-def test_a_look_at_many_that_wait_asks_few_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = itertools.count()
-    slot = Admission._slot
-    monkeypatch.setattr(Admission, "_slot", lambda *found: (next(asked), slot(*found))[1])
-    for memory, slots in ((8, 1), (100, 50)):  # all slots taken; slots left, and no memory
-        admission = Admission()
-        workers = [Worker(f"w{number}", 8, memory, slots=slots) for number in range(100)]
-        admission.look(workers, range(10_000))
-        for number, worker in enumerate(workers):
-            admission.take(Task(number, worker.name, {}, 1, memory - 3))
-        before = next(asked)
-        for who in range(10_000):
-            assert admission.place(who, Demand(memory=4 + who % 50 if memory > 8 else 1)) is None
-        assert next(asked) - before < 1000

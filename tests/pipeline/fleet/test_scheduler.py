@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import random
 import signal
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -52,16 +51,6 @@ def test_scenes_are_prepared_run_in_order_and_finished(tmp_path: Path) -> None:
     assert order.index("s0") < order.index("s4")
 
 
-def test_stages_of_different_scenes_share_a_machine_with_a_device(tmp_path: Path) -> None:
-    """While one scene trains on the device, the cameras of the next are found."""
-    workers = Simulated([Worker("a", 4, gpus=(0,), slots=1)])
-    together: Counter[frozenset[str]] = Counter()
-    workers.between = lambda: together.update([frozenset(what(task.request) for task in workers.running.values())])
-    assert run(tmp_path, workers, scenes(8), device="cuda").state == "done"
-    assert any({"poses"} < names and names & {"train", "bake"} for names in together)
-    assert workers.most["a"][1] == 2
-
-
 def test_stages_are_admitted_by_memory_and_a_large_one_has_its_turn(tmp_path: Path) -> None:
     workers = Simulated([Worker("a", 8, 8 * GIB, slots=4)], at("s0", "train", 1, kind="refused", text="needs 7.0 GiB.", needed=7 * GIB))
     assert run(tmp_path / "one", workers, scenes(12)).totals.done == 12
@@ -105,20 +94,6 @@ def test_a_stage_whose_worker_died_is_tried_once_elsewhere(tmp_path: Path) -> No
     assert [event["event"] for event in told] == ["retry", "scene_failed"]
 
 
-def test_attempts_are_counted_for_each_stage(tmp_path: Path) -> None:
-    """A long scene on poor machines is not given up for one loss in each of its stages."""
-    lost: set[str] = set()
-
-    def answer(task: Task) -> dict[str, Any]:
-        if what(task.request) in lost or task.request["kind"] != "stage":
-            return done(task)
-        lost.add(what(task.request))
-        return {"ok": False, "kind": "died", "signal": signal.SIGSEGV, "text": "ended by SIGSEGV."}
-
-    found = run(tmp_path, Simulated([Worker("a", 1)], answer), scenes(1))
-    assert (found.state, lost) == ("done", set(STAGES))
-
-
 def test_a_locked_run_is_waited_for_and_fails_by_circumstances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = "being written by process 7 on b."
     assert run(tmp_path, Simulated([Worker("a", 1)], at("s0", "train", 30, kind="locked", text=text)), scenes(2)).state == "done"
@@ -126,20 +101,6 @@ def test_a_locked_run_is_waited_for_and_fails_by_circumstances(tmp_path: Path, m
     found = run(tmp_path, Simulated([Worker("a", 1)], at("s0", "train", kind="locked", text=text)), scenes(2))
     assert (state_of(found, "s0").state, state_of(found, "s0").reason) == ("failed", text)
     assert run(tmp_path, Simulated([Worker("a", 1)]), scenes(2), former=read_fleet(tmp_path)).state == "done"
-
-
-def test_what_is_up_to_date_is_not_run(tmp_path: Path) -> None:
-    def answer(task: Task) -> dict[str, Any]:
-        if task.request["kind"] != "prepare":
-            return done(task)
-        fresh = {"s0": STAGES, "s1": STAGES, "s2": STAGES[:1]}[scene_of(task)]
-        stages = [{"name": name, "fresh": name in fresh, "seconds": 3.0} for name in STAGES]
-        return {"ok": True, "stages": stages, "finished": scene_of(task) == "s0"}
-
-    workers = Simulated([Worker("a", 1)], answer)
-    assert run(tmp_path, workers, scenes(3)).state == "done"
-    ran = {name: [stage for scene, stage, _ in workers.log if scene == name] for name in ("s0", "s1", "s2")}
-    assert ran == {"s0": ["prepare"], "s1": ["prepare", "finish"], "s2": ["prepare", "train", "bake", "finish"]}
 
 
 def test_shared_artifacts_are_made_once_and_waited_for(tmp_path: Path) -> None:
@@ -272,39 +233,6 @@ def test_jobs_of_a_queue_are_waited_for_and_so_are_those_after_them(tmp_path: Pa
     assert next(calls) > 60
 
 
-def test_a_worker_that_takes_no_more_ends_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(absence, "LONGEST", 0.0)
-    calls = itertools.count()
-
-    def answer(task: Task) -> dict[str, Any] | None:
-        if what(task.request) != "finish":
-            return done(task)
-        workers.workers = []
-        return done(task) if next(calls) > 5 else None
-
-    workers = Simulated([Worker("a", 1)], answer)
-    with pytest.raises(StageFailed):
-        run(tmp_path, workers, scenes(2))
-    assert [scene.state for scene in read_fleet(tmp_path).scenes] == ["done", "waiting"]
-
-
-def test_what_needs_more_memory_than_is_left_holds_up_nobody(tmp_path: Path) -> None:
-    """The only worker that had as much has gone."""
-    calls = itertools.count()
-
-    def between() -> None:
-        assert next(calls) < 1000, "it goes on for ever"
-        if any((scene_of(task), what(task.request)) == ("s0", "train") and task.number not in workers.running for task in workers.tasks):
-            workers.lose("large")
-
-    refused = at("s0", "train", kind="refused", text="needs 6.0 GiB.", needed=6 * GIB)
-    workers = Simulated([Worker("large", 2, 8 * GIB, slots=2), Worker("small", 2, 4 * GIB, slots=2)], refused, between=between)
-    found = run(tmp_path, workers, scenes(6))
-    assert found.totals.done == 5
-    assert (state_of(found, "s0").state, state_of(found, "s0").reason) == ("quarantined", "needs 6.0 GiB.")
-    assert [task.memory for task in workers.tasks if (scene_of(task), what(task.request)) == ("s0", "train")][-1] == 4 * GIB
-
-
 def test_stages_are_admitted_by_what_they_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of them do not fit side by side, though there are workers for both; one alone never fits and fails by circumstances."""
     monkeypatch.setattr(disk, "free_space", lambda fleet: disk.RESERVE + 5 * GIB)
@@ -333,16 +261,6 @@ def test_a_full_disk_fails_a_scene_and_the_next_command_tries_it_again(tmp_path:
     found = run(tmp_path, workers, scenes(3))
     assert [(scene.state, scene.reason) for scene in found.scenes] == [("done", None), ("failed", "bake: no space left."), ("done", None)]
     assert run(tmp_path, Simulated([Worker("a", 2)]), scenes(3), former=found).state == "done"
-
-
-def test_what_was_written_already_is_not_asked_for_twice(tmp_path: Path) -> None:
-    """Free space has shrunk by it."""
-    (tmp_path / "s0" / ".work" / "train").mkdir(parents=True)
-    (tmp_path / "s0" / ".work" / "train" / "checkpoint").write_bytes(bytes(3000))
-    free, running = disk.RESERVE + 5000, [(tmp_path / "s0", 4000)]
-    assert disk.has_room(free, (tmp_path / "s1", 4000), running)
-    assert not disk.has_room(free, (tmp_path / "s1", 4001), running)
-    assert not disk.has_room(free, (tmp_path / "s1", 4000), [(tmp_path / "s2", 4000)])
 
 
 def test_whatever_happens_every_scene_comes_to_an_end(tmp_path: Path) -> None:

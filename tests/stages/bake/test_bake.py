@@ -19,18 +19,16 @@ from efficientnerf.asset import format
 from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.file import serialisation
 from efficientnerf.asset.refinement.schedule import stated_schedule
-from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.rendering.compositing import activate
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
-from stages.bake import memory, plan, resolution
+from stages.bake import resolution
 from stages.bake import run as bake
-from stages.bake.refine import checkpoint, refinement
+from stages.bake.refine import checkpoint
 from stages.bake.settings import BakeSettings
-from stages.evaluate.views import ground_truth
 from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from stages.train import run as train
@@ -82,15 +80,6 @@ def test_more_voxels_than_fit_into_memory_are_refused_before_they_are_baked(inpu
     with pytest.raises(UsageError, match=r"bake\.max_mib \(\d+\) or bake\.resolution \(24\)"):
         bake.run(short)
     assert not list(short.work.glob("block_*.npy"))
-
-
-def test_pixels_in_a_file_are_baked_to_the_same_bytes(
-    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: tuple[str, Job, int]
-) -> None:
-    monkeypatch.setattr(memory, "has_room", lambda job, need: False)
-    events: list[dict[str, Any]] = []
-    assert run(job(tmp_path, QUICK, events=events, **inputs)) == undisturbed[0]
-    assert any("kept in a file" in event.get("text", "") for event in events)
 
 
 def test_stopped_anywhere_it_ends_in_the_same_bytes(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int]) -> None:
@@ -233,21 +222,6 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
     }
 
 
-def test_the_raw_asset_is_like_the_field_the_fitted_like_the_photograph(
-    inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int]
-) -> None:
-    view = load(inputs["poses"]).views[-1]
-    white = (1.0, 1.0, 1.0)
-    field = load_renderer(inputs["train"]).render(view.camera).colour
-    made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=0), **inputs)
-    run(made)
-    raw = render(format.load(made.out / BakeOutputs.asset), view.camera, background=white).colour
-    fitted = render(format.load(undisturbed[1].out / BakeOutputs.asset), view.camera, background=white).colour
-    truth = ground_truth(inputs["poses"], view, white).colour
-    assert np.sqrt(((field - raw) ** 2).mean()) < 0.08
-    assert ((fitted - truth) ** 2).mean() < 0.5 * ((raw - truth) ** 2).mean()
-
-
 def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
     m = load_renderer(inputs["train"]).model
     m.voxels.values.fill_(-1.0)
@@ -283,21 +257,6 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
     assert sizes[20_000][2] <= 20_000 < sizes[10**7][2]
 
 
-def plan_of(inputs: dict[str, Path], settings: BakeSettings, **trained: Any) -> plan.Bake:
-    m = load_renderer(inputs["train"]).model
-    m.settings = dataclasses.replace(m.settings, **trained)
-    return plan.bake_plan(settings, m, load(inputs["poses"]), "cpu", 2)
-
-
-def test_steps_of_the_fit_follow_the_voxels_or_what_was_asked_for(inputs: dict[str, Path]) -> None:
-    assert [refinement.usual_steps(voxels, 1000, None) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
-    assert [refinement.usual_steps(10**6, 1000, pixels) for pixels in (10**5, 10**7, 10**9)] == [6000, 10000, 15000]
-    for steps in (0, 7):  # a time budget takes the place of any number, of none too: what is thick is learned then as ever
-        assert plan_of(inputs, BakeSettings(refine_steps=steps)).refine_steps == steps
-        assert plan_of(inputs, BakeSettings(refine_steps=steps, time_budget=40.0)).refine_steps is None
-    assert plan_of(inputs, BakeSettings()).refine_steps is None
-
-
 @pytest.mark.parametrize(("layout", "most"), [("compact", 1), ("sparse", 1), ("compact", 64)])
 def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: dict[str, Path], tmp_path: Path, layout: str, most: int) -> None:
     chosen = BakeSettings(resolution=80, samples_per_voxel=1, weight_threshold=0.0, max_mib=most, layout=layout, refine_steps=2, refine_rays_per_batch=512)
@@ -306,35 +265,6 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
     size = (made.out / BakeOutputs.asset).stat().st_size
     assert (2**16 < size <= 2**20) if most == 1 else (size > 2**20)
     assert format.describe(made.out / BakeOutputs.asset)["layout"] == layout
-
-
-def test_a_packed_asset_keeps_to_a_part_of_a_mib(inputs: dict[str, Path], tmp_path: Path) -> None:
-    settings = BakeSettings(
-        resolution=40, samples_per_voxel=1, weight_threshold=0.0, visibility_rays=4000, max_mib=0.1, layout="packed", refine_steps=2, refine_rays_per_batch=512
-    )
-    made = job(tmp_path, settings, **inputs)
-    run(made)
-    path, report = made.out / BakeOutputs.asset, json.loads((made.out / "report.json").read_text())
-    assert path.stat().st_size == report["bytes"] <= 0.1 * 2**20
-    about = format.describe(path)
-    assert about["layout"] == "packed"
-    assert about["provenance"]["metrics"]["training_psnr"] == report["optimisation"]["psnr_written"]
-    assert report["optimisation"]["psnr_written"] > report["optimisation"]["psnr_after"] - 3
-
-
-def test_bytes_beyond_the_usual_size_of_a_packed_asset_give_no_more_voxels(inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan, "usual_mib", lambda s, packed=False: 0.018 if packed else 3 * 0.018)
-    stated = BakeSettings(layout="packed", max_mib=0.2)
-
-    def sizes(settings: BakeSettings, **trained: Any) -> tuple[float, float]:
-        made = plan_of(inputs, settings, **trained)
-        return made.max_mib, made.mib
-
-    assert sizes(stated) == (0.2, 0.018)
-    assert sizes(dataclasses.replace(stated, max_mib=0.01)) == (0.01, 0.01)
-    for more in (dataclasses.replace(stated, resolution=40), dataclasses.replace(stated, layout="compact")):
-        assert sizes(more) == (0.2, 0.2)
-    assert sizes(stated, discretise=20) == (0.2, 0.2)
 
 
 def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: Path, inputs: dict[str, Path]) -> None:

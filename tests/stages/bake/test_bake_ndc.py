@@ -16,14 +16,13 @@ from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.plan import NdcBake
 from stages.bake.pruning import RAYS_PER_VOXEL
-from stages.bake.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, finest_resolution, ndc_pixel, usual_mib
 from stages.bake.settings import BakeSettings
 from stages.io.field_file import load_renderer
 from stages.io.scene import load
 from stages.train import run as train
 from tests.efficientnerf.balls import settings
-from tests.stages.balls import job, poses
-from tests.stages.forward_facing import forward_facing, painted_wall
+from tests.stages.balls import job
+from tests.stages.forward_facing import painted_wall
 
 QUICK: dict[str, Any] = {"resolution": 64, "visibility_rays": 4000, "weight_threshold": 0.0, "max_mib": 8, "samples_per_voxel": 4, "refine_steps": 0}
 
@@ -71,13 +70,3 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     assert looked == {min(int(RAYS_PER_VOXEL[NdcBake] * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
     assert max(looked) > 1000
     assert not [event for event in told if event["event"] == "warning"]
-
-
-def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:
-    small, large, huge = (forward_facing(side) for side in (200, 1000, 4000))
-    assert usual_mib(small) == NDC_MIN_MIB
-    assert usual_mib(huge) == NDC_MAX_MIB
-    across, down = (large.forward.bounds[1] - large.forward.bounds[0])[:2] / ndc_pixel(large, large.forward)
-    assert usual_mib(large) == int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
-    assert usual_mib(load(poses(tmp_path))) == MAX_MIB
-    assert finest_resolution(huge).resolution == 1024

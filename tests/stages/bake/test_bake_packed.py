@@ -10,7 +10,6 @@ import pytest
 
 from efficientnerf.asset.economy import DEFAULT_RATE, economised
 from efficientnerf.asset.format import serialize
-from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from stages.bake import economy
@@ -41,16 +40,6 @@ def packed(tree: NerfTree, size: int) -> tuple[NerfTree, list[str], list[str]]:
 @pytest.fixture(scope="module")
 def tree() -> NerfTree:
     return noisy()
-
-
-def test_where_there_is_room_codes_are_as_fine_as_they_may_be(tree: NerfTree) -> None:
-    found, said, warned = packed(tree, 10**7)
-    assert isinstance(found.harmonics, PaletteHarmonics)
-    assert len(said) == 2
-    assert f"{DEFAULT_RATE:.3g}" in said[0]
-    assert f"{economy.FINEST:.3g}" in said[1]
-    assert len(serialize(found, "packed")) > len(serialize(economised(tree), "packed"))
-    assert not warned
 
 
 @pytest.mark.parametrize("share", [0.7])

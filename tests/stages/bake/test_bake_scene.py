@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import field_samples, format
-from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades, voxel_coordinates
-from efficientnerf.asset.rendering import render
+from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.rendering.field_renderer import FieldRenderer
@@ -22,7 +21,7 @@ from efficientnerf.training.exposure.model import exposure_of
 from pipeline.errors import Interrupted, UsageError
 from pipeline.executors.memory import Limit
 from stages.artifacts import BakeOutputs, TrainOutputs
-from stages.bake import holes, pruning, resolution, whole_scene
+from stages.bake import pruning, whole_scene
 from stages.bake import run as bake
 from stages.bake.resolution import MAX_CELLS, MAX_MIB, SCENE_BYTES, SCENE_MAX_MIB, finest_of_cascades, usual_mib
 from stages.bake.settings import BakeSettings
@@ -30,7 +29,7 @@ from stages.framing.view_coverage import close_to_path
 from stages.io.png import read_png, write_png
 from stages.io.scene import Scene, View, load, save
 from stages.train import averaged
-from tests.efficientnerf.surroundings import WALL, around, photographs, surroundings
+from tests.efficientnerf.surroundings import around, photographs, surroundings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job
 from tests.stages.spoilers import SPOILERS
 
@@ -77,27 +76,6 @@ def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactor
         patch.setattr(field_samples, "RAYS_PER_BLOCK", 2048)
         bake.run(job(folder, QUICK, stop=never, **inputs))
     return folder, never.count
-
-
-def test_a_view_that_was_held_back_is_shown_whole_by_the_asset_alone(inputs: dict[str, Path], undisturbed: tuple[Path, int]) -> None:
-    tree, report = format.load(undisturbed[0] / "out" / BakeOutputs.asset), json.loads((undisturbed[0] / "out" / "report.json").read_text())
-    assert len(tree.outer) >= 2
-    assert report["cascades"] == np.bincount(voxel_cascades(tree)).tolist()
-    assert min(report["cascades"]) > 0
-    assert tree.environment.shape == (16, 32, 3)
-    assert (cascades_of(tree)[0].bounds(tree.brick)[0] <= tree.region.bounds[0] + 1e-6).all()
-    assert (cascades_of(tree)[0].bounds(tree.brick)[1] >= tree.region.bounds[1] - 1e-6).all()
-    outermost = cascades_of(tree)[-1].bounds(tree.brick)
-    assert (outermost[1][:2] > WALL).all()
-    view = load(inputs["poses"]).views[-1]
-    truth = FieldRenderer(surroundings(), 0.2, 60.0).render(view.camera)
-    seen = render(tree, view.camera)
-    assert np.sqrt(((seen.colour - truth.colour) ** 2).mean()) < 0.12
-    opaque = truth.opacity > 0.95
-    assert (seen.opacity[opaque] < 0.5).mean() < 0.05
-    assert report["optimisation"]["psnr_after"] > report["optimisation"]["psnr_before"] > 10
-    assert set(report["optimisation"]["holes"]) == {"pruned", "restored", "refined", "voxels_restored"}
-    assert report["optimisation"]["holes"]["refined"] < 0.02
 
 
 def test_a_size_that_the_environment_map_fills_is_refused_early(
@@ -158,15 +136,6 @@ def test_scratch_that_is_damaged_is_made_again(inputs: dict[str, Path], tmp_path
     assert {"samples.json", "cascade0_000000.json", "refinement.safetensors"} <= set(warned)
 
 
-def test_the_asset_keeps_to_its_size(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resolution, "SCENE_VOXEL_PIXELS", 0.1)
-    tree, report = baked(tmp_path, inputs, resolution="auto", max_resolution=160, max_mib=1, refine_steps=2)
-    assert (tmp_path / "out" / BakeOutputs.asset).stat().st_size <= 2**20
-    assert report["voxels_along_longest_side"] < 160
-    assert "as its size allows" in report["resolution_decided_by"]
-    assert len(np.unique(voxel_cascades(tree))) == 1 + len(tree.outer)  # neither the subject nor what is around it is left out
-
-
 def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the prune drops a piece of the ball that the photographs show it comes back, within the room there is."""
     heaviest = pruning.heaviest
@@ -188,28 +157,6 @@ def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_
     assert found["restored"] < 0.2 * found["pruned"]
     assert 0 < found["voxels_restored"] <= dropped[0]
     assert any("holes" in event.get("text", "") and "restored" in event["text"] for event in events)
-
-
-def test_rays_that_end_in_holes_are_those_without_their_voxels(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int]) -> None:
-    from stages.train.data import pixels_of
-
-    tree = format.load(undisturbed[0] / "out" / BakeOutputs.asset)
-    scene = load(inputs["poses"])
-    pixels = pixels_of(inputs["poses"], tuple(view for view in scene.views if view.split == "train"))
-    samples = field_samples.field_samples(surroundings(), pixels, 20_000, 1e-3, lambda done, total: None)
-    made = job(tmp_path, QUICK)
-    _, before = holes.find_holes(made, tree, samples)
-    inner = voxel_cascades(tree) == 0
-    rays, share = holes.find_holes(made, subset(tree, ~inner), samples)
-    assert share > before + 0.1
-    assert (samples.opacity[rays] > 0.95).all()
-    ends = field_samples.surface_points(samples)[rays]
-    low, high = cascades_of(tree)[0].bounds(tree.brick)
-    assert ((ends > low - 0.2) & (ends < high + 0.2)).all(axis=1).mean() > 0.9
-    needed = holes.voxels_of_holes(tree, samples, rays)
-    assert inner[needed].mean() > 0.9
-    assert holes.find_holes(made, subset(tree, ~inner | needed), samples)[1] < before + 0.3 * (share - before)
-    assert not holes.voxels_of_holes(tree, samples, rays[:0]).any()
 
 
 def test_nothing_is_baked_where_the_cameras_pass(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,12 +43,3 @@ def test_the_room_is_used_where_voxels_grow_by_a_power(power: float, room: int) 
         assert MIN_FILL * (room - choice.resolution) - 0.1 * room <= count(choice.resolution) <= room - choice.resolution
         assert "as its size allows" in choice.why
     assert MIN_RESOLUTION <= choice.resolution <= 800
-
-
-def test_counts_that_jump_end_in_a_resolution_for_which_there_is_room() -> None:
-    def count(resolution: int) -> int:
-        return 100 * (resolution // 50) ** 3
-
-    choice = affordable_resolution(Choice(400, "pixels"), count, lambda resolution: 9_000)
-    assert count(choice.resolution) <= 9_000
-    assert choice.resolution >= 200

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import errno
-import io
 import os
 import resource
 from pathlib import Path
@@ -28,14 +27,6 @@ def test_a_write_that_the_system_cuts_short_keeps_the_number_of_its_error(tmp_pa
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert caught.value.errno == errno.EFBIG
-
-
-@pytest.mark.parametrize("values", [np.arange(24.0).reshape(2, 3, 4), np.zeros((0, 3), np.int32), np.ones(5, bool), np.arange(20)[::2], np.float16([[1], [2]])])
-def test_what_is_written_is_what_numpy_writes(values: np.ndarray, tmp_path: Path) -> None:
-    scratch.write_arrays({"values": values}, tmp_path / "block")
-    expected = io.BytesIO()
-    np.save(expected, values)
-    assert (tmp_path / "block_values.npy").read_bytes() == expected.getvalue()
 
 
 def test_nothing_writes_arrays_past_pythons_files() -> None:

@@ -6,12 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from efficientnerf.evaluation.metrics import psnr, ssim
 from stages.evaluate.views import ground_truth, subsample
-from stages.io.scene import View, load
+from stages.io.scene import load
 from tests.fakes import WHITE, BallField, BallTree
 from tests.stages.evaluate.balls import TREE, figures_of, job_in, make_scene, measure, problems_of, settings
 
@@ -40,26 +39,6 @@ def test_the_gap_is_that_of_the_same_pixels(tmp_path: Path) -> None:
     assert found["gap"]["psnr"] == pytest.approx(psnr(image.clip(0, 1), truth) - found["network"]["psnr"], abs=1e-4)
     assert found["gap"]["ssim"] == pytest.approx(ssim(image.clip(0, 1), truth) - found["network"]["ssim"], abs=1e-5)
     assert found["views"][0]["gap"] == {name: found["gap"][name] for name in ("psnr", "ssim", "psnr_colour_fitted")}
-
-
-def test_renders_are_compared_as_the_camera_shows_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each once: asset, network, and the asset on the network's pixels."""
-
-    def darker_below(view: View, image: np.ndarray, stride: int) -> np.ndarray:
-        rows = np.arange(view.camera.height)[(stride - 1) // 2 :: stride, None, None]
-        return image * (1 - 0.5 * rows / view.camera.height).astype(np.float32)
-
-    poses = make_scene(tmp_path / "poses", "t")
-    monkeypatch.setattr("stages.evaluate.run.as_taken", lambda trained, scene: darker_below)
-    job = job_in(tmp_path, poses, settings(field_image_scale=0.34))
-    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
-    found, view = figures_of(job), load(poses).views[0]
-    truth = ground_truth(poses, view, WHITE)
-    image = darker_below(view, TREE.render(view.camera, background=WHITE).colour.clip(0, 1), 1)
-    assert found["asset"]["psnr"] == pytest.approx(psnr(image, truth.colour), abs=1e-4)
-    assert found["asset"]["psnr"] < 20
-    assert found["network"]["psnr"] == pytest.approx(psnr(subsample(image, 3), truth.subsampled(3).colour), abs=1e-2)
-    assert found["gap"]["psnr"] == pytest.approx(0.0, abs=1e-2)
 
 
 def test_holes_are_what_the_network_has_and_the_asset_has_not(tmp_path: Path) -> None:

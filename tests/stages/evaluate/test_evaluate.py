@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +13,9 @@ import pytest
 from PIL import Image
 
 from efficientnerf.evaluation.metrics import psnr, ssim
-from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import Interrupted
-from stages.evaluate.splats import EvaluatedSplats
-from stages.evaluate.views import bounded_stride, stride_for, subsample, subsample_camera, upsample
+from stages.evaluate.views import bounded_stride, stride_for
 from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
@@ -46,19 +44,6 @@ def test_a_perfect_asset_is_as_good_as_eight_bits_allow(tmp_path: Path) -> None:
     assert field.calls == [(f"v{k}.png", WIDTH, HEIGHT) for k in (1, 3, 5)]
 
 
-def test_gaussians_that_look_like_the_asset_have_its_figures(tmp_path: Path) -> None:
-    """Over the same background; and where a first attempt had none, its views are measured again."""
-    poses = make_scene(tmp_path / "poses", "tt")
-    splats = EvaluatedSplats(lambda camera, background: TREE.render(camera, background=background).colour, {"gaussians": 7})
-    measure(TREE, lambda: BallField(TREE, background=WHITE), job_in(tmp_path, poses, out="none"))
-    assert json.loads((tmp_path / "none/metrics.json").read_text())["splats"] is None
-    job = job_in(tmp_path, poses)
-    measure(TREE, lambda: BallField(TREE, background=WHITE), job, splats)
-    metrics = figures_of(job)
-    assert metrics["splats"] == {"psnr": metrics["asset"]["psnr"], "ssim": metrics["asset"]["ssim"], "gaussians": 7, "views": 2, "scale": 1.0}
-    assert [view["splats"]["psnr"] for view in metrics["views"]] == [view["asset"]["psnr"] for view in metrics["views"]]
-
-
 def test_figures_are_those_of_the_metrics(tmp_path: Path) -> None:
     poses = make_scene(tmp_path / "poses", "rt")
     worse = replace(TREE, radius=0.5)
@@ -74,18 +59,6 @@ def test_figures_are_those_of_the_metrics(tmp_path: Path) -> None:
     assert found["ssim"] == pytest.approx(ssim(image, truth), abs=1e-5)
     assert found["psnr_in_box"] == pytest.approx(psnr(image, truth, pixels[..., 3] > 0), abs=1e-4)
     assert found["psnr_in_box"] < found["psnr"] < 30
-
-
-def test_the_network_is_bounded_in_views_and_scale_and_the_asset_is_not(tmp_path: Path) -> None:
-    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t" * 6), settings(field_views=2, field_image_scale=0.5))
-    field = BallField(TREE, background=WHITE)
-    measure(TREE, lambda: field, job)
-    metrics = figures_of(job)
-    assert [view["network"] is not None for view in metrics["views"]] == [False, True, False, False, True, False]
-    assert (metrics["network"]["views"], metrics["network"]["scale"], metrics["asset"]["views"]) == (2, 0.5, 6)
-    assert {call[1:] for call in field.calls} == {(30, 22)}
-    assert metrics["views"][1]["network"]["psnr"] > 50, "subsampling takes nothing from a perfect field"
-    assert metrics["views"][1]["asset"]["width"] == WIDTH
 
 
 @pytest.mark.parametrize(("splits", "expected", "warned"), [("rrv", "val", False), ("rr", "train", True), ("rvt", "test", False)])
@@ -177,22 +150,3 @@ def test_stride_for_bounds_the_pixels() -> None:
     assert stride_for([view] * 4, 9_999) == 3
     assert stride_for([], 1) == 1
     assert stride_for([view], 1) == bounded_stride([view], 10**6) == min(view.camera.width, view.camera.height), "each view keeps a pixel"
-
-
-@pytest.mark.parametrize("stride", [1, 3])
-@pytest.mark.parametrize("model", [("SIMPLE_RADIAL", (70.0, 31.0, 20.0, 0.1)), ("OPENCV_FISHEYE", (70.0, 72.0, 31.0, 20.0, 0.1, 0.01, 0.0, 0.0))])
-def test_a_subsampled_camera_has_the_rays_of_the_pixels_that_are_kept(stride: int, model: tuple[str, tuple[float, ...]]) -> None:
-    camera = Camera("a", 61, 44, *model, pose_on_sphere((0.0, 0.0, 0.0), 3.0, 10.0, 20.0))
-    small = subsample_camera(camera, stride)
-    expected = subsample(rays(camera)[1].reshape(44, 61, 3), stride)
-    np.testing.assert_allclose(rays(small)[1].reshape(small.height, small.width, 3), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("stride", [1, 3])
-def test_upsampling_gives_back_what_was_kept_and_straight_lines_between(stride: int) -> None:
-    y, x = np.mgrid[0:40, 0:50].astype(np.float32)
-    ramp = np.stack([x, y, x + 2 * y, np.ones_like(x)], -1)
-    again = upsample(subsample(ramp, stride), stride, 50, 40)
-    np.testing.assert_allclose(subsample(again, stride), subsample(ramp, stride), atol=1e-4)
-    inner = slice(stride, -stride)
-    np.testing.assert_allclose(again[inner, inner], ramp[inner, inner], atol=0.2)  # OpenCV knows 32 places between two pixels

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
-from pipeline.errors import BadInput, UsageError
-from stages.evaluate.comparison import AGAINST_NETWORK, GAP, load_lpips, lpips_metrics
+from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, _layers
+from pipeline.errors import BadInput
+from stages.evaluate.comparison import load_lpips
 from stages.evaluate.lpips_weights import BACKBONES
-from stages.evaluate.mesh import FIGURES
-from stages.evaluate.summary import summary
-from stages.evaluate.views import GroundTruth
 
 
 @pytest.fixture(autouse=True)
@@ -71,24 +68,6 @@ def test_it_is_the_formula(network: str, tmp_path: Path) -> None:
     assert metric(0.9 * truth + 0.1 * image, truth) < metric(image, truth)
 
 
-def test_what_a_mask_leaves_out_does_not_count(tmp_path: Path) -> None:
-    metric = load_lpips("alex", written(tmp_path / "weights", "alex"), bundled=[])
-    image, truth = images()
-    mask = np.zeros(image.shape[:2], bool)
-    assert metric(image, truth, mask) == 0
-    mask[:, :40] = True
-    assert 0 < metric(image, truth, mask) < metric(image, truth)
-
-
-def test_missing_weights_are_named_with_the_remedy(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"alexnet-owt-7be5be79\.pth.*download\.pytorch\.org.*lpips_weights.*lpips=off"):
-        load_lpips("alex", str(tmp_path), bundled=[])
-    folder = Path(written(tmp_path / "weights", "vgg"))
-    (folder / "vgg.pth").unlink()
-    with pytest.raises(UsageError, match=r"vgg\.pth.*efficientnerf\[lpips\]"):
-        load_lpips("vgg", str(folder), bundled=[])
-
-
 def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:
     folder = Path(written(tmp_path / "weights", "alex"))
     torch.save({"lin0.model.1.weight": torch.zeros(1, 3, 1, 1)}, folder / "alex.pth")
@@ -97,21 +76,3 @@ def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:
     (folder / "alex.pth").write_bytes(b"not weights")
     with pytest.raises(BadInput, match="not a readable file of weights"):
         load_lpips("alex", str(folder), bundled=[])
-
-
-def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
-    metrics = {"lpips_alex": load_lpips("alex", written(tmp_path / "weights", "alex"), bundled=[])}
-    image, truth = (a.astype(np.float32) for a in images())
-    figures = lpips_metrics(metrics, image, GroundTruth(truth, None, None))
-    assert figures["lpips_alex"] is not None
-    assert figures["lpips_alex"] > 0
-    assert lpips_metrics(metrics, image[:50], GroundTruth(truth[:50], None, None)) == {"lpips_alex": None}
-    some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, "psnr_colour_fitted": 21.0, **figures}
-    network = {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0, "floaters": None}
-    against = {"asset_with_network_background": None, "gap": dict.fromkeys(GAP), **dict.fromkeys(AGAINST_NETWORK)}
-    against |= {"trivial": None, "sparse_points": None}
-    views = [{"name": "a", "network": network, "asset": {**some, "lpips_alex": None}, "mesh": dict.fromkeys(FIGURES), **against}]
-    found = summary(views, split="test", stride=1, background=None, mesh={"faces": 2}, perceptual=("lpips_alex",))
-    assert found["network"]["lpips_alex"] == figures["lpips_alex"]
-    assert found["asset"]["lpips_alex"] is None
-    assert Lpips.__doc__

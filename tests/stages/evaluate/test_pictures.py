@@ -8,35 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from pipeline.stage import Job
 from stages.io.scene import load
 from tests.fakes import WHITE, BallField
-from tests.stages.evaluate.balls import HEIGHT, TREE, WIDTH, figures_of, job_in, make_scene, measure, settings
+from tests.stages.evaluate.balls import TREE, job_in, make_scene, measure, settings
 from tests.stages.spoilers import SPOILERS
-
-
-def test_strips_show_worst_median_and_best_at_full_size(tmp_path: Path) -> None:
-    poses = make_scene(tmp_path / "poses", "tttt", background=None)
-    worse, job = replace(TREE, centre=(0.1, 0.0, 0.0)), job_in(tmp_path, poses, settings(strips="on", field_views=1, field_image_scale=0.5))
-    field = BallField(TREE)
-    measure(worse, lambda: field, job)
-    found = figures_of(job)
-    ranked = sorted(found["views"], key=lambda view: view["asset"]["psnr"])
-    assert [(strip["which"], strip["view"]) for strip in found["strips"]] == [("worst", ranked[0]["name"]), ("median", ranked[2]["name"]),
-                                                                              ("best", ranked[3]["name"])]  # fmt: skip
-    assert [call[1:] for call in field.calls[-3:]] == [(WIDTH, HEIGHT)] * 3
-    for strip in found["strips"]:
-        with Image.open(job.out / strip["file"]) as image:
-            assert image.width >= 3 * WIDTH
-            picture = np.asarray(image)
-        assert strip["network"]["psnr"] > 45 > strip["asset"]["psnr"]
-        view = next(view for view in load(poses).views if view.name == strip["view"])
-        with Image.open(poses / view.image) as image:
-            photograph = np.asarray(image)
-        rows, columns = np.nonzero((picture == photograph[0, 0]).all(-1))
-        assert any(np.array_equal(picture[y : y + HEIGHT, x : x + WIDTH], photograph) for y, x in zip(rows, columns, strict=True)), "pixel for pixel"
 
 
 def test_the_captured_path_is_a_video_of_the_asset(tmp_path: Path) -> None:

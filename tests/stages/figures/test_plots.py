@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, with_palette
-from stages.io.png import read_png
+from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet
 
 
 def test_sheet_holds_each_image_at_its_place(tmp_path: Path) -> None:
@@ -25,17 +24,3 @@ def test_sheet_holds_each_image_at_its_place(tmp_path: Path) -> None:
     assert tuple(pixels[second + 30, MARGIN + 30]) == (0, 255, 0)
     assert (pixels[second + 60 : second + 60 + LABEL_HEIGHT, MARGIN : MARGIN + 60] < 128).any(), "the label is written"
     assert (pixels[:, 60 + MARGIN + 1 : 60 + 2 * MARGIN - 1] == 255).all(), "a long label stays in its column"
-
-
-def test_a_palette_halves_a_plot_and_shows_the_same(tmp_path: Path) -> None:
-    path, x = tmp_path / "a.png", np.linspace(0, 6, 50)
-    curve(path, {str(n): (x, np.sin(x + n)) for n in range(8)}, x_label="time", y_label="height")
-    before, (plain, size) = read_png(path)[..., :3].astype(int), (read_png(path).ndim, path.stat().st_size)
-    with_palette(path)
-    with Image.open(path) as image:
-        assert (plain, image.mode) == (3, "P")
-        after = np.asarray(image.convert("RGB")).astype(int)
-    assert path.stat().st_size < 0.5 * size
-    assert np.abs(after - before).max() < 32
-    assert np.abs(after - before).mean() < 1
-    assert [each.name for each in tmp_path.iterdir()] == ["a.png"]

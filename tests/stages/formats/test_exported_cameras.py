@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,6 @@ import pytest
 from efficientnerf.geometry.cameras import project
 from pipeline.errors import BadInput
 from stages.formats import importers
-from stages.formats.importers.brown import MAX_ERROR, quotient_of_cubics
 from stages.formats.importers.description import describe_source
 from stages.io.capture import Capture
 from tests.stages import captures, exports
@@ -97,43 +94,6 @@ def test_lenses_of_metashape_that_no_model_describes_are_refused(lens: dict[str,
         read(folder)
 
 
-@pytest.mark.parametrize("k4", [0.2, -0.076])
-def test_a_fourth_radial_coefficient_becomes_a_quotient(k4: float) -> None:
-    r = np.linspace(0, 0.9, 50)
-    factor = np.array([1.0, -0.1, 0.05, 0.01, k4])
-    top, bottom = quotient_of_cubics(factor, 4000.0, float(0.9 * np.polyval(factor[::-1], 0.81)), "a lens")
-    found = np.polyval(top[::-1], r * r) / np.polyval(bottom[::-1], r * r)
-    assert np.abs(found - np.polyval(factor[::-1], r * r)).max() * 4000 < MAX_ERROR
-
-
-def test_opensfms_points_and_reconstructions(tmp_path: Path) -> None:
-    folder, _ = exports.opensfm(tmp_path / "a", ".")
-    capture = read(folder)
-    np.testing.assert_allclose(capture.points.xyz, POINTS)
-    assert capture.points.tracks == ((0, 1, 2, 3),) * 3 + ((),) * 6
-    assert capture.points.rgb[4].tolist() == [10, 20, 34]
-    assert capture.metric
-    assert any("the reconstruction with 6 images is used; there are others with 1" in warning for warning in capture.warnings)
-
-
-def test_kaptures_points_and_images_without_a_pose(tmp_path: Path) -> None:
-    capture = read(exports.kapture(tmp_path / "a")[0])
-    np.testing.assert_allclose(capture.points.xyz, POINTS)
-    assert capture.points.tracks == ((), (), (0, 3), (), (1,), (), (), (), ())
-    assert capture.rejected == (("map/lost.png", "without a pose"),)
-
-
-def test_polycam_without_corrected_cameras(tmp_path: Path) -> None:
-    folder, pixels = exports.polycam(tmp_path / "a", corrected=False)
-    (folder / "keyframes/cameras/img_5.json").unlink()
-    capture = read(folder)
-    assert_seen(capture, {name: where for name, where in pixels.items() if name != "img_5.jpg"})
-    assert capture.metric
-    assert capture.up.tolist() == [0, 1, 0]
-    assert capture.rejected == (("keyframes/images/img_5.jpg", "without a camera file"),)
-    assert any("the phone's own poses" in warning for warning in capture.warnings)
-
-
 def test_splits_bounds_masks_and_bad_frames(tmp_path: Path) -> None:
     plain = read(exports.nsvf(tmp_path / "nsvf")[0])
     assert [photo.split for photo in plain.photos] == ["train"] * 2 + ["val"] * 2 + ["test"] * 2
@@ -156,26 +116,6 @@ def test_splits_bounds_masks_and_bad_frames(tmp_path: Path) -> None:
 def moved(folder: Path, to: str) -> Path:
     (folder / "images").rename(folder / to)
     return folder
-
-
-@pytest.mark.parametrize("how", ["nerfstudio", "colmap bin"])
-def test_images_under_another_folder_are_found_and_said(how: str, tmp_path: Path) -> None:
-    folder = moved(captures.WRITERS[how][1](tmp_path / "a"), "photographs of today")
-    capture = read(folder)
-    captures.assert_same_rays(capture, captures.cameras())
-    assert any("6 images are not where they are listed" in warning and "photographs of today/img_0.png" in warning for warning in capture.warnings)
-    assert len([path for path in importers.files(folder, Settings()) if path.suffix == ".png"]) == 6
-
-
-def test_depth_and_images_of_another_split_do_not_stand_in(tmp_path: Path) -> None:
-    """Blender's splits have files of the same names."""
-    folder = moved(captures.nerfstudio(tmp_path / "a"), "Depth")
-    with pytest.raises(BadInput):
-        read(folder)
-    folder = captures.blender(tmp_path / "b", [replace(camera, name=f"r_{index % 4}.png") for index, camera in enumerate(captures.cameras())])
-    shutil.rmtree(folder / "train")
-    with pytest.raises(BadInput):
-        read(folder)
 
 
 # --- hostile

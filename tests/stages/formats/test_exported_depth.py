@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Camera, project
-from pipeline.stage import Job
 from stages.formats import importers
 from stages.formats.importers import depth
-from stages.io import scene
 from stages.io.pictures import UnreadableImage
-from stages.poses import run as poses
-from stages.train.data import sparse_depth_of
 from tests.stages import captures, exports
 from tests.stages.captures import Settings
 from tests.stages.exports import read
@@ -123,17 +119,3 @@ def test_an_exr_that_is_cut_short_prints_nothing(tmp_path: Path, capfd: pytest.C
         with contextlib.suppress(UnreadableImage):
             depth._exr(path)
     assert not capfd.readouterr().out
-
-
-def test_points_of_depth_supervise_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scene that the poses stage writes of a phone's capture has rays to them."""
-    folder, _ = sharp(tmp_path / "a")
-    monkeypatch.setattr("stages.formats.importers.depth.MAX_POINTS", 200)
-    job = Job(settings=poses.PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=folder, stage="poses", report=lambda event: None)
-    poses.run(job)
-    made = scene.load(tmp_path / "poses")
-    assert made.metric
-    found = sparse_depth_of(tmp_path / "poses", made)
-    ends = found.origins + found.directions * found.distance[:, None]
-    there = made.world_from_capture.inverse().points(ends)
-    assert np.abs(there[:, 2]).max() < 0.02

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import unicodedata
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,8 @@ from PIL import Image
 from pipeline.errors import BadInput
 from stages.formats import importers
 from stages.formats.importers.description import describe_source
-from stages.formats.importers.masks import masks_of
 from stages.formats.importers.photographs import photographs
-from stages.formats.importers.source import Source, images_in
+from stages.formats.importers.source import Source
 from stages.io.material import find_material
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH, Settings
@@ -78,26 +76,6 @@ def test_photographs_in_other_folders_are_named(tmp_path: Path) -> None:
 # --- masks
 
 
-@pytest.mark.parametrize("name", ["1.mask.png", "1.jpg.mask", "1_MASK.PNG"])
-def test_masks_beside_their_photographs_are_no_photographs(name: str, tmp_path: Path) -> None:
-    photograph = captures.write_picture(tmp_path / "1.jpg", captures.picture())
-    with open(tmp_path / name, "wb") as file:
-        Image.fromarray(BLACK).save(file, "PNG")
-    other = captures.write_picture(tmp_path / "2_mask.png", captures.picture(1))  # of no photograph: it is one
-    assert images_in(tmp_path) == photographs(Source(tmp_path)) == [photograph, other]
-    assert masks_of(Source(tmp_path), [photograph, other]) == {photograph: tmp_path / name}
-    assert importers.files(tmp_path, Settings()) == sorted([photograph, tmp_path / name, other])
-
-
-@pytest.mark.parametrize("masks", ["Masks", "mask"])
-def test_folders_of_masks_have_any_case(masks: str, tmp_path: Path) -> None:
-    folder = write(tmp_path, "photos/a/1.png", f"{masks}/photos/a/1.png", "photos/b/1.png", f"photos/b/{masks}/1_mask.png")
-    source = Source(folder)
-    found = photographs(source)
-    assert found == [folder / "photos/a/1.png", folder / "photos/b/1.png"]
-    assert masks_of(source, found) == {found[0]: folder / masks / "photos/a/1.png", found[1]: folder / f"photos/b/{masks}/1_mask.png"}
-
-
 # --- one picture in two formats
 
 
@@ -132,23 +110,6 @@ def test_a_picture_in_two_formats_is_read_once(tmp_path: Path) -> None:
     assert "3 pictures lie there twice, in two formats, and are read once (IMG_0.HEIC is IMG_0.JPG, " in said
     assert len(importers.files(folder, Settings())) == 6  # what they hold decides
     assert read(tmp_path)[0] == [f"shoot/{name}" for name in found]  # anywhere below, too
-
-
-def test_two_pictures_of_one_name_are_two(tmp_path: Path) -> None:
-    """Unless they are alike, which is asked again when one has changed."""
-    captures.write_picture(tmp_path / "a.jpg", smooth(0))
-    heic(tmp_path / "a.heic", smooth(1))
-    captures.write_picture(tmp_path / "b.jpg", smooth(2))
-    captures.write_picture(tmp_path / "b.png", smooth(2)[:64])
-    captures.write_picture(tmp_path / "c.jpg", smooth(3))
-    captures.write_picture(tmp_path / "elsewhere" / "c.png", smooth(3))
-    captures.write_picture(tmp_path / "d.jpg", smooth(0))
-    captures.write_picture(tmp_path / "d.png", smooth(0))
-    alone = ["a.heic", "a.jpg", "b.jpg", "b.png", "c.jpg", "d.jpg"]
-    assert read(tmp_path)[0] == alone
-    captures.write_picture(tmp_path / "d.png", smooth(1))
-    os.utime(tmp_path / "d.png", (1, 1))
-    assert read(tmp_path)[0] == [*alone, "d.png"]
 
 
 def test_the_time_tells_pictures_apart_and_the_one_that_has_it_is_read(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import itertools
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -14,10 +12,9 @@ import pytest
 
 from efficientnerf.evaluation.metrics import psnr
 from efficientnerf.geometry.cameras import Camera, Similarity, project
-from efficientnerf.rendering.colour import linear_from_srgb, linear_premultiplied, srgb_from_linear, straight_from_premultiplied
-from pipeline.errors import UsageError
+from efficientnerf.rendering.colour import linear_from_srgb, linear_premultiplied, srgb_from_linear
 from stages.formats.exporters.exr import write_exr
-from stages.formats.exporters.frames import background_from_text, frame_from_rendering
+from stages.formats.exporters.frames import frame_from_rendering
 from stages.formats.exporters.video import write_mp4
 from stages.io.png import read_png, write_png
 from tests.fakes import BallTree
@@ -31,20 +28,6 @@ def test_srgb_curve_and_its_inverse() -> None:
     values = np.linspace(-0.1, 1.2, 50)
     np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(values)), values, atol=1e-6)
     assert linear_from_srgb(np.zeros(3, np.float32)).dtype == np.float32
-
-
-def test_light_is_taken_of_the_straight_colour() -> None:
-    straight, opacity = np.array([[0.5, 0.25, 1.0]]), np.array([0.25])
-    np.testing.assert_allclose(linear_premultiplied(straight * 0.25, opacity), linear_from_srgb(straight) * 0.25, atol=1e-12)
-    assert (straight_from_premultiplied(np.ones((1, 3)), np.zeros(1)) == 0).all()
-
-
-def test_backgrounds() -> None:
-    for text, colour in [("white", (1, 1, 1)), ("black", (0, 0, 0)), ("#ff0080", (1, 0, 128 / 255)), ("transparent", None)]:
-        assert background_from_text(text) == colour
-    for text in ("whit", "#12345", "#１２３４５６"):
-        with pytest.raises(UsageError, match="#rrggbb"):
-            background_from_text(text)
 
 
 def test_png_keeps_its_pixels_and_bytes(tmp_path: Path) -> None:
@@ -131,40 +114,6 @@ def test_mp4_decodes_to_its_frames(tmp_path: Path, size: tuple[int, int]) -> Non
     # Colours come back without a cast: the wrong matrix or range would shift the means (the decoder rounds down, by up to 1.5).
     means = [np.abs(np.mean(a[: size[0], : size[1]].astype(float) - f, axis=(0, 1))).max() for f, a in zip(frames, decoded, strict=True)]
     assert max(means) < 2.0
-
-
-def test_mp4_repeats_to_the_byte_whatever_lies_in_memory(tmp_path: Path) -> None:
-    frames = [np.random.default_rng(n).integers(0, 256, (72, 96, 3), np.uint8) // 8 + frame // 2 for n, frame in enumerate(moving_frames(12, 72, 96))]
-    contents, clutter = set(), []
-    for attempt in range(4):
-        clutter.append(np.random.default_rng(attempt).random(7919 * (attempt + 1)))
-        write_mp4(frames, tmp_path / "a.mp4", fps=6)
-        contents.add((tmp_path / "a.mp4").read_bytes())
-    assert len(contents) == 1
-
-
-def test_mp4_of_many_frames_shows_each_at_its_time(tmp_path: Path) -> None:
-    write_mp4(moving_frames(75, 32, 32), tmp_path / "a.mp4", fps=30)
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        stream = container.streams.video[0]
-        packets = [packet for packet in container.demux(stream) if packet.pts is not None]
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        shown = [frame.time for frame in container.decode(container.streams.video[0])]
-    assert sorted(packet.pts * packet.time_base for packet in packets) == [Fraction(k, 30) for k in range(75)]
-    assert [packet.dts for packet in packets] == sorted({packet.dts for packet in packets})
-    assert shown == pytest.approx([k / 30 for k in range(75)])
-    assert all(before < after for before, after in itertools.pairwise(shown))
-
-
-def test_mp4_index_lies_before_the_pictures_and_no_program_signs_it(tmp_path: Path) -> None:
-    write_mp4(moving_frames(3, 32, 32), tmp_path / "a.mp4", fps=30)
-    content = (tmp_path / "a.mp4").read_bytes()
-    assert 0 < content.index(b"moov") < content.index(b"mdat")
-    assert b"Lavf" not in content
-    for frames in ([], moving_frames(1, 32, 32) + moving_frames(1, 32, 34)):
-        with pytest.raises(ValueError, match="frame"):
-            write_mp4(frames, tmp_path / "b.mp4", fps=30)
-    assert not (tmp_path / "b.mp4").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from efficientnerf.geometry.cameras import project
 from pipeline.errors import BadInput
@@ -17,7 +16,6 @@ from stages.formats import importers
 from stages.io.capture import Capture
 from tests.stages import captures, exports
 from tests.stages.captures import Settings
-from tests.stages.exports import POINTS
 
 NAME = "3d-scanner-app"
 
@@ -49,18 +47,6 @@ def test_frame_up_and_what_has_no_partner(tmp_path: Path) -> None:
     assert folder / "frame_00006.json" not in importers.files(folder, Settings()), "it has no picture"
 
 
-def test_a_picture_that_exif_turns_has_the_camera_of_its_stored_pixels(tmp_path: Path) -> None:
-    folder, pixels = exports.scanner_app(tmp_path / "a")
-    path = folder / "frame_00001.jpg"
-    exif = Image.Exif()
-    exif[274] = 6  # upright when turned clockwise
-    captures.write_picture(path, captures.picture(), exif=exif)
-    camera = next(photo.camera for photo in read(folder).photos if photo.image == path)
-    assert (camera.width, camera.height) == (captures.HEIGHT, captures.WIDTH)
-    x, y = pixels[path.name].T
-    np.testing.assert_allclose(project(camera, POINTS)[0], np.stack([captures.HEIGHT - y, x], -1), atol=1e-6)
-
-
 @pytest.mark.parametrize("size", [(64, 48), (24, 32)])
 def test_pictures_that_the_lens_is_not_of_are_refused(size: tuple[int, int], tmp_path: Path) -> None:
     folder, _ = exports.scanner_app(tmp_path / "a")
@@ -84,22 +70,6 @@ def test_values_that_cannot_be_are_refused(tmp_path: Path) -> None:
     assert importers.detect(folder) == NAME, "no other format is chosen"
     with pytest.raises(BadInput, match=r"frame_00000\.json"):
         read(folder)
-
-
-def test_other_formats_keep_their_folders(tmp_path: Path) -> None:
-    """Pictures with notes of other programs, and transforms.json, which converters write beside the frames."""
-    folder = changed(tmp_path / "notes", lambda document: document.pop("cameraPoseARFrame"), every=True)
-    assert importers.candidates(folder) == ["photographs"]
-    for path in folder.glob("frame_*.json"):
-        path.write_text("{")
-    assert importers.candidates(folder) == ["photographs"]
-    folder, pixels = exports.scanner_app(tmp_path / "converted")
-    listed = captures.frames(captures.cameras(), folder=".")
-    for frame, name in zip(listed, pixels, strict=True):
-        frame["file_path"] = name
-    lens = {"fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 12.0, "w": captures.WIDTH, "h": captures.HEIGHT}
-    captures.write_json(folder / "transforms.json", lens | {"camera_model": "OPENCV", "frames": listed})
-    assert importers.candidates(folder)[:2] == ["nerfstudio", NAME]
 
 
 def test_depth_where_the_sensor_is_sure(tmp_path: Path) -> None:

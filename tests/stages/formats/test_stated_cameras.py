@@ -77,15 +77,6 @@ def both(folder: Path, made: list[Camera]) -> Path:
     return folder
 
 
-def looking_one_way() -> list[Camera]:
-    made = []
-    for index, camera in enumerate(captures.cameras()):
-        pose = np.eye(4)
-        pose[:3, 3] = 0.1 * index, 0.05 * (index % 2), -4.0
-        made.append(Camera(camera.name, camera.width, camera.height, camera.model, camera.params, pose))
-    return made
-
-
 def test_a_model_beside_llff_is_read_where_the_capture_goes_round(tmp_path: Path) -> None:
     folder = both(tmp_path, captures.cameras(model="RADIAL", params=captures.LENSES["RADIAL"]))
     assert importers.candidates(folder)[:2] == ["colmap", "llff"]
@@ -94,32 +85,7 @@ def test_a_model_beside_llff_is_read_where_the_capture_goes_round(tmp_path: Path
     assert folder / "poses_bounds.npy" in importers.files(folder, Settings(llff_factor=1))
 
 
-def test_llff_is_read_where_all_look_one_way_or_the_model_is_of_other_images(tmp_path: Path) -> None:
-    assert importers.detect(both(tmp_path / "ahead", looking_one_way())) == "llff"
-    folder = both(tmp_path / "fewer", captures.cameras(5))
-    np.save(folder / "poses_bounds.npy", captures.llff_rows(captures.cameras(6), scale=1))
-    captures.write_picture(folder / "images" / "img_5.png", captures.picture(5))
-    assert importers.detect(folder) == "llff"
-    folder = both(tmp_path / "damaged", captures.cameras())
-    (folder / "sparse/0/images.bin").write_bytes((folder / "sparse/0/images.bin").read_bytes()[:-1])
-    assert importers.detect(folder) == "llff"
-
-
 # --- lenses of COLMAP
-
-
-def test_fisheye_models_with_fewer_parameters(tmp_path: Path) -> None:
-    made = captures.cameras(model="OPENCV_FISHEYE", params=(30.0, 30.0, 16.0, 12.0, 0.05, 0.0, 0.0, 0.0))
-    folder = captures.colmap_txt(tmp_path, made)
-    lines = {"SIMPLE_RADIAL_FISHEYE": "30 16 12 0.05", "RADIAL_FISHEYE": "30 16 12 0.05 0"}
-    numbers = {"SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9}
-    for model, params in lines.items():
-        (folder / "sparse/0/cameras.txt").write_text(f"7 {model} {WIDTH} {HEIGHT} {params}\n")
-        capture = importers.IMPORTERS["colmap"].read(folder, Settings())
-        assert_same_rays(capture, made)
-        assert capture.photos[0].camera.model == "OPENCV_FISHEYE"
-        assert colmap_model.MODEL_NUMBERS[numbers[model]] == (model, colmap_model.count_parameters(model))
-    assert colmap_model.as_traced("RADIAL_FISHEYE", (30.0, 16.0, 12.0, 0.1, 0.2)) == ("OPENCV_FISHEYE", (30.0, 30.0, 16.0, 12.0, 0.1, 0.2, 0.0, 0.0))
 
 
 def test_they_are_pycolmaps(tmp_path: Path) -> None:

@@ -15,10 +15,9 @@ import pytest
 from PIL import Image
 
 from efficientnerf.surface.mesh import Mesh, Texture
-from efficientnerf.surface.texturing.corners import split_at_seams
 from pipeline.errors import BadInput
 from stages.formats.exporters import MESH_EXPORTERS
-from stages.formats.exporters.textures import open_faces, plain_stem
+from stages.formats.exporters.textures import open_faces
 from tests.stages.io.meshes import NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
 
 SIDE = 48
@@ -127,22 +126,6 @@ def test_the_same_surface_in_the_same_colours(extension: str, normals: bool, pic
     assert written == sorted([path.name, *(each.name for each in exporter.companions(path, picture, normals))])
 
 
-def test_stl_and_ply_have_the_same_surface(tmp_path: Path) -> None:
-    mesh = textured()
-    MESH_EXPORTERS[".stl"](mesh, tmp_path / "a.stl", Z_UP)
-    data = (tmp_path / "a.stl").read_bytes()
-    assert not data.startswith(b"solid")
-    rows = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")], struct.unpack_from("<I", data, 80)[0], 84)
-    np.testing.assert_allclose(rows["corners"], mesh.vertices[mesh.faces])
-    edges = rows["corners"][:, 1:] - rows["corners"][:, :1]
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    np.testing.assert_allclose(rows["normal"], normal / np.linalg.norm(normal, axis=1, keepdims=True), atol=1e-6)
-    assert len(data) == 84 + 50 * len(mesh.faces)
-    MESH_EXPORTERS[".ply"](mesh, tmp_path / "a.ply", Z_UP)
-    MESH_EXPORTERS[".ply"](block(), tmp_path / "b.ply", Z_UP)
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
 @pytest.mark.parametrize("extension", [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in MESH_EXPORTERS])
 def test_the_same_mesh_is_the_same_bytes(extension: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On another day, elsewhere on the earth, in another folder."""
@@ -154,17 +137,6 @@ def test_the_same_mesh_is_the_same_bytes(extension: str, tmp_path: Path, monkeyp
         os.utime(tmp_path / name / f"thing{extension}", (1e9, 1e9))
         found.append([each.read_bytes() for each in sorted((tmp_path / name).iterdir())])
     assert found[0] == found[1]
-
-
-def test_vertices_are_split_at_seams_alone() -> None:
-    mesh = textured()
-    corners = split_at_seams(mesh)
-    assert len(corners.vertex) == 24, "three sides meet in each of eight corners"
-    np.testing.assert_array_equal(corners.vertex[corners.faces], mesh.faces)
-    np.testing.assert_allclose(corners.coordinates[corners.faces], mesh.texture.coordinates, atol=1e-6)
-    whole = replace(mesh, texture=Texture((mesh.vertices[mesh.faces][..., :2] - 1) / 3, mesh.texture.colours))
-    np.testing.assert_array_equal(split_at_seams(whole).vertex, np.arange(8))
-    np.testing.assert_array_equal(split_at_seams(whole).faces, mesh.faces)
 
 
 def test_open_meshes_are_seen_from_both_sides(tmp_path: Path) -> None:
@@ -202,18 +174,6 @@ def test_usds_own_validators_find_nothing(mesh: Mesh, tmp_path: Path) -> None:
     assert len(validators) > 10
     errors = UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path)))
     assert [error.GetMessage() for error in errors] == []
-
-
-def test_the_names_of_an_objs_other_files_are_plain(tmp_path: Path) -> None:
-    names = ["my scan", "my_scan", "ünï", "日本", "-o", ".hidden", "a" * 140, "mesh"]
-    stems = [plain_stem(Path(f"{name}.obj")) for name in names]
-    assert stems[1::6] == ["my_scan", "mesh"]
-    assert len(set(stems)) == len(names)
-    assert all(stem.isascii() and not {" ", "/"} & set(stem) and stem[0] not in ".-" for stem in stems)
-    for name in names[:4]:
-        MESH_EXPORTERS[".obj"](textured(), tmp_path / f"{name}.obj", Z_UP)
-        read_obj(tmp_path / f"{name}.obj")
-    assert len(list(tmp_path.iterdir())) == 12
 
 
 @pytest.mark.parametrize(("function", "call"), [("fsync", 0), ("fsync", 3), ("replace", 0), ("replace", 2)])
@@ -256,11 +216,3 @@ def test_broken_textures_are_refused(extension: str, tmp_path: Path) -> None:
         with pytest.raises(BadInput, match=r"texture|coordinates|normal"):
             MESH_EXPORTERS[extension](mesh, tmp_path / f"a{extension}", Z_UP)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_textures_of_eight_thousand_texels_a_side(tmp_path: Path) -> None:
-    colours = np.zeros((8192, 8192, 3), np.uint8)
-    colours[::512] = 255
-    MESH_EXPORTERS[".glb"](spoilt(colours=colours), tmp_path / "a.glb", Z_UP)
-    np.testing.assert_array_equal(read_glb(tmp_path / "a.glb")[2], colours)

@@ -88,13 +88,6 @@ def test_the_bytes_are_those_that_openvdb_has_read(tmp_path: Path) -> None:
     assert len(content) < 1.3 * sum(grid.values.nbytes for grid in grids) + 200 * (64 * 2 + 1024 + 2 * 8192), "nothing is written of empty space"
 
 
-def test_a_voxel_that_is_listed_twice_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    grid = Grid("density", np.zeros((2, 3), int), np.ones(2, np.float32), np.eye(4))
-    with pytest.raises(ValueError, match="twice"):
-        write_grids([grid], tmp_path / "a.vdb")
-    assert not list(tmp_path.iterdir())
-
-
 def tree(voxel: float = 0.25, low: float = -1.0, shape: tuple[int, int, int] = (2, 2, 2), seed: int = 0) -> NerfTree:
     rng = np.random.default_rng(seed)
     at = np.argwhere(rng.random(np.array(shape) * 4) < 0.3)
@@ -116,20 +109,6 @@ def test_density_and_colour_lie_where_the_asset_has_them() -> None:
     world = Y_DOWN.world_from_capture.points(centres)
     np.testing.assert_allclose(density.values / Y_DOWN.world_from_capture.scale, density_at(asset, world), rtol=1e-5)
     np.testing.assert_allclose(colour.values, linear_from_srgb(colour_at(asset, world)), atol=1e-3)
-
-
-def test_colours_are_those_that_are_seen_from_outside() -> None:
-    """A ball that is white outside and, what nobody saw, black from within: harmonics of degree 1 that point along its normals."""
-    at = np.argwhere(np.ones((16, 16, 16), bool))
-    outward = (at + 0.5) / 8 - 1
-    inside = np.linalg.norm(outward, axis=1) < 0.8
-    sh = np.zeros((inside.sum(), 4, 3), np.float32)
-    sh[:, 1:] = 12 * (outward[inside] / np.linalg.norm(outward[inside], axis=1, keepdims=True) * (1, 1, -1))[:, (1, 2, 0), None]
-    density = 100 * (1 - np.linalg.norm(outward[inside], axis=1)) + 1
-    ball = tree_from_voxels((4, 4, 4), 0.125, np.full(3, -1.0), at[inside], density.astype(np.float32), sh)
-    _, colour = grids_of(ball, Z_UP, Path("a.vdb"))
-    far = np.linalg.norm((colour.coordinates + 0.5) / 8 - 1, axis=1) > 0.4
-    assert np.median(colour.values[far]) > 0.9, "0.21 is what the harmonic of degree 0 has"
 
 
 def test_colours_are_those_that_the_captured_cameras_see() -> None:

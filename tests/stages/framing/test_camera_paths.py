@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 
@@ -16,11 +15,9 @@ from efficientnerf.asset.rendering import MOST_PIXELS
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput
-from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
 from stages.framing.captured import captured_metadata, captured_of
 from stages.io.camera_path import read_camera_path
-from stages.io.png import read_png
 from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree
@@ -58,39 +55,6 @@ def test_turntable_shows_the_whole_asset_without_wasting_the_picture(tree: BallT
     azimuths = np.unwrap([math.atan2(*camera.centre[1::-1]) for camera in cameras])
     np.testing.assert_allclose(np.degrees(azimuths - azimuths[0]), np.arange(24) * 15.0, atol=1e-6)
     assert math.degrees(azimuths[0]) == pytest.approx(90.0)
-
-
-@pytest.mark.parametrize(("layer", "forward_facing"), [(3, False), (8, True), (12, False)])
-def test_what_lies_flat_is_seen_with_as_much_room_above_as_below(layer: int, forward_facing: bool) -> None:
-    """A floor at any height of the box, and the picture no wider than it is high: the room at the sides decides nothing."""
-
-    class Floor(BallTree):
-        @property
-        def brick_index(self) -> np.ndarray:
-            index = np.full(self.shape, -1, np.int32)
-            index[:, 5:11, layer] = np.arange(16 * 6).reshape(16, 6)
-            return index
-
-    tree = Floor(forward_facing=forward_facing)
-    cells = np.argwhere(tree.brick_index >= 0)
-    points = tree.bounds_min + (cells + 0.5) * tree.brick * tree.voxel
-    for size in ((400, 100), (100, 100)):
-        cameras = turntable_cameras(tree, frames=12, width=size[0], height=size[1], sway=5.0)
-        seen = np.stack([project(camera, points)[0] for camera in cameras]) / size
-        above, below = seen[..., 1].min(), 1 - seen[..., 1].max()
-        assert above == pytest.approx(below, abs=0.01)
-        assert 0 < min(above, seen[..., 0].min(), 1 - seen[..., 0].max()) < 0.06, "and fills it one way or the other"
-        assert {camera.params[2] for camera in cameras} == {cameras[0].params[2]}, "the picture does not sway"
-    asked = turntable_cameras(tree, frames=1, width=64, height=48, fov=50.0)[0]
-    assert asked.params[1:] == (32, 24)
-
-
-def test_turntable_of_a_capture_from_one_side_stays_near_the_heading() -> None:
-    cameras = turntable_cameras(BallTree(forward_facing=True), frames=20, width=64, height=48, sway=10.0)
-    azimuths = np.degrees([math.atan2(*camera.centre[1::-1]) for camera in cameras])
-    assert np.abs(azimuths - 90.0).max() == pytest.approx(10.0, abs=0.1)
-    steps = np.linalg.norm(np.diff([c.centre for c in [*cameras, cameras[0]]], axis=0), axis=1)
-    assert steps.max() < 3 * steps.min(), "the path closes without a jump"
 
 
 def test_an_asset_without_an_orbit_gets_one_and_a_broken_one_is_refused() -> None:
@@ -165,23 +129,6 @@ def test_what_is_wrong_with_a_path_is_said(tmp_path: Path, changes: dict[str, An
     assert str(path) in str(caught.value)
 
 
-def test_a_path_is_drawn(tmp_path: Path) -> None:
-    tree = BallTree(similarity=SIMILARITY)
-    cameras = read_camera_path(path_file(tmp_path), SIMILARITY, width=40).cameras
-    steps: list[tuple[int, int]] = []
-    options = RenderOptions(background="transparent", exr="all", fps=24)
-    written = render_frames(tree, cameras, tmp_path / "out", options, lambda done, total: steps.append((done, total)), draw=BallTree.render)
-    names = ["frame_0000.png", "frame_0000.exr", "frame_0001.png", "frame_0001.exr"]
-    assert [path.name for path in written] == names
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(names)
-    assert steps == [(0, 2), (1, 2), (2, 2)]
-    assert read_png(written[0]).shape == (32, 40, 4)
-    encode_frames([path for path in written if path.suffix == ".png"], tmp_path / "path.mp4", options)
-    with av.open(str(tmp_path / "path.mp4")) as container:
-        first = next(container.decode(video=0)).to_ndarray(format="rgb24")
-    assert first[:4, :4].min() > 250, "what is transparent lies on white in the video"
-
-
 ODD_NUMBERS = [10**400, 1e308, -1e308, 1e-308, 0, -1, 1e31, math.nan, math.inf, "1", [], None, {}, True]
 
 
@@ -246,25 +193,6 @@ def test_the_whole_region_is_in_the_middle_of_every_picture(degrees: float, size
     assert min(distances) >= 0.97 * 3.0, "not closer than the photographs"
 
 
-@pytest.mark.parametrize("degrees", [300.0, 200.0, 40.0])
-def test_the_path_stays_where_photographs_were_taken(degrees: float) -> None:
-    """On an arc of less than a full circle the camera goes to and fro, nearly to its ends."""
-    if degrees > 285:  # a gap of 60 degrees is no gap
-        cameras = turntable_cameras(captured_tree(degrees), frames=40, width=64, height=48)
-        azimuths = np.unwrap(np.radians([azimuth_of(camera) for camera in cameras]))
-        assert np.degrees(np.ptp(azimuths)) == pytest.approx(360 * 39 / 40, abs=1)
-        return
-    cameras = turntable_cameras(captured_tree(degrees), frames=40, width=64, height=48)
-    off = np.array([(azimuth_of(camera) + 90 + 180) % 360 - 180 for camera in cameras])
-    assert np.abs(off).max() <= degrees / 2
-    assert np.abs(off).max() >= 0.65 * degrees / 2
-    elevations = np.array([math.degrees(math.asin(-camera.forward[2])) for camera in cameras])
-    assert elevations.min() > 9
-    assert elevations.max() < 31
-    steps = np.abs(np.diff([*off, off[0]]))
-    assert steps.max() < 0.2 * degrees, "without a jump"
-
-
 def azimuth_of(camera: Camera) -> float:
     return math.degrees(math.atan2(-camera.forward[1], -camera.forward[0]))
 
@@ -293,30 +221,3 @@ def test_captured_cameras_that_cannot_be_are_refused() -> None:
         captured_of({"captured_path": 7})
     found = captured_of({"captured_path": json.loads(json.dumps(captured_metadata(arc(360.0, count=150))))})
     assert len(found.poses) == 64
-
-
-@pytest.mark.parametrize(
-    ("tree", "given", "expected"),
-    [
-        (captured_tree(360.0), {"path": "captured", "elevation": 5.0, "radius": 9.0, "sway": 3.0, "fov": 40.0}, {"elevation", "radius", "sway"}),
-        (captured_tree(360.0), {"path": "captured"}, set()),
-        (captured_tree(360.0), {"elevation": 5.0, "radius": 9.0, "sway": 3.0}, {"sway"}),
-        (captured_tree(360.0), {"path": "sway", "elevation": 5.0, "radius": 9.0, "sway": 3.0}, set()),
-        (captured_tree(120.0), {"path": "orbit", "sway": 3.0}, {"sway"}),
-        (captured_tree(120.0), {"sway": 3.0}, set()),
-        (wall(voxels=24), {"sway": 3.0}, {"sway"}),
-        (wall(voxels=24), {"sway": 3.0, "elevation": 0.0, "path": "sway"}, set()),
-    ],
-    ids=["captured", "nothing", "circle", "swaying", "a circle of an arc", "arc", "spiral", "none"],
-)  # fmt: skip
-def test_what_the_path_has_no_use_for_is_told(tree: NerfTree, given: dict[str, Any], expected: set[str]) -> None:
-    """And it has none: the cameras are the same without."""
-    found: list[str] = []
-    size = {"frames": 6, "width": 64, "height": 48}
-    cameras = turntable_cameras(tree, **size, **given, unused=lambda name, path: found.append(name))
-    assert set(found) == expected
-    assert len(found) == len(expected)
-    for name in ("elevation", "radius", "sway"):
-        without = turntable_cameras(tree, **size, **{key: value for key, value in given.items() if key != name})
-        same = all(np.array_equal(a.world_from_camera, b.world_from_camera) and a.params == b.params for a, b in zip(cameras, without, strict=True))
-        assert same == (name in expected or name not in given)

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Camera, rays
-from pipeline.errors import BadInput
 from pipeline.stage import Job
-from stages.framing.mask_use import compactness
 from stages.io import scene, working_images
-from stages.io.capture import Capture, Photo, Silhouettes
+from stages.io.capture import Capture, Photo
 from stages.io.scene import Scene
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
@@ -124,20 +122,6 @@ def test_other_masks_leave_pixels_out(how: str, draw: Drawing, tmp_path: Path) -
         np.testing.assert_array_equal(scene.read_mask(tmp_path / "poses", view), draw(index, captures.cameras()[index]) > 0)
 
 
-@pytest.mark.parametrize(("draw", "choice"), [(ball, "ignore"), (but_for_a_thing, "silhouette")])
-def test_the_choice_can_be_made_by_hand(draw: Drawing, choice: str, tmp_path: Path) -> None:
-    made, said, _ = run(with_masks("llff", tmp_path / "source", draw), tmp_path, masks=choice)
-    assert (made.background == WHITE) == (choice == "silhouette")
-    assert any(text.endswith("poses.masks says so") for text in said)
-
-
-def test_only_what_may_be_one_compact_thing_is_compact() -> None:
-    picture, half, dots = (np.zeros((24, 32), bool) for _ in range(3))
-    picture[8:16, 8:20] = half[:, :18] = dots[2:22:3, 2:30:3] = True
-    assert compactness(picture) is None
-    assert all(compactness(other) for other in (~picture, picture & False, half, dots))
-
-
 def test_masks_and_alpha_are_judged_apart(tmp_path: Path) -> None:
     source = with_alpha("colmap", tmp_path / "source", but_for_a_thing)
     for index, camera in enumerate(captures.cameras()):
@@ -147,21 +131,6 @@ def test_masks_and_alpha_are_judged_apart(tmp_path: Path) -> None:
     assert made.background == WHITE
     np.testing.assert_array_equal(scene.read_mask(tmp_path / "poses", made.views[1]), but_for_a_thing(1, captures.cameras()[1]) > 0)
     assert scene.read_image(tmp_path / "poses", made.views[1])[0, 0, 3] == 0
-
-
-def test_photographs_without_a_silhouette_are_left_out(tmp_path: Path) -> None:
-    source = with_masks("colmap", tmp_path / "source", ball)
-    (source / "masks/img_2.png").unlink()
-    captures.write_picture(source / "masks/img_4.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    made, _, warned = run(source, tmp_path / "a", masks="silhouette")
-    assert [view.name for view in made.views] == [f"images/img_{index}.png" for index in (0, 1, 3, 5)]
-    assert any("1 of 6 images have no silhouette, unlike the others: images/img_2.png" in text for text in warned)
-    assert any("images/img_4.png has an empty silhouette" in text for text in warned)
-    assert {len(track) for track in scene.read_points(tmp_path / "a/poses").tracks} == {4}
-    for index in (0, 1, 3):
-        (source / f"masks/img_{index}.png").unlink()
-    with pytest.raises(BadInput, match="2 of 6"):
-        run(source, tmp_path / "b", masks="silhouette")
 
 
 def test_points_of_the_background_go(tmp_path: Path) -> None:
@@ -201,27 +170,6 @@ def test_levels_of_masks(levels: tuple[int, ...], suffix: str, expected: tuple[i
     assert [int(found[32, 64 * n + 32]) for n in range(len(levels))] == list(expected)
     inverse = working_images.mask_levels(Photo(camera, tmp_path / "a.png", tmp_path / f"m.{suffix}", "white"), 1)[0]
     np.testing.assert_array_equal(inverse, 255 - found)
-
-
-def test_a_mask_of_another_size_and_alpha_meet(tmp_path: Path) -> None:
-    """The lower of alpha and the mask's levels; colours outside do not bleed in where the image is reduced."""
-    pixels = np.zeros((24, 32, 4), np.uint8)
-    pixels[:] = (0, 255, 0, 255)
-    pixels[:, :17] = (255, 0, 0, 255)
-    pixels[:4, :, 3] = 0
-    captures.write_picture(tmp_path / "a.png", pixels)
-    mask = np.zeros((48, 64), np.uint8)
-    mask[:, :34] = 255
-    captures.write_picture(tmp_path / "m.png", mask)
-    photo = Photo(captures.cameras(1)[0], tmp_path / "a.png", tmp_path / "m.png")
-    written = working_images.write(photo, tmp_path / "out", "a.png", max_side=16, silhouettes=Silhouettes(alpha=True, masks=True))
-    assert written.mask is None
-    assert any("the mask is 64x48, its image 32x24; it was resized" in text for text in written.warnings)
-    found = working_images.decode(tmp_path / "out" / written.image).pixels
-    assert found.shape == (12, 16, 4)
-    assert (found[:2, :, 3] == 0).all()
-    np.testing.assert_array_equal(found[3, :, 3], [255] * 8 + [128] + [0] * 7)
-    assert (found[2:, :9, :3] == (255, 0, 0)).all()
 
 
 def photographs_with(folder: Path, draw: Drawing, *, turned: bool) -> Path:
@@ -286,28 +234,3 @@ def test_masks_that_show_the_object_in_black_are_turned_round_and_said(how: str,
     np.testing.assert_array_equal(made.bounds, usual.bounds)
     for one, other in zip(made.views, usual.views, strict=True):
         np.testing.assert_array_equal(scene.read_image(tmp_path / "black/poses", one), scene.read_image(tmp_path / "white/poses", other))
-
-
-def test_which_level_is_kept_can_be_stated(tmp_path: Path) -> None:
-    source = with_masks("colmap", tmp_path / "source", lambda index, camera: 255 - ball(index, camera))
-    made, said, _ = run(source, tmp_path / "white", mask_polarity="white")
-    assert made.background is None
-    assert not any("keep what is black" in text for text in said)
-    usual = with_masks("colmap", tmp_path / "usual", but_for_a_thing)
-    made, said, _ = run(usual, tmp_path / "black", mask_polarity="black", masks="ignore")
-    assert "masks keep what is black; what is white is left out" in said
-    for index, view in enumerate(made.views):
-        np.testing.assert_array_equal(scene.read_mask(tmp_path / "black/poses", view), but_for_a_thing(index, captures.cameras()[index]) == 0)
-
-
-def test_a_mask_may_be_an_alpha_channel(tmp_path: Path) -> None:
-    """As Brush has it: whatever the colours below it are."""
-    source = with_masks("colmap", tmp_path / "source", ball)
-    for index, camera in enumerate(captures.cameras()):
-        level = (0, 255)[index % 2]
-        captures.write_picture(source / "masks" / camera.name, np.dstack([np.full((HEIGHT, WIDTH, 3), level, np.uint8), ball(index, camera)]))
-    made, _, _ = run(source, tmp_path)
-    assert made.background == WHITE
-    for index, view in enumerate(made.views):
-        found = scene.read_image(tmp_path / "poses", view)[..., 3].astype(int)
-        assert abs(found - ball(index, captures.cameras()[index])).max() <= working_images.TRANSPARENT

@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.geometry.spaces import ContractedSpace
-from stages.framing.near_planes import content_depths, near_far_planes, reliable_points
+from stages.framing.near_planes import content_depths, reliable_points
 from stages.framing.scene_bounds import in_view
 from stages.framing.training_frame import TrainingFrame, find_training_frame
 from stages.framing.view_coverage import cells_before_near, contradicted
@@ -99,18 +98,6 @@ def test_points_that_others_observe_count_as_much_as_a_photographs_own() -> None
     assert (framed.near_far_planes[:, 0] / world.scale).max() <= 1.5
 
 
-def test_outliers_near_a_camera_do_not_pull_its_near_plane() -> None:
-    capture = room_capture(0, on_subject=200)
-    camera = capture.photos[0].camera
-    stray = camera.centre + camera.forward * 0.05 + np.random.default_rng(0).normal(0, 0.001, (4, 3))
-    points = SparsePoints(
-        np.concatenate([capture.points.xyz, stray]), np.zeros((len(capture.points.xyz) + 4, 3), np.uint8),
-        np.concatenate([capture.points.error, np.full(4, 0.5)]), (*capture.points.tracks, *[(0, 1, 2)] * 4),
-    )  # fmt: skip
-    clean, dirty = (find_training_frame(c).near_far_planes[0, 0] for c in (capture, replace(capture, points=points)))
-    assert dirty == pytest.approx(clean, rel=0.25)
-
-
 def test_near_planes_never_begin_behind_the_subjects_middle() -> None:
     capture = replace(room_capture(0), points=None)
     framed = find_training_frame(capture)
@@ -133,27 +120,3 @@ def test_no_single_view_masks_what_lies_before_its_near_plane() -> None:
     before = sum(((world - c.centre) @ c.forward < near[n] * 1.2).astype(int) for n, c in enumerate(cameras) if n != 5)
     close = np.min([np.linalg.norm(world - camera.centre, axis=1) for camera in others], axis=0)
     assert ((before >= 1) | (close < near.max())).all()
-
-
-def test_rays_end_behind_all_that_there_is() -> None:
-    """Where nearly all points of a picture lie on a table, the walls behind it are to be learned too."""
-    capture = room_capture(0, on_subject=8000)
-    assert capture.points is not None
-    walls = np.abs(capture.points.xyz).max(axis=1) > 4.9
-    few = np.flatnonzero(~walls | (np.cumsum(walls) <= 80))
-    capture = replace(capture, points=capture.points.only(few))
-    framed = find_training_frame(capture)
-    placed = [framed.world_from_capture.camera(photo.camera) for photo in capture.photos]
-    corners = framed.world_from_capture.points(np.array([[x, y, z] for x in (-5, 5) for y in (-5, 5) for z in (-1, 4)], float))
-    depths = np.array([(corners - camera.centre) @ camera.forward for camera in placed])
-    assert (framed.near_far_planes[:, 1] > depths.max(axis=1)).all()
-
-
-def test_planes_that_the_source_states_are_kept() -> None:
-    capture = room_capture(0)
-    stated = replace(capture, photos=tuple(replace(photo, near=1.0, far=20.0) for photo in capture.photos))
-    framed = find_training_frame(stated)
-    placed = [framed.world_from_capture.camera(photo.camera) for photo in stated.photos]
-    planes = near_far_planes(stated, placed, framed.world_from_capture, framed.bounds, np.zeros(3))
-    np.testing.assert_allclose(planes[:, 0], 0.9 * framed.world_from_capture.scale)
-    assert (planes[:, 1] >= 22 * framed.world_from_capture.scale - 1e-9).all()

@@ -13,8 +13,6 @@ from efficientnerf.asset import format
 from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates
 from efficientnerf.geometry.cameras import Camera, project, rays
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
-from efficientnerf.model import render_rays
-from efficientnerf.training.pixels import Pixels
 from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.settings import BakeSettings
@@ -24,13 +22,10 @@ from stages.framing.view_coverage import (
     cells_below_min_views,
     cells_without_view,
     close_to_path,
-    has_min_views,
-    kept_pixels,
     poorly_seen,
     shows,
 )
-from stages.io.field_file import load_renderer, space_of
-from stages.io.png import write_png
+from stages.io.field_file import space_of
 from stages.io.scene import Scene, views_of
 from stages.io.scene import load as load_scene
 from stages.io.scene import save as save_scene
@@ -123,59 +118,12 @@ def test_a_place_is_open_where_enough_cameras_see_it(watching: int, min_views: i
     assert left.any()
 
 
-def looking_along_y(z: float, *, x: float = 0.0, away: float = 4.0, back: bool = False) -> Camera:
-    """A camera before the origin, or as far behind it, that looks along y by a lens of 22 degrees."""
-    placed = np.eye(4)
-    placed[:3, 0], placed[:3, 1], placed[:3, 2] = ((-1, 0, 0), (0, 0, -1), (0, -1, 0)) if back else ((1, 0, 0), (0, 0, -1), (0, 1, 0))
-    placed[:3, 3] = (x, away if back else -away, z)
-    return replace(narrow(balls.cameras(1)[0], 2), world_from_camera=placed)
-
-
-def test_what_cameras_just_miss_before_the_box_is_poorly_seen() -> None:
-    """Eight cameras look at the box from one side; a picture's half is 0.19 of the depth."""
-    one_side = [looking_along_y(0.01 * n) for n in range(8)]
-    places = {
-        "the subject": (0.0, 0.0, 0.0), "in the box, in nobody's view": (0.95, 0.0, 0.0), "before the box": (0.45, -2.0, 0.0),
-        "before the box, far beside the pictures": (0.65, -2.0, 0.0), "a wall beside the subject": (1.1, 0.1, 0.0),
-        "behind the box, before it for who stands opposite": (1.65, 2.0, 0.0), "behind the cameras": (0.0, -4.5, 0.0), "far away": (1e6, 0.0, 0.0),
-    }  # fmt: skip
-
-    def among(cameras: list[Camera]) -> set[str]:
-        return {name for name, poor in zip(places, poorly_seen(np.array(list(places.values())), SPACE.bounds, cameras, 2), strict=True) if poor}
-
-    assert among(one_side) == {"in the box, in nobody's view", "before the box"}
-    assert among([*one_side, looking_along_y(0.0, x=1.2, back=True)]) == {*among(one_side), "behind the box, before it for who stands opposite"}
-    assert among([*one_side, looking_along_y(0.0, away=1.5)]) == among(one_side)  # one camera close to the box does not decide for the others
-    assert among([*one_side, looking_along_y(0.0, x=0.4)]) == among(one_side) - {"before the box"}  # the floor before the subject, say
-    assert among([*one_side, looking_along_y(0.0, x=0.45, back=True)]) >= among(one_side)  # something behind it, which could as well be farther away
-    assert "before the box" not in among([*one_side, looking_along_y(0.0, x=0.45, back=True), looking_along_y(0.0, x=0.5, back=True)])
-    assert not among(one_side[:4])  # of four cameras one is enough
-
-
 def narrow_scene(folder: Path) -> Scene:
     """Photographs of a ball, of which nine are for training, whose corners of the box few of them show."""
     s = load_scene(poses(folder, count=10, photographs=True))
     s = replace(s, views=tuple(replace(view, camera=narrow(view.camera, 2.2)) for view in s.views))
     save_scene(s, folder)
     return s
-
-
-def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_path: Path) -> None:
-    s = narrow_scene(tmp_path / "poses")
-    made = job(tmp_path, balls.settings(iterations=30, occupancy_update_ray_fraction=0.1), poses=tmp_path / "poses")
-    train.run(made)
-    m = load_renderer(made.out).model
-    cameras = [view.camera for view in views_of(s, "train")]
-    closed = torch.from_numpy(cells_below_min_views(space_of(s), cameras, m.settings.min_views, m.voxels.side))
-    assert 0.01 < float(closed.float().mean()) < 0.12
-    assert torch.equal(torch.isneginf(m.voxels.values), closed)
-    for prune in (False, True):
-        pixels = Pixels(cameras, [balls.photograph(c) for c in cameras], [None] * len(cameras), np.full(len(cameras), 1.0), np.full(len(cameras), 50.0))
-        bundle = [torch.from_numpy(np.ascontiguousarray(a)) for a in pixels.bundle(np.arange(len(pixels)))[:4]]
-        seen = render_rays(m, *bundle, torch.full_like(bundle[2], 0.5), m.behind(bundle[1]), prune=prune, rng=np.random.default_rng(0))
-        at = (seen.coarse.point * m.voxels.side).long().clamp(0, m.voxels.side - 1)
-        assert len(at) > 100
-        assert not closed[at[:, 0], at[:, 1], at[:, 2]].any()
 
 
 @pytest.mark.parametrize("min_views", [2, 0])
@@ -196,24 +144,6 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, min
     few = poorly_seen(centre, space_of(s).bounds, [view.camera for view in views_of(s, "train")], 2)
     assert len(few) > 1000
     assert few.any() == (min_views == 0)
-
-
-def test_a_view_counts_only_where_its_mask_keeps_the_pixel() -> None:
-    cameras = balls.cameras(8)
-    points = np.random.default_rng(3).uniform(-0.6, 0.6, (400, 3))
-    rng = np.random.default_rng(4)
-    masks = [*(rng.random((camera.height, camera.width)) < 0.3 for camera in cameras[:-1]), None]
-    count = np.zeros(len(points), int)
-    for camera, mask in zip(cameras, masks, strict=True):
-        pixels, depth = project(camera, points)
-        for n, (x, y) in enumerate(pixels):
-            inside = depth[n] > 0 and 0 <= x <= camera.width and 0 <= y <= camera.height
-            count[n] += inside and (mask is None or mask[min(int(y), camera.height - 1), min(int(x), camera.width - 1)])
-    np.testing.assert_array_equal(has_min_views(points, cameras, 2, masks), count >= 2)
-    assert 0 < (count >= 2).sum() < len(points)
-    everything = [np.ones((3, 4), bool) for _ in cameras]
-    np.testing.assert_array_equal(has_min_views(points, cameras, 2, everything), has_min_views(points, cameras, 2))
-    assert not has_min_views(points, cameras, 2, [~mask for mask in everything]).any()
 
 
 def leaving_out(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
@@ -238,32 +168,6 @@ def test_voxels_that_no_kept_pixel_shows(space: BoundedSpace) -> None:
     assert not found[(distance > 1.3 * radius) & (distance < 1)].any()
     assert cells_without_view(space, cameras, side, [np.zeros((4, 4), bool) for _ in cameras]).all()
     assert not cells_without_view(space, cameras, side, [None for _ in cameras])[distance < 0.8].any()
-
-
-def test_training_learns_nothing_behind_ignored_pixels(tmp_path: Path) -> None:
-    """A part of space that all masks leave out stays empty, and nothing else of the ball does."""
-    folder = poses(tmp_path / "poses", count=6, photographs=True)
-    s, hidden = load_scene(folder), np.zeros(3)
-    views = []
-    for view in s.views:
-        path = folder / "masks" / view.camera.name
-        path.parent.mkdir(exist_ok=True)
-        write_png(np.where(leaving_out(view.camera, hidden, 0.8), np.uint8(255), np.uint8(0)), path)
-        views.append(replace(view, mask=f"masks/{view.camera.name}"))
-    save_scene(replace(s, views=tuple(views)), folder)
-    done = job(tmp_path, balls.settings(iterations=2, occupancy_resolution=128), poses=folder)
-    train.run(done)
-    values = load_renderer(done.out).model.voxels.values.numpy()
-    grid = (np.stack(np.meshgrid(*(np.arange(128),) * 3, indexing="ij"), axis=-1) + 0.5) / 128
-    distance = np.linalg.norm(space_of(s).world(torch.from_numpy(grid).reshape(-1, 3)).numpy(), axis=1).reshape(values.shape)
-    assert np.isneginf(values[distance < 0.15]).all()
-    training = views_of(load_scene(folder), "train")
-    cameras, masks = [view.camera for view in training], kept_pixels(folder, training)
-    assert masks is not None
-    expected = cells_below_min_views(space_of(s), cameras, 2, 128, masks) | cells_without_view(space_of(s), cameras, 128, masks)
-    expected |= cells_before_near(space_of(s), cameras, [view.near for view in training], 128)
-    np.testing.assert_array_equal(np.isneginf(values), expected)
-    assert expected[(distance > 0.9) & (distance < 0.98)].mean() < 0.3
 
 
 @pytest.mark.parametrize("count", [1, 9])

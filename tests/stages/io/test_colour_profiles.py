@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import io
 import random
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image
 
 from stages.io import photo, pictures, working_images
 from stages.io.capture import Photo
-from stages.io.decoders import colour_profile
 from stages.verdict import looks
 from tests.stages import captures
 from tests.stages.io import profiles
-from tests.stages.io.profiles import ADOBE_RGB, DISPLAY_P3, PROPHOTO, SRGB, linear_to_srgb, of_colours, of_greys, of_inks, power, srgb_to_linear, to_srgb
+from tests.stages.io.profiles import ADOBE_RGB, DISPLAY_P3, PROPHOTO, linear_to_srgb, of_colours, of_greys, of_inks, power, srgb_to_linear, to_srgb
 
 P3 = of_colours(DISPLAY_P3, srgb_to_linear)
 SPACES: dict[str, tuple[np.ndarray, profiles.Curve]] = {
@@ -82,17 +79,6 @@ def test_all_who_read_a_photograph_see_the_same_colours(tmp_path: Path) -> None:
     assert looks.grey_of(path)[12, 16] == looks.grey_of(tmp_path / "scene" / written.image)[12, 16]
 
 
-@pytest.mark.parametrize(
-    "profile", [ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes(), of_colours(SRGB, srgb_to_linear), None], ids=["littlecms", "ours", "none"]
-)
-def test_pictures_in_srgb_keep_their_pixels(profile: bytes | None, tmp_path: Path) -> None:
-    path = saved(tmp_path / "a.png", Image.fromarray(colours()), "PNG", profile)
-    decoded = working_images.decode(path)
-    np.testing.assert_array_equal(decoded.pixels, colours())
-    assert decoded.verbatim
-    assert decoded.fault is None
-
-
 def test_alpha_is_kept_and_palettes_are_converted(tmp_path: Path) -> None:
     rgba = np.dstack([colours(), np.arange(24 * 32).reshape(24, 32) % 256]).astype(np.uint8)
     rgb, alpha = read(saved(tmp_path / "a.png", Image.fromarray(rgba), "PNG", P3))
@@ -101,24 +87,6 @@ def test_alpha_is_kept_and_palettes_are_converted(tmp_path: Path) -> None:
     few = Image.fromarray(colours()).quantize(16)
     expected = to_srgb(np.asarray(few.convert("RGB")), DISPLAY_P3, srgb_to_linear)
     assert np.abs(read(saved(tmp_path / "p.png", few, "PNG", P3))[0] - expected).max() <= 2
-
-
-def test_grey_pictures(tmp_path: Path) -> None:
-    ramp = np.tile(np.arange(256, dtype=np.uint8), (3, 1))
-    dark = 255 * linear_to_srgb((ramp / 255.0) ** 1.2)
-    profile = of_greys(power(1.2))
-    cases = {
-        "8 bits": Image.fromarray(ramp),
-        "16 bits": Image.fromarray(ramp.astype(np.uint16) * 257),
-        "with alpha": Image.merge("LA", (Image.fromarray(ramp), Image.fromarray(ramp[:, ::-1].copy()))),
-    }
-    for what, image in cases.items():
-        rgb, alpha = read(saved(tmp_path / "a.png", image, "PNG", profile))
-        assert np.abs(rgb - dark[..., None]).max() <= 2, what
-        assert (alpha is not None) == (what == "with alpha")
-    # greys of a space of colours
-    found = read(saved(tmp_path / "b.png", Image.fromarray(ramp), "PNG", of_colours(ADOBE_RGB, power(1.2))))[0]
-    assert np.abs(found - dark[..., None]).max() <= 2
 
 
 def test_cmyk_pictures(tmp_path: Path) -> None:
@@ -173,24 +141,3 @@ def test_mutated_profiles_are_used_or_refused(tmp_path: Path) -> None:
                 data[at] = rng.choice((0, 1, 127, 255, rng.randrange(256)))
             rgb, _ = read(saved(tmp_path / "a.tif", picture, "TIFF", bytes(data)))
             assert rgb.shape == (24, 32, 3)
-
-
-def test_a_conversion_takes_no_second_picture_of_memory(tmp_path: Path) -> None:
-    """Beyond what the result takes: a band of rows."""
-    large = Image.fromarray(np.zeros((3000, 1000, 3), np.uint8))
-    conversion = colour_profile.conversion_of(P3, "RGB")
-    tracemalloc.start()
-    try:
-        conversion.rgb_of(large)
-        assert tracemalloc.get_traced_memory()[1] < 1.5 * large.width * large.height * 3
-    finally:
-        tracemalloc.stop()
-
-
-def test_the_profile_is_read_from_a_jpeg_in_parts(tmp_path: Path) -> None:
-    """A JPEG's segments hold 64 KiB each."""
-    large = of_colours(DISPLAY_P3, srgb_to_linear) + bytes(200_000)
-    buffer = io.BytesIO()
-    Image.fromarray(np.full((24, 32, 3), (200, 60, 60), np.uint8)).save(buffer, "JPEG", icc_profile=large)
-    (tmp_path / "a.jpg").write_bytes(buffer.getvalue())
-    assert np.abs(read(tmp_path / "a.jpg")[0][12, 16] - to_srgb(np.array([200, 60, 60]), DISPLAY_P3, srgb_to_linear)).max() <= 4

@@ -54,20 +54,6 @@ def refused(folder: Path, *named: str) -> None:
     assert [name for name in (TrainOutputs.field, *named) if name not in text] == [], text
 
 
-def test_damage_is_told(tmp_path: Path) -> None:
-    path = tmp_path / TrainOutputs.field
-    save_model(untrained(), 0.5, 20.0, path)
-    data = path.read_bytes()
-    for damaged in (b"", data[:5], data[:2000], data[:-1], data + b"\0", b"\xff" * 40, b"{}" * 20):
-        path.write_bytes(damaged)
-        refused(tmp_path, "Train again")
-    for at in (len(data) // 2, len(data) - 1, data.index(b'"sha256') + 14):
-        path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
-        refused(tmp_path, "SHA-256", "Train again")
-    path.unlink()
-    refused(tmp_path)
-
-
 def test_what_does_not_fit_is_named_and_hostile_text_stays_in_a_line(tmp_path: Path) -> None:
     path = tmp_path / TrainOutputs.field
     save_model(untrained(field="hash", contracted=False), 0.5, 20.0, path)

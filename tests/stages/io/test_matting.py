@@ -32,16 +32,6 @@ def test_an_edge_keeps_nothing_of_the_background(behind: tuple[int, int, int]) -
     np.testing.assert_array_equal(found[cover == 255], photograph[cover == 255])
 
 
-def test_masks_too_small_or_too_large_give_no_foreign_colours() -> None:
-    front, behind = np.array([180.0, 60.0, 40.0]), np.array([20.0, 200.0, 90.0])
-    for radius in (12.0, 16.0):
-        cover = disc(radius=radius)
-        found = without_background(seen(disc(), front, behind), cover).astype(float)
-        shown = found[cover > 0]
-        assert (shown >= np.minimum(front, behind) - 1).all()
-        assert (shown <= np.maximum(front, behind) + 1).all()
-
-
 def test_what_has_no_soft_edge_or_no_surroundings_stays() -> None:
     photograph = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
     hard = np.where(np.arange(30) < 12, np.uint8(255), np.uint8(0)) * np.ones((20, 1), np.uint8)

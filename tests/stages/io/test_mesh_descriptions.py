@@ -68,35 +68,6 @@ def test_it_says_what_another_library_reads(tmp_path: Path, suffix: str) -> None
     assert found.get("watertight") is (True if suffix in MESH_EXPORTERS else None)
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_polygons_of_a_ply_are_fans_whatever_their_order(tmp_path: Path, text: bool) -> None:
-    """Quads, triangles and a pentagon, in another order of bytes, with scalars about the list and elements before and behind."""
-    corners = [[0, 1, 2, 3], [4, 5, 6], [0, 1, 2, 3, 4], [1, 2, 3]]
-    head = "ply\nformat {}\nelement camera 1\nproperty uchar id\nelement vertex 7\nproperty short t\nproperty double x\nproperty float y\nproperty float z\n"
-    head += "element face 4\nproperty uchar kind\nproperty list ushort uint vertex_index\nproperty float area\nelement edge 1\nproperty int a\nend_header\n"
-    places = np.random.default_rng(0).random((7, 3)).astype("f4")
-    if text:
-        lines = ["7", *(f"1 {x} {y} {z}" for x, y, z in places.tolist()), *(f"9 {len(each)} {' '.join(map(str, each))} 0.5" for each in corners), "3"]
-        data = (head.format("ascii 1.0") + "\n".join(lines) + "\n").encode()
-    else:
-        rows = b"".join(struct.pack(">hdff", 1, *each) for each in places.tolist())
-        faces = b"".join(struct.pack(f">BH{len(each)}If", 9, len(each), *each, 0.5) for each in corners)
-        data = head.format("binary_big_endian 1.0").encode() + b"\7" + rows + faces + struct.pack(">i", 3)
-    found = described(tmp_path / "a.ply", data)
-    assert (found["vertices"], found["faces"]) == (7, 2 + 1 + 3 + 1)
-    np.testing.assert_allclose(found["bounds"], [places.min(0), places.max(0)], rtol=1e-6)
-    with pytest.raises(BadInput, match="none of"):
-        described(tmp_path / "a.ply", data.replace(b"4 5 6", b"4 5 7").replace(struct.pack(">3I", 4, 5, 6), struct.pack(">3I", 4, 5, 7)))
-
-
-def test_indices_of_an_obj_count_from_either_end(tmp_path: Path) -> None:
-    found = described(tmp_path / "a.obj", b"v 0 0 0\nv 1 0 0 1 0 0\nv 1 1 0\nf -3/1 -2//2 -1/1/1\nv 0 1 0\nusemtl a\nf 1 2 3 4\nmtllib /etc/passwd\n")
-    assert (found["vertices"], found["faces"]) == (4, 3)
-    for wrong in (b"f 0 1 2", b"f 1 2 9", b"f -9 1 2", b"f a b c", b"f 1 2 99999999999999999999", b"v 1 2", b"v a b c"):
-        with pytest.raises(BadInput):
-            described(tmp_path / "a.obj", b"v 0 0 0\nv 1 0 0\nv 1 1 0\n" + wrong + b"\n")
-
-
 def test_nodes_place_meshes_and_instances_are_counted(tmp_path: Path) -> None:
     document, data = box_glb()
     half = 2**-0.5

@@ -28,17 +28,6 @@ def test_exif_orientation_is_undone(tmp_path: Path, orientation: int) -> None:
     np.testing.assert_array_equal(photo.rgb, seen)
 
 
-def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
-    Image.fromarray(np.full((8, 8), 65535 // 2, np.uint16)).save(tmp_path / "deep.png")
-    assert abs(int(reading.read_photo(tmp_path / "deep.png", 100).rgb[0, 0, 0]) - 127) <= 1
-    rgba = np.full((8, 8, 4), 255, np.uint8)
-    rgba[:, :4, 3] = 0
-    Image.fromarray(rgba).save(tmp_path / "alpha.png")
-    opaque = reading.read_photo(tmp_path / "alpha.png", 100).opaque
-    assert opaque[:, 4:].all()
-    assert not opaque[:, :4].any()
-
-
 @pytest.mark.parametrize(("masks", "masked"), [({}, True), ({"a.png": None}, False)])
 def test_what_is_transparent_may_count(masks: dict[str, Path | None], masked: bool, tmp_path: Path) -> None:
     rgba = np.random.default_rng(0).integers(0, 256, (40, 60, 4), np.uint8)
@@ -49,18 +38,6 @@ def test_what_is_transparent_may_count(masks: dict[str, Path | None], masked: bo
         images, _ = prepare_images({"a.png": tmp_path / "a.png"}, max_side=60, features=100, seed=0, masks=masks, work=tmp_path / "work", **quiet)
         assert len(images) == 1
         assert (tmp_path / "work/masks" / f"{images[0].file}.png").exists() == masked
-
-
-def test_mask_must_fit(tmp_path: Path) -> None:
-    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
-    photo = reading.read_photo(tmp_path / "a.png", 20)
-    mask = np.zeros((60, 80), np.uint8)
-    mask[:, 40:] = 255
-    Image.fromarray(mask).save(tmp_path / "m.png")
-    np.testing.assert_array_equal(reading.read_mask_file(tmp_path / "m.png", photo), np.broadcast_to(np.arange(20) >= 10, (15, 20)))
-    Image.fromarray(mask[:, :50]).save(tmp_path / "m.png")
-    with pytest.raises(reading.UnreadableImage, match="50x60, the photograph 40x30"):
-        reading.read_mask_file(tmp_path / "m.png", photo)
 
 
 @pytest.mark.parametrize("size", [(40, 40), (40, 30)])

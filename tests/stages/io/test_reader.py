@@ -16,7 +16,6 @@ from stages.io.capture import Photo
 from stages.io.photo import PhotoDetails, read_photo
 from stages.io.png import read_png, write_png
 from stages.io.reader import PhotoReader
-from stages.sfm.images import prepare_images
 
 
 @pytest.fixture
@@ -61,17 +60,6 @@ def test_what_was_decoded_is_read_again_until_it_changes(tmp_path: Path, counted
     for _ in range(2):
         np.testing.assert_array_equal(PhotoReader(folder).photo(path, 40).rgb(), expected.rgb)
     assert len(counted) == 4
-
-
-def test_a_second_search_has_the_same_copies(tmp_path: Path, counted: list[Path]) -> None:
-    paths = {"a.png": picture(tmp_path / "a.png"), "b.png": picture(tmp_path / "b.png", 1)}
-    for work in ("one", "two"):
-        prepare_images(
-            paths, max_side=40, features=100, seed=0, masks={}, work=tmp_path / work, copies=tmp_path / "photographs",
-            progress=lambda *_: None, safe_point=lambda: None, warn=lambda *_: None,
-        )  # fmt: skip
-    assert counted == list(paths.values())
-    assert all((tmp_path / "one/images" / name).read_bytes() == (tmp_path / "two/images" / name).read_bytes() for name in ("00000.png", "00001.png"))
 
 
 def test_a_mask_that_is_written_anew_or_turned_round_is_read_again(tmp_path: Path) -> None:

@@ -74,16 +74,6 @@ def test_the_subject_is_kept_and_what_moved_next_to_it_is_not(capture: Capture, 
         assert (mask & ~true).sum() <= 0.1 * true.sum()
 
 
-def test_points_in_the_white_refute_it(capture: Capture, tmp_path: Path) -> None:
-    """A table with faint dots: 6 % of the points lie around the cube."""
-    assert capture.points is not None
-    angle = np.linspace(0, 2 * np.pi, 50)
-    table = np.stack([0.95 * np.cos(angle), 0.95 * np.sin(angle), np.full(50, -0.55)], -1)
-    points = points_at(np.concatenate([capture.points.xyz, table]), list(capture.photos))
-    seen = replace(capture, points=points)
-    assert judged(seen, tmp_path) is seen
-
-
 @pytest.mark.parametrize("why", ["no points", "few points", "wrong cameras", "texture", "alpha"])
 def test_nothing_is_left_out_without_evidence(capture: Capture, tmp_path: Path, why: str) -> None:
     assert capture.points is not None

@@ -16,8 +16,7 @@ from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.io import scene
 from stages.masking import foreground
-from stages.masking.foreground import cleaned
-from stages.masking.subject import Subject, may_show, subject_of
+from stages.masking.subject import Subject, subject_of
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
 from tests.stages import captures
@@ -49,31 +48,6 @@ def test_a_subject_is_cut_off_close_to_what_supports_it() -> None:
     assert 0.004 < above < 0.02
     places = np.array([[0, 0, 0.5], [0, 0, above + 0.01], [0, 0, 0.0], [1.5, 0, 0.5], [0.56, 0, 0.4], [0.7, 0, 0.04], [0.7, 0, 0.0]])
     assert found.holds(places).tolist() == [True, True, False, False, True, True, False]
-
-
-def test_rays_that_cannot_show_the_subject_are_left_out() -> None:
-    camera = captures.cameras()[0]
-    subject = Subject(np.random.default_rng(2).uniform(-0.1, 0.1, (200, 3)), 0.05, ())
-    shown = may_show(subject, camera)
-    assert 0.01 < shown.mean() < 0.5
-    assert shown[camera.height // 2, camera.width // 2]
-    beside = Subject(camera.centre[None], 0.5, ())
-    assert may_show(beside, camera).all()
-
-
-def test_small_parts_and_small_gaps_go_and_soft_edges_stay() -> None:
-    covered = np.zeros((120, 160))
-    covered[30:90, 40:100] = 1
-    covered[30, 40:100] = 0.6
-    covered[50:52, 60:63] = 0  # a gap
-    covered[60:80, 60:80] = 0.1  # a hole
-    covered[100:103, 10:13] = 1  # a part
-    mask = cleaned(covered)
-    assert (mask[50:52, 60:63] == 255).all()
-    assert (mask[62:78, 62:78] < 128).all()
-    assert not mask[95:, :20].any()
-    assert mask[30, 70] == 153
-    assert not cleaned(np.zeros((20, 30))).any()
 
 
 def ball_pictures(made: list[Camera], offset: float = 0.0) -> dict[str, np.ndarray]:
@@ -136,21 +110,6 @@ def test_the_foreground_is_trained_alone_on_silhouettes_as_on_masks_of_users(sou
     assert report["facts"]["foreground"]["photographs"] == 8
     assert report["facts"]["foreground"]["overlap"] > 0.8
     assert report["masks"]["masks"]["use"] == "silhouette"
-
-
-def test_masks_are_made_once_and_the_same_bytes_come_of_them_again(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    poses.run(job_of(source, tmp_path / "a"))
-    asked = seen(monkeypatch, ball_pictures(captures.cameras(8)))
-    again = Job(settings=PosesSettings(mask_from="foreground"), out=tmp_path / "b/poses", work=tmp_path / "a/work", source=source, stage="poses")
-    poses.run(again)
-    assert not asked
-    files = sorted(path.relative_to(tmp_path / "a/poses") for path in (tmp_path / "a/poses").rglob("*") if path.is_file())
-    assert Path("silhouettes.png") in files
-    assert all((tmp_path / "a/poses" / path).read_bytes() == (tmp_path / "b/poses" / path).read_bytes() for path in files)
-    (tmp_path / "a/work/foreground/00003.png").write_bytes(b"damaged")
-    poses.run(Job(settings=PosesSettings(mask_from="foreground"), out=tmp_path / "c/poses", work=tmp_path / "a/work", source=source, stage="poses"))
-    assert len(asked) == 8
-    assert all((tmp_path / "a/poses" / path).read_bytes() == (tmp_path / "c/poses" / path).read_bytes() for path in files)
 
 
 def test_a_photograph_whose_silhouette_does_not_fit_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

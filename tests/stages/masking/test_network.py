@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.errors import BadInput, UsageError
+from pipeline.errors import BadInput
 from stages.io.capture import Provenance
 from stages.io.png import read_png, write_png
 from stages.masking.made import masks_by_network
@@ -19,7 +18,7 @@ from stages.poses.settings import PosesSettings
 onnx = pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
 
-from stages.masking.network import DEVIATION, MEAN, OWN_DEVIATION, OWN_MEAN, MaskNetwork  # noqa: E402
+from stages.masking.network import MaskNetwork  # noqa: E402
 
 SIDE = 32
 
@@ -53,13 +52,6 @@ def test_the_subject_is_where_the_network_sees_it(tmp_path: Path, logits: bool, 
     height, width = mask.shape
     assert mask[int(50 / 96 * height), int(70 / 128 * width)] > 240
     assert mask[2, 2] < 15
-
-
-def test_pictures_are_normalised_as_rembg_does_for_each_family(tmp_path: Path) -> None:
-    for name, mean, deviation in (("u2netp", MEAN, DEVIATION), ("birefnet-dis", MEAN, DEVIATION), ("isnet-general-use", OWN_MEAN, OWN_DEVIATION)):
-        network = MaskNetwork(red(tmp_path / f"{name}.onnx"))
-        np.testing.assert_allclose(network._mean, mean)
-        np.testing.assert_allclose(network._deviation, deviation)
 
 
 def made(paths: dict[str, Path], model: Path, folder: Path, told: list[str]) -> dict[str, Path]:
@@ -96,13 +88,3 @@ def test_what_is_no_such_network_is_refused_in_one_line(tmp_path: Path) -> None:
     assert huge.mask(scene()) is not None
     with pytest.raises(BadInput, match="at most 4096 on a side"):
         MaskNetwork(red(tmp_path / "huge.onnx", shape=(1, 3, 65536, 65536)))
-
-
-def test_a_missing_file_or_package_is_named_with_its_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match=r"absent.onnx: cannot be read \(No such file or directory\). Name the ONNX file of a network that you have"):
-        MaskNetwork(tmp_path / "absent.onnx")
-    with pytest.raises(UsageError, match="expected a plain file"):
-        MaskNetwork(tmp_path)
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[rembg\]'"):
-        MaskNetwork(red(tmp_path / "net.onnx"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,12 +11,10 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity
 from stages.formats import importers
-from stages.formats.importers.photographs import photographs
-from stages.formats.importers.source import Source
 from stages.io.capture import Capture
 from stages.masking.photographs import _in_known_frame
 from stages.poses.settings import PosesSettings
-from tests.stages import captures, exports
+from tests.stages import captures
 
 AWAY = Similarity(0.2, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([4.0, 1, -3]))
 ANEW = PosesSettings(format="photographs")
@@ -42,17 +39,6 @@ def test_cameras_come_into_the_frame_of_those_that_are_stated(tmp_path: Path) ->
     assert capture.provenance.stated_cameras.used == "frame"
     assert len(said) == 1
     assert "6 of the 6 photographs (colmap)" in said[0]
-
-
-def test_photographs_that_an_app_writes_twice_are_taken_once(tmp_path: Path) -> None:
-    source, _ = exports.polycam(tmp_path / "source")
-    stated = importers.IMPORTERS["polycam"].read(source, PosesSettings())
-    place = source / "keyframes"
-    shutil.copytree(place / "corrected_images", place / "images", dirs_exist_ok=True)
-    found = photographs(Source(source, False))
-    assert [path.relative_to(source).as_posix() for path in found] == sorted(photo.camera.name for photo in stated.photos)
-    shutil.rmtree(place / "corrected_images")
-    assert {path.parent for path in photographs(Source(source, False))} == {place / "images"}
 
 
 def test_what_states_cameras_is_among_the_files_that_a_run_depends_on(tmp_path: Path) -> None:

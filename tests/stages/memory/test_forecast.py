@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from efficientnerf.asset.format import load, outline
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit
@@ -22,22 +20,17 @@ from stages.evaluate import run as evaluate
 from stages.formats.exporters.exr import write_exr
 from stages.io.png import write_png
 from stages.memory.forecast import LEAST, Known, memory_needed, sizes_below, space_needed
-from stages.memory.tree import tree_bytes
 from stages.mesh import run as mesh
-from stages.mesh.memory import surface_needed
 from stages.points import run as points
-from stages.poses.memory import features_needed
 from stages.splats import run as splats
-from stages.splats.memory import most_gaussians
 from stages.train import run as train
 from stages.turntable import run as turntable
 from stages.turntable.memory import space_needed as frames_written
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
 from tests.stages.captures import HEIGHT, WIDTH, cameras, nerfstudio
-from workflows.asset import STAGES, WORKFLOW
+from workflows.asset import STAGES
 
-GOLDEN = Path(__file__).parents[2] / "data" / "golden"
 GIB = 2**30
 DEFAULTS: dict[str, Any] = {stage.name: stage.settings() for stage in STAGES}
 QUICK = {"iterations": 4, "checkpoint_every": 2, "sample_batch_size": 1024, "occupancy_warmup_steps": 2, "preview_every": 2, "initial_density": 10.0}
@@ -98,51 +91,11 @@ def test_a_stage_writes_what_was_predicted_and_no_less_than_half(run: tuple[Path
     assert written <= predicted <= 2 * written + 3 * LEAST
 
 
-def test_photographs_are_predicted_by_their_headers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    for number in range(3):
-        Image.fromarray(np.zeros((30, 40 + number, 3), np.uint8)).save(tmp_path / f"{number}.png")
-    (tmp_path / "broken.jpg").write_bytes(b"no picture")
-    (tmp_path / "notes.txt").write_bytes(b"words")
-    own = DEFAULTS["poses"]
-    expected = features_needed([(42, 30)] * 4, own.feature_image_size, 4096, 2).total
-    assert memory_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS) == expected
-    Image.fromarray(np.zeros((3000, 4000, 3), np.uint8)).save(tmp_path / "large.png")
-    assert memory_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS) > expected + GIB // 2
-    assert (WORKFLOW.memory("poses", tmp_path / "run", (tmp_path,), DEFAULTS, "cpu") or 0) > expected + GIB // 2
-
-
-@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.nerftree")), ids=lambda path: path.stem)
-def test_the_outline_of_an_asset_takes_what_the_asset_does(path: Path) -> None:
-    whole, claimed = load(path), outline(path)
-    assert tree_bytes(claimed) == tree_bytes(whole)
-    assert surface_needed(claimed, 1000, 512, 10**6, dense=True) == surface_needed(whole, 1000, 512, 10**6, dense=True)
-    assert (claimed.resolution, claimed.degree, len(claimed.outer)) == (whole.resolution, whole.degree, len(whole.outer))
-    assert claimed.harmonics_count == whole.harmonics_count
-
-
 def photographs(where: Path, count: int) -> Path:
     where.mkdir()
     for number in range(count):
         (where / f"{number:03}.jpg").write_bytes(bytes(3_000_000))
     return where
-
-
-def test_more_photographs_need_more_room(tmp_path: Path) -> None:
-    few, many = (space_needed("poses", tmp_path / "run", (photographs(tmp_path / str(count), count),), DEFAULTS) for count in (20, 80))
-    assert 2 * few < many < 4 * few, "beyond 60 photographs half as many features of each"
-
-
-def test_a_video_needs_the_room_of_its_frames(tmp_path: Path) -> None:
-    clip = tmp_path / "clip.mp4"
-    clip.write_bytes(bytes(1000))
-    one = space_needed("poses", tmp_path / "run", (clip,), DEFAULTS)
-    assert one > 50 * 2**20
-    assert space_needed("poses", tmp_path / "run", (clip, clip), DEFAULTS) == one, "poses.frames are of all videos together"
-    for name in ("notes.txt", "imu.csv", "times.json"):
-        (tmp_path / name).write_bytes(bytes(10))
-    assert space_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS) == one, "a folder with a video and its notes"
-    assert space_needed("poses", tmp_path / "run", (clip,), {**DEFAULTS, "poses": replace(DEFAULTS["poses"], lens="equirectangular")}) > 5 * one
 
 
 def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
@@ -154,10 +107,6 @@ def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
     taken = {**DEFAULTS, "poses": replace(DEFAULTS["poses"], format="photographs", max_features=512)}
     assert space_needed("poses", tmp_path / "run", (tmp_path / "source",), taken) >= needed + 8 * 512 * 300, "asked to find the cameras it looks for features"
     assert disk.has_room(60 * 10**6, (tmp_path, needed), [(tmp_path, needed)])
-
-
-def test_no_more_gaussians_are_predicted_than_a_picture_has_pixels() -> None:
-    assert [most_gaussians(replace(DEFAULTS["splats"], count=count), [300, 200, 100]) for count in (50, 1000)] == [50, 200]
 
 
 def test_pixels_that_do_not_fit_into_memory_and_checkpoints_are_written(run: tuple[Path, Any, Any]) -> None:

@@ -18,12 +18,10 @@ from stages.bake import settings as bake
 from stages.bake.settings import BakeSettings
 from stages.evaluate import settings as evaluate
 from stages.evaluate.settings import EvaluateSettings
-from stages.memory.need import Need, refuse_what_does_not_fit
 from stages.mesh import settings as mesh
 from stages.mesh.settings import MeshSettings
 from stages.points import settings as points
 from stages.points.settings import PointsSettings
-from stages.poses.memory import feature_threads, features_needed
 from stages.poses.run import run as run_poses
 from stages.poses.settings import PosesSettings
 from stages.splats import settings as splats
@@ -54,17 +52,6 @@ def limited(made: Job, size: int, events: list[dict[str, Any]] | None = None) ->
     if events is not None:
         made._report = events.append
     return made
-
-
-def test_a_need_that_fits_is_recorded_and_one_that_does_not_is_refused(tmp_path: Path) -> None:
-    need = Need({"pixels": 3 * GIB, "tables": GIB, "crumbs": 1, "libraries": GIB // 2})
-    fitting = limited(job(tmp_path, None), need.total)
-    refuse_what_does_not_fit(fitting, need, "Lower x.")
-    assert fitting.facts["memory"] == {"needed": need.total, "terms": dict(need.terms), "limit": need.total}
-    with pytest.raises(UsageError) as caught:
-        refuse_what_does_not_fit(limited(job(tmp_path, None), GIB), need, "Lower x.")
-    assert all(part in str(caught.value) for part in ("4.5 GiB", "pixels 3.0 GiB", "--memory", "Lower x."))
-    assert caught.value.exit_code == 2
 
 
 def test_training_pixels_that_do_not_fit_go_to_a_file(made: dict[str, Path], tmp_path: Path) -> None:
@@ -114,14 +101,6 @@ def test_later_stages_are_refused_before_they_begin(made: dict[str, Path], tmp_p
     assert not list(short.out.iterdir())
 
 
-def test_a_bake_is_refused_where_not_even_its_images_fit(made: dict[str, Path], tmp_path: Path) -> None:
-    short = limited(job(tmp_path, BakeSettings(resolution=16), poses=made["poses"], train=made["train"]), 2**28)
-    with pytest.raises(UsageError, match=r"bake\.visibility_rays"):
-        bake.STAGE.run(short)
-    assert not (short.out / BakeOutputs.asset).exists()
-    assert not list(short.work.iterdir())
-
-
 def test_a_photograph_that_does_not_fit_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
     source = tmp_path / "photographs"
     source.mkdir()
@@ -131,19 +110,6 @@ def test_a_photograph_that_does_not_fit_is_refused_before_it_is_decoded(tmp_path
     with pytest.raises(UsageError, match="feature_image_size"):
         run_poses(short)
     assert not list(short.out.iterdir())
-
-
-def test_features_are_detected_on_as_many_threads_as_fit(tmp_path: Path) -> None:
-    sizes = [(4000, 3000)] * 5
-    events: list[dict[str, Any]] = []
-    room = features_needed(sizes, 4000, 4096, 3).total
-    assert feature_threads(job(tmp_path, None), sizes, 4000, 4096, 16) == 16
-    assert feature_threads(limited(job(tmp_path, None), room, events), sizes, 4000, 4096, 16) == 3
-    assert "3 of 16 threads" in events[-1]["text"]
-    small = [(400, 300)] * 20
-    assert features_needed(small, 400, 256, 2, networks=True).total > features_needed(small, 400, 256, 1, networks=True).total > 2 * 2**30
-    assert features_needed(small, 400, 256, 8).total < 2 * 2**30
-    assert features_needed([(900, 600)], 1600, 4096, 1).total > features_needed([(1000, 600)], 1600, 4096, 1).total  # detected at twice the size
 
 
 def test_enclosed_space_is_found_with_any_number_of_bricks_at_once(made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:

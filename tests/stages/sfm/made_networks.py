@@ -101,15 +101,3 @@ def matcher(path: Path, layout: str = "LightGlue-ONNX", like: float = 0.85) -> P
         g.add("Concat", *pairs, out="matches0", axis=1)
         g.add("Gather", best, which, out="mscores0")
     return g.save(path, inputs, [value("matches0", None, TensorProto.INT64), value("mscores0", None)])
-
-
-def echo(path: Path, layout: str) -> Path:
-    """A matcher whose score is how far right a feature is in the first picture: it shows what key points it was given."""
-    g = _Graph()
-    x = g.add("Gather", g.add("Squeeze", "kpts0", g.constant([0], np.int64)), g.constant(0, np.int64), axis=1)
-    g.add("Identity", x, out="mscores0")
-    count = g.add("Squeeze", g.add("Shape", x), g.constant([0], np.int64))
-    g.add("Range", g.constant(0, np.int64), count, g.constant(1, np.int64), out="matches0")
-    inputs = [value(f"{name}{k}", (1, f"n{k}", wide)) for name, wide in (("kpts", 2), ("desc", WIDE)) for k in (0, 1)]
-    inputs += [value(f"image_size{k}", (1, 2)) for k in (0, 1)] if layout == "COLMAP" else []
-    return g.save(path, inputs, [value("matches0", None, TensorProto.INT64), value("mscores0", None)])

@@ -78,15 +78,6 @@ def climbed(rig: Rig, tmp_path: Path) -> Search:
     return find_models(Search(tmp_path, IMAGES, 0, 100, 1, **QUIET), "exhaustive")
 
 
-def test_nothing_more_is_tried_where_every_photograph_has_a_camera(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.95)})
-    found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive"]
-    assert found.tried == [{"rung": "exhaustive", "registered": 20, "agreeing": 0.95}]
-    assert found.work == tmp_path
-    assert not (tmp_path / "rungs").exists()
-
-
 def test_attempts_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
@@ -112,26 +103,6 @@ def test_own_focal_lengths_are_kept_where_they_explain_disagreement(
     assert rig.tried == ["exhaustive", attempts.EACH]
     assert found.tried[-1] == {"rung": attempts.EACH, "registered": each[0], "agreeing": each[1]}
     assert (found.best, found.work) == ((attempts.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
-
-
-def test_a_way_straight_ahead_begins_with_small_angles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rig = Rig(monkeypatch, {"small angles": (20, 0.95)})
-    found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", *ANEW]
-    assert rig.weak == []
-    assert (found.best, found.work) == ("small angles", tmp_path)
-    again = Rig(monkeypatch, {"exhaustive": (9, 0.5), "wider matching": (20, 0.7)})
-    found = climbed(again, tmp_path)
-    assert [rung["rung"] for rung in found.tried] == ["exhaustive", "fewer matches", *ANEW, "wider matching", *ANEW, attempts.EACH]
-
-
-def test_focal_lengths_that_differ_are_looked_at_though_the_matches_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.EACH: (20, 0.999)})
-    assert climbed(rig, tmp_path).best == "exhaustive"
-    rig.spread = 1.2
-    assert climbed(rig, tmp_path).best == attempts.EACH
-    rig.outcomes[attempts.EACH] = (20, 0.984)  # not worth so many more parameters
-    assert climbed(rig, tmp_path).best == "exhaustive"
 
 
 @pytest.mark.parametrize(("cropped", "kept"), [((20, 0.979), True), ((20, 0.96), False), ((19, 0.98), False)])
@@ -164,19 +135,6 @@ def test_networks_come_last_and_for_photographs_without_a_camera_alone(
     assert (tmp_path / "networks").exists() == bool(tried)
     weak = set(range(registered, 20))
     assert compared == ([[(i, j) for i, j in sorted(pairs.all_pairs(20)) if {i, j} & weak]] if tried else [])
-
-
-def test_a_weak_photograph_is_matched_with_all_but_those_it_overlaps_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: dict[str, Any] = {}
-    monkeypatch.setattr(attempts, "neighbours", lambda work, count: {i: {5} if i == 3 else {3} if i == 5 else set() for i in range(count)})
-    monkeypatch.setattr(attempts, "forget", lambda place, tables, keys: asked.update(forgotten=keys))
-    monkeypatch.setattr(matches, "match_pairs", lambda place, images, wanted, **k: asked.update(wanted=wanted, **k))
-    there = {k: SimpleNamespace(name=image.file, has_pose=True) for k, image in enumerate(IMAGES) if k != 3}
-    attempts.match_again(Search(tmp_path, IMAGES, 0, 100, 2, models=[SimpleNamespace(images=there)], **QUIET), "wider_")
-    assert asked["wanted"] == {pairs.ordered(3, j) for j in range(20) if j not in (3, 5)}
-    assert len(asked["forgotten"]) == 18
-    assert asked["guided"]
-    assert asked["name"] == "wider_"
 
 
 def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> None:

@@ -70,17 +70,6 @@ def test_the_same_images_are_not_looked_at_again_and_have_the_same_features(monk
     assert features(second)[:3] == features(first)
 
 
-def test_other_options_and_masks_are_looked_at_anew(monkeypatch: pytest.MonkeyPatch, cache: Path, photographs: Path) -> None:
-    work = cache.parent / "work"
-    detected(monkeypatch, work, opened(photographs, work))
-    for number, change in enumerate(({"features": 100}, {"contrast": 0.5})):
-        other = cache.parent / f"other_{number}"
-        assert len(detected(monkeypatch, other, opened(photographs, other), **change)) == 3
-    Image.fromarray(np.full((192, 256), 255, np.uint8)).save(cache.parent / "mask.png")
-    masked = cache.parent / "masked"
-    assert len(detected(monkeypatch, masked, opened(photographs, masked, masks={"0.png": cache.parent / "mask.png"}))) == 3
-
-
 @pytest.mark.parametrize("damage", ["cut", "altered", "of_another_kind", "a_link"])
 def test_a_damaged_file_is_no_features(monkeypatch: pytest.MonkeyPatch, cache: Path, photographs: Path, damage: str) -> None:
     first, second = cache.parent / "first", cache.parent / "second"

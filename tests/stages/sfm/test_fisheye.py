@@ -7,15 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks.poses import aligned_errors
 from benchmarks.scenes import room as rooms
 from efficientnerf.geometry.cameras import Camera, rays
-from stages.io.photo import read_photo
 from stages.sfm.cameras import find_cameras
-from stages.sfm.database import WorkImage
-from stages.sfm.images import prepare_images
 
 WIDTH, HEIGHT = 400, 300
 LENS = (132.0, 132.4, 200.0, 150.0, 0.03, -0.008, 0.002, -0.0005)  # 174 degrees from left to right
@@ -41,21 +37,3 @@ def test_cameras_and_lens_are_those_that_took_the_photographs(room: tuple[Path, 
     pixels = np.array([[x, y] for x in (5.0, 100.0, 200.0, 395.0) for y in (5.0, 150.0, 295.0)])
     one, other = (rays(camera, pixels)[1] @ camera.world_from_camera[:3, :3] for camera in (found.photos[0].camera, made[0]))
     assert np.degrees(np.arccos(np.clip((one * other).sum(1), -1, 1))).max() < 0.5
-
-
-def prepared(folder: Path, work: Path, lens: str) -> list[WorkImage]:
-    names = sorted(path.name for path in folder.iterdir())
-    return prepare_images({name: folder / name for name in names}, max_side=100, features=100, seed=0, masks={}, lens=lens, work=work, **QUIET)[0]
-
-
-def test_the_lens_is_told_by_exif_and_overruled_by_the_setting(room: tuple[Path, list[Camera]], tmp_path: Path) -> None:
-    folder = tmp_path / "mixed"
-    folder.mkdir()
-    (folder / "a.jpg").write_bytes((room[0] / "room_00.jpg").read_bytes())
-    with Image.open(room[0] / "room_01.jpg") as image:
-        image.save(folder / "b.jpg")  # without EXIF data
-    assert [read_photo(folder / name, 100).fisheye for name in ("a.jpg", "b.jpg")] == [True, False]
-    for lens, expected in (("auto", [True, False]), ("fisheye", [True, True]), ("perspective", [False, False])):
-        images = prepared(folder, tmp_path / lens, lens)
-        assert [image.fisheye for image in images] == expected
-        assert len({image.camera_key for image in images}) == len(set(expected))

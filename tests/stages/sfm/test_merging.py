@@ -17,7 +17,7 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import PAIRS, WorkImage, forget, pair_id_of
 from stages.sfm.merging import Sights
 from stages.sfm.reconstruction import find_models
-from tests.stages.sfm.made_matches import COUNT, QUIET, cameras, matched, off, registered
+from tests.stages.sfm.made_matches import QUIET, cameras, matched, off, registered
 
 MOVED = Similarity(3.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, -2, 1]))
 TRUTH = cameras()
@@ -62,16 +62,6 @@ def test_two_sub_models_become_one_by_photographs_or_matches(scene: tuple[Path, 
     assert not (scene[0] / "merged").exists()
 
 
-def test_a_third_sub_model_finds_its_place_by_the_second(tmp_path: Path) -> None:
-    images = matched(tmp_path, TRUTH)
-    model = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    forget(tmp_path, PAIRS, [pair_id_of(i + 1, j + 1) for i in range(3) for j in range(6, 9)])
-    parts = part_of(model, [0, 1, 2]), part_of(model, [6, 7, 8], MOVED), part_of(model, [3, 4, 5], MOVED.inverse())
-    (whole,) = merging.merged(tmp_path, images, parts, 0, lambda: None)
-    assert whole.num_reg_images() == COUNT
-    assert off(whole, TRUTH) < 0.01
-
-
 def test_sub_models_without_anything_in_common_stay_apart(tmp_path: Path) -> None:
     images = matched(tmp_path, TRUTH)
     model = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
@@ -81,15 +71,6 @@ def test_sub_models_without_anything_in_common_stay_apart(tmp_path: Path) -> Non
     # One more, which shares photographs with the first.
     whole, left = merging.merged(tmp_path, images, [*apart, part_of(model, [2, 3, 4])], 0, lambda: None)
     assert (whole.num_reg_images(), left) == (5, apart[1])
-
-
-def test_a_sub_model_of_another_shape_is_refused(scene: tuple[Path, list[WorkImage], Any]) -> None:
-    """As of matches that join what does not belong together: its points are where no similarity takes them."""
-    other = part_of(scene[2], [4, 5, 6, 7, 8], MOVED)
-    rng = np.random.default_rng(0)
-    for _, point in sorted(other.points3D.items()):
-        point.xyz = point.xyz + rng.normal(0, 0.5, 3) * MOVED.scale
-    assert merged(scene, part_of(scene[2], [0, 1, 2, 3, 4]), other) == []
 
 
 def sights(similarity: Similarity, wrong: float, count: int = 200) -> tuple[Sights, Sights]:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from efficientnerf.capture.moving_parts import OF_A_PART, motions, moving_parts, share_of_parts
+from efficientnerf.capture.moving_parts import motions, moving_parts, share_of_parts
 from efficientnerf.geometry.cameras import project
-from stages.sfm import mapping
-from stages.sfm.attempts import Search
-from stages.sfm.reconstruction import find_models
-from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, SIZE, cameras, clouds, matched
+from tests.stages.sfm.made_matches import COUNT, POINTS, cameras, clouds
 
 BALL = 60  # points that move
 NONE = np.zeros((0, 2))
@@ -53,32 +48,6 @@ def test_wrong_matches_move_nothing(wrong: float) -> None:
     assert moving_parts(TAKEN, seen(0), all_matches(wrong).items()) == {}
 
 
-def test_a_patch_that_comes_twice_is_no_motion() -> None:
-    """In half of the pairs it is matched with its twin; by the others both stand still."""
-    pixels = {}
-    for k, cloud in enumerate(clouds()):
-        cloud[-BALL:] = cloud[-2 * BALL : -BALL] * 0.4 + np.array((0.3, -0.4, 0.2))
-        cloud[-2 * BALL : -BALL] = cloud[-BALL:] + np.array((0.1, 0.7, 0.0))
-        pixels[k] = project(TAKEN[k], cloud)[0]
-    matches = all_matches(0.0)
-    for (i, j), rows in matches.items():
-        if (i + j) % 2:
-            rows[-BALL:, 1] -= BALL
-            rows[-2 * BALL : -BALL, 1] += BALL
-    i, j = 0, 1
-    a, b = (pixels[k][matches[i, j][-BALL:, side]] / SIZE[0] for side, k in enumerate((i, j)))
-    assert len(motions(a, b)) > BALL / 2  # of this pair alone it looks like one
-    assert moving_parts(TAKEN, pixels, matches.items()) == {}
-
-
-def test_what_stays_in_the_picture_is_no_motion() -> None:
-    """As a date that was burnt in."""
-    pixels = seen(0)
-    for places in pixels.values():
-        places[-BALL:] = np.random.default_rng(4).uniform((20, 20), (120, 60), (BALL, 2))
-    assert moving_parts(TAKEN, pixels, all_matches(0.1).items()) == {}
-
-
 def test_a_motion_is_a_similarity_of_a_patch() -> None:
     rng = np.random.default_rng(5)
     a = rng.uniform(0.3, 0.5, (40, 2))
@@ -90,17 +59,6 @@ def test_a_motion_is_a_similarity_of_a_patch() -> None:
     assert not len(motions(a, 3 * turned))  # three times as large
     assert not len(motions(a[:5], turned[:5]))
     assert not len(motions(*others))
-
-
-def test_the_share_is_that_of_the_outlines_of_what_lies_together() -> None:
-    y, x = np.mgrid[0:5, 0:5]
-    patch = 10.0 * np.stack([x.ravel(), y.ravel()], 1)  # 40 by 40 px
-    one = share_of_parts(patch + 50, NONE, TAKEN[0])
-    assert one == pytest.approx(1600 / (SIZE[0] * SIZE[1]))
-    assert share_of_parts(np.concatenate([patch + 50, patch + 250]), NONE, TAKEN[0]) == pytest.approx(2 * one)
-    assert share_of_parts(np.concatenate([patch + 50, patch[:3] + 250, patch + 50.2]), NONE, TAKEN[0]) == pytest.approx(one)
-    assert share_of_parts(patch[: OF_A_PART - 1], NONE, TAKEN[0]) == 0.0
-    assert share_of_parts(patch[:0], NONE, TAKEN[0]) == 0.0
 
 
 def test_a_part_with_more_still_features_than_moving_ones_stands_still() -> None:
@@ -123,13 +81,3 @@ def test_a_pattern_that_is_matched_a_stitch_away_moves_nothing() -> None:
         pixels[k][-3 * BALL :] = project(TAKEN[k], stitches)[0]
         pixels[k][-BALL:] = project(TAKEN[k], stitches[-BALL:] + 0.12 * np.array((np.cos(k), np.sin(k), 0.0)))[0]
     assert moving_parts(TAKEN, pixels, matches.items()) == {}
-
-
-@pytest.mark.parametrize("elsewhere", [0, BALL])
-def test_the_mapper_s_cameras_show_what_moved(tmp_path: Path, elsewhere: int) -> None:
-    images = matched(tmp_path, list(TAKEN.values()), elsewhere)
-    found = find_models(Search(tmp_path, images, 0, POINTS, 1, **QUIET), "exhaustive")
-    model = mapping.bundle_adjusted(found.work, images, found.models[0], QUIET["safe_point"])
-    shares = mapping.moving_shares(found.work, images, model, QUIET["safe_point"])
-    assert sorted(shares) == ([image.name for image in images] if elsewhere else [])
-    assert all(0.001 < share < 0.1 for share in shares.values())

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from benchmarks.poses import aligned_errors, true_centres
-from pipeline.errors import BadInput, UsageError
-from pipeline.stage import Job
-from stages.io.reader import PhotoReader
-from stages.masking.photographs import cameras_of_photographs
-from stages.poses.settings import PosesSettings
-from stages.sfm import attempts, matches
-from stages.sfm.cameras import find_cameras
+from pipeline.errors import BadInput
+from stages.sfm import matches
 from stages.sfm.database import FEATURES, forget
 from stages.sfm.learned.matches import NEIGHBOURS, pairs_of
 from stages.sfm.reconstruction import Request, reconstruct
@@ -25,7 +18,7 @@ from stages.sfm.reconstruction import Request, reconstruct
 pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
 
-from stages.sfm.learned.networks import Detector, Features, Matcher, given_networks
+from stages.sfm.learned.networks import Detector, Features, Matcher
 from tests.stages.sfm.made_networks import WIDE, _Graph, detector, matcher, value
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -51,27 +44,8 @@ def strongest(path: Path, mask: np.ndarray | None = None) -> Features:
     return Detector(path).features(squares()[0], mask, 100)
 
 
-def textured(shift: int) -> np.ndarray:
-    """A picture in which no place looks like another, moved to the right."""
-    coarse = np.random.default_rng(0).integers(0, 255, (HEIGHT // 5, WIDTH // 5, 3), np.uint8)
-    return np.roll(cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), shift, axis=1)
-
-
 def distance(found: np.ndarray, to: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(found[:, None] - to[None], axis=2).min(1))
-
-
-def test_layouts_of_detectors_say_the_same_and_where_corners_are(tmp_path: Path) -> None:
-    found = {layout: strongest(detector(tmp_path / f"{layout}.onnx", layout)) for layout in LAYOUTS}
-    for layout in LAYOUTS:
-        np.testing.assert_allclose(found[layout].xy, found["LightGlue-ONNX"].xy, atol=1e-3)
-        np.testing.assert_allclose(found[layout].descriptors, found["LightGlue-ONNX"].descriptors, atol=1e-5)
-        assert found[layout].size == (WIDTH, HEIGHT)
-    xy, corners = found["COLMAP"].xy, squares()[1]
-    assert len(xy) == 100
-    assert np.median(distance(xy, corners)) < 2.5, "the smoothed response lies a little within"
-    assert np.median(distance(corners, xy)) < 2.5
-    assert abs(np.mean(xy - corners[np.linalg.norm(xy[:, None] - corners[None], axis=2).argmin(1)])) < 0.5, "of no half pixel more to one side"
 
 
 @pytest.mark.parametrize("size", [(160, 192)])
@@ -80,16 +54,6 @@ def test_a_network_of_one_size_gets_the_picture_at_its_size(tmp_path: Path, size
         found = strongest(detector(tmp_path / f"{layout}.onnx", layout, size))
         assert max(found.size[0] / size[1], found.size[1] / size[0]) == pytest.approx(1.0, abs=0.01)
         assert np.median(distance(found.xy, squares()[1])) < 5.0
-
-
-def test_layouts_of_matchers_find_the_same_shift(tmp_path: Path) -> None:
-    one, other = (Detector(detector(tmp_path / "d.onnx")).features(textured(shift), None, 300) for shift in (0, 6))
-    pairs = [Matcher(matcher(tmp_path / f"{layout}.onnx", layout)).matches(one, other) for layout in ("LightGlue-ONNX", "COLMAP")]
-    np.testing.assert_array_equal(*pairs)
-    assert pairs[0].dtype == np.uint32
-    moved = other.xy[pairs[0][:, 1]] - one.xy[pairs[0][:, 0]]
-    assert len(moved) > 30
-    np.testing.assert_allclose(np.median(moved, axis=0), (6, 0), atol=0.01)
 
 
 def refused_networks(folder: Path) -> dict[str, Path]:
@@ -125,23 +89,6 @@ def test_what_is_no_such_network_is_refused_in_one_line(tmp_path: Path) -> None:
         Matcher(tmp_path / "m.onnx").matches(found, Features(found.xy, found.seen, found.size, np.zeros((len(found.xy), WIDE + 1), np.float32)))
 
 
-def test_a_missing_file_package_or_second_network_is_a_usage_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, other = str(detector(tmp_path / "d.onnx")), str(matcher(tmp_path / "m.onnx"))
-    assert given_networks("off", "off") is None
-    assert given_networks(path, other) == (Path(path), Path(other))
-    for given in ((path, "off"), ("off", other), (path, str(tmp_path / "absent.onnx")), (str(tmp_path), other)):
-        with pytest.raises(UsageError):
-            given_networks(*given)
-    with pytest.raises(BadInput):
-        given_networks(other, path)
-    job = Job(settings=PosesSettings(features_model=path), out=tmp_path / "out", work=tmp_path / "work", source=STILL_LIFE)
-    with pytest.raises(UsageError):  # before cameras are looked for
-        cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[rembg\]'"):
-        given_networks(path, other)
-
-
 def test_photographs_without_cameras_are_compared_with_others() -> None:
     overlaps = {(i, j): 100 - 10 * (j - i) for i in range(1, 9) for j in range(i + 1, 9)} | {(2, 9): 0}
     pairs = pairs_of([0], [(0, 8), (7, 0), (0, 6)], overlaps)
@@ -162,19 +109,6 @@ def some(count: int) -> tuple[list[str], dict[str, Any]]:
 def errors_of(capture: Any, truth: dict[str, Any]) -> np.ndarray:
     photos = capture.photos
     return np.asarray(aligned_errors(np.array([photo.camera.centre for photo in photos]), np.array([truth[photo.camera.name] for photo in photos])))
-
-
-def test_cameras_are_found_where_sift_finds_none(tmp_path: Path) -> None:
-    """Two dozen features of a photograph are too few."""
-    names, truth = some(6)
-    asked: dict[str, Any] = {"max_side": 480, "features": 24, **QUIET}
-    networks = detector(tmp_path / "d.onnx"), matcher(tmp_path / "m.onnx")
-    capture = find_cameras(STILL_LIFE, names, work=tmp_path / "work", networks=networks, **asked)
-    rungs: list[dict[str, Any]] = capture.provenance.rungs
-    first = next(number for number, rung in enumerate(rungs) if rung["rung"] in (attempts.NETWORK, attempts.NETWORK_ANEW))
-    assert max(rung["registered"] for rung in rungs[:first]) < 3
-    assert len(capture.photos) == 6
-    assert errors_of(capture, truth).max() < 0.05
 
 
 def test_a_photograph_without_sift_features_gets_its_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

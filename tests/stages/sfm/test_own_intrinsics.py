@@ -10,7 +10,6 @@ import pytest
 from benchmarks.poses import aligned_errors
 from stages.sfm.colmap import import_pycolmap
 from stages.sfm.database import WorkImage
-from stages.sfm.intrinsics import own as own_intrinsics
 from stages.sfm.intrinsics.own import FOCAL_LENGTH, PRINCIPAL_POINT, with_own_intrinsics
 
 FOCAL, MIDDLE = 1280.0, np.array([512.0, 384.0])
@@ -37,11 +36,6 @@ def centres_of(model: Any) -> np.ndarray:
     return np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
 
 
-def test_one_lens_stays_one() -> None:
-    model, images, _ = made_model(np.ones(12), np.zeros((12, 2)))
-    assert with_own_intrinsics(images, model, lambda: None) == (model, None)
-
-
 def test_focus_breathing_is_found() -> None:
     factors = np.random.default_rng(1).uniform(0.97, 1.03, 12)
     model, images, centres = made_model(factors, np.zeros((12, 2)))
@@ -64,16 +58,3 @@ def test_principal_points_are_found_where_they_matter() -> None:
     own, which = with_own_intrinsics(images, model, lambda: None)
     assert which == PRINCIPAL_POINT
     assert own.compute_mean_reprojection_error() < min(0.5, 0.9 * shared)
-
-
-def test_a_photograph_with_few_observations_has_the_intrinsics_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    factors = np.random.default_rng(1).uniform(0.97, 1.03, 12)
-    model, images, _ = made_model(factors, np.zeros((12, 2)))
-    first = min(model.reg_image_ids())
-    for point_id in sorted(model.point3D_ids())[own_intrinsics.FEW - 10 :]:
-        for element in list(model.points3D[point_id].track.elements):
-            if element.image_id == first:
-                model.delete_observation(first, element.point2D_idx)
-    own, which = with_own_intrinsics(images, model, lambda: None)
-    assert which == FOCAL_LENGTH
-    assert own.cameras[own.images[first].camera_id].mean_focal_length() == FOCAL

@@ -45,29 +45,6 @@ def test_retrieval_finds_what_shows_the_same_in_any_order_of_files() -> None:
     assert len(found) < 0.5 * count * (count - 1) / 2
 
 
-def test_likeness_is_symmetric_whole_and_largest_for_the_same() -> None:
-    rng = np.random.default_rng(2)
-    images = [*views(8, 60, 20, rng), np.zeros((0, 128), np.uint8)]
-    images.append(images[3])
-    likeness = pairs.likeness_of(images, seed=3)
-    assert (likeness == likeness.T).all()
-    assert (likeness == np.rint(likeness)).all()
-    assert likeness[3, 9] == likeness[3, 3] == likeness[3].max()
-    assert (likeness[8] == 0).all()
-    assert (pairs.ranks(likeness)[3, 0], pairs.ranks(likeness)[9, 0]) == (9, 3)
-    shuffled = [image[rng.permutation(len(image))] for image in images]  # few enough that all are aggregated
-    words = pairs.visual_words(images, 3)
-    assert all((pairs.vlad(a, words) == pairs.vlad(b, words)).all() for a, b in zip(images, shuffled, strict=True))
-
-
-def test_nearest_words_are_those_of_exact_arithmetic() -> None:
-    rng = np.random.default_rng(4)
-    some, words = rng.integers(0, 256, (300, 128), np.uint8), rng.integers(0, 256, (40, 128), np.uint8)
-    some[:100], words[:3] = 255, np.array([[0], [255], [254]])  # the largest sums there are
-    distances = ((some[:, None].astype(np.int64) - words[None].astype(np.int64)) ** 2).sum(2)
-    assert (pairs._nearest(some, words) == distances.argmin(1)).all()
-
-
 def test_weak_images_are_compared_with_neighbours_of_neighbours() -> None:
     likeness = -np.abs(np.subtract.outer(np.arange(100.0), np.arange(100.0)))
     near = {i: {i - 1, i + 1} & set(range(100)) for i in range(100)} | {0: {50}, 50: {0, 90}}

@@ -121,32 +121,9 @@ def test_what_a_safe_point_raises_stops_the_child_at_a_safe_point(monkeypatch: p
     assert (tmp_path / "note").read_text() == "tidy"
 
 
-def test_a_child_that_comes_to_no_safe_point_is_stopped_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    child_does(monkeypatch, "progress(os.getpid(), 1)\nctypes.PyDLL(None).sleep(60)")
-    child: list[int] = []
-
-    def safe_point() -> None:
-        if child:
-            raise Interrupted(signal.SIGINT)
-
-    began = time.monotonic()
-    with pytest.raises(Interrupted):
-        process.run({}, **{**QUIET, "safe_point": safe_point, "progress": lambda pid, _: child.append(pid)})
-    assert time.monotonic() - began < 30  # not the 60 of its sleep
-    assert ended(child[0])
-
-
 def test_the_signals_of_a_terminal_are_the_parents_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     child_does(monkeypatch, "for number in (2, 15):\n    os.kill(os.getpid(), number)\nsafe_point()\nreturn 'alive'")
     assert process.run({}, **QUIET) == "alive"
-
-
-def test_modules_in_the_working_folder_are_not_imported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for name in ("json", "ctypes", "stages", "queue"):
-        (tmp_path / f"{name}.py").write_text("raise SystemExit('taken from the working folder')")
-    monkeypatch.chdir(tmp_path)
-    child_does(monkeypatch, "return 'ours'")
-    assert process.run({}, **QUIET) == "ours"
 
 
 # -------------------------------------------------------------------------------------------------------- whole runs

@@ -2,47 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[3]
-
-TERMINATED = """
-import os, signal, sys
-from dataclasses import replace
-from pathlib import Path
-from pipeline.errors import PipelineError
-from pipeline.runner import run_stages
-from stages.sfm.colmap import quiet_pycolmap
-from tests.pipeline.toy import STAGES, make_run
-
-def work(job):
-    with quiet_pycolmap():
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-    job.safe_point()
-
-if sys.argv[1] == "none":
-    with quiet_pycolmap():
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-try:
-    run_stages(make_run(Path(sys.argv[1])), [replace(STAGES[0], run=work), *STAGES[1:]])
-except PipelineError as error:
-    sys.exit(error.exit_code)
-"""
-
-
-@pytest.mark.parametrize(("engine", "code"), [(True, 143), (False, -signal.SIGTERM)])
-def test_colmap_leaves_sigterm_as_it_was(tmp_path: Path, engine: bool, code: int) -> None:
-    command = [sys.executable, "-c", TERMINATED, str(tmp_path) if engine else "none"]
-    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stderr) == (code, "")
-
 
 WHILE_IMPORTING = """
 import os, signal, sys

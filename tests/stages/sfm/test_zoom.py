@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from stages.sfm import attempts, mapping
 from stages.sfm.attempts import Search
-from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, WorkImage, copy_with_own_cameras, database_path
+from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics import zoom
 from stages.sfm.reconstruction import find_models
 from stages.verdict.verdict import DOUBTFUL
@@ -79,24 +75,3 @@ def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -
     assert zoom.principal_point_spread(model) < attempts.APART / 2
     assert off(model, taken) < 0.5 * off(shared, taken) < 0.005
     assert numbers(found_for(tmp_path, images)) == numbers(found)
-
-
-def test_a_copy_with_own_cameras_has_the_same_features_and_matches(tmp_path: Path) -> None:
-    images = matched(tmp_path, cameras(ZOOMED))
-    place = tmp_path / "copy"
-    place.mkdir()
-    copy_with_own_cameras(tmp_path, place, images)
-
-    def rows(work: Path, table: str) -> list[Any]:
-        with contextlib.closing(sqlite3.connect(database_path(work))) as connection:
-            return connection.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()
-
-    for table, _ in (*FEATURES, *PAIRS):
-        assert rows(tmp_path, table) == rows(place, table)
-        assert rows(place, table)
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(place)) as database:
-        own = {image.name: (image.image_id, image.camera_id) for image in database.read_all_images()}
-    assert [own[image.file][0] for image in images] == list(range(1, COUNT + 1))
-    assert len({camera for _, camera in own.values()}) == COUNT
-    copy_with_own_cameras(tmp_path, place, images)  # over what is there
-    assert rows(tmp_path, "matches") == rows(place, "matches")

@@ -19,7 +19,7 @@ from stages.artifacts import TrainOutputs
 from stages.io.field_file import load_renderer, read_tensors, space_of
 from stages.io.scene import load, views_of
 from stages.train import run as train
-from stages.train.budget import TIMED, UNKNOWN, training_budget
+from stages.train.budget import TIMED, training_budget
 from stages.train.data import depth_range, pixels_of
 from stages.train.hash_resolution import with_auto_sizes
 from tests.efficientnerf.balls import settings
@@ -99,24 +99,6 @@ def test_an_interrupted_run_keeps_to_its_plan(scene: Path, tmp_path: Path, at: i
     assert repeated(scene, said) == tensors_of(again)
 
 
-def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
-    """The warm-up's steps are slower than those that follow, and say nothing about them."""
-    now = [0.0]
-    budget = training_budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 0.0, lambda: now[0])
-    assert budget.schedule.iterations == UNKNOWN
-    assert not budget.known
-    for step in range(1, 100):
-        now[0] += 3.0 if step <= 10 else 0.5
-        if budget.after(step):
-            break
-    assert step == 10 + TIMED
-    assert budget.schedule.iterations == step + int((99 - 54) / 0.5)
-    given = settings(occupancy_warmup_steps=10, time_budget=100.0)
-    assert training_budget(given, tmp_path, 54.0, lambda: 0.0).schedule == budget.schedule
-    (tmp_path / "schedule.json").write_text("{")
-    assert not training_budget(given, tmp_path, 54.0, lambda: 0.0).known
-
-
 PACES: dict[str, Callable[[int], float]] = {
     "dearer": lambda step: 0.2 + step / 2000,
     "cheaper": lambda step: 0.5 - step / 2000,
@@ -145,19 +127,3 @@ def test_steps_that_change_their_pace_end_on_time(tmp_path: Path, pace: Callable
         assert budget.schedule.fraction(step) == pytest.approx(before, abs=1e-6)  # a revision changes nothing that has been done
     assert 0.97 * 120 < spent + times[-1] - began <= 120 * 1.005
     assert budget.schedule.fraction(step) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("stopped", [False, True])
-def test_work_that_comes_after_the_last_mark_does_not_overdraw_the_budget(tmp_path: Path, stopped: bool) -> None:
-    """Steps take eight times as long from 96 % of the budget on; an attempt that is stopped after that plans nothing anew either."""
-    given, times, step = settings(occupancy_warmup_steps=10, time_budget=120.0), [0.0], 0
-    budget = training_budget(given, tmp_path, 0.0, lambda: times[-1])
-    while step < budget.schedule.iterations:
-        times.append(times[-1] + (0.2 if times[-1] < 0.96 * 120 else 1.6))
-        step += 1
-        budget.after(step)
-        if stopped and times[-1] > 0.98 * 120:
-            stopped = False
-            budget = training_budget(given, tmp_path, times[-1], lambda: times[-1])
-    assert 0.97 * 120 < times[-1] <= 120 + 1.6
-    assert training_budget(given, tmp_path).schedule == budget.schedule  # what the field's bytes follow from

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.errors import Interrupted, StageFailed
+from pipeline.errors import Interrupted
 from stages.artifacts import TrainOutputs
 from stages.evaluate.trivial import blurred
 from stages.io import scene as scenes
@@ -24,7 +24,6 @@ from stages.train import run as train
 from stages.train.checks import early_check, second_chances
 from stages.train.checks.early_check import HeldOutView, judge
 from stages.train.choices import TrainingChoices
-from stages.train.data import pixels_of
 from tests.efficientnerf import balls
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
@@ -111,15 +110,6 @@ def test_no_plain_colour_is_progress_and_the_photograph_is(seed: int) -> None:
     assert result(lambda view: blurred(view.colour, early_check.BLUR * 40)).progress == pytest.approx(1, abs=0.1)
 
 
-def test_black_is_not_all_there_is_to_learn_of_a_small_thing_before_black() -> None:
-    rng = np.random.default_rng(0)
-    colour = np.zeros((40, 40, 3))
-    colour[15:22, 15:22] = 0.5 * rng.random((7, 7, 3))
-    found = judge([held_out(colour)], lambda camera: np.zeros((40, 40, 3)), 1)
-    assert found.psnr > early_check.GOOD_PSNR - 3
-    assert not found.learning
-
-
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0)])
 def test_an_empty_field_has_learned_nothing_whatever_the_background(tmp_path: Path, background: tuple[float, float, float]) -> None:
     folder = poses(tmp_path / "poses", side=64, background=background)
@@ -186,28 +176,6 @@ def test_a_training_that_is_stopped_anywhere_ends_with_the_same_bytes(tmp_path: 
     assert report(tmp_path / "stopped")["second_chances"] == report(tmp_path / "undisturbed")["second_chances"]
 
 
-def test_what_nothing_rescues_goes_on_as_it_is(tmp_path: Path) -> None:
-    def noise(view: View, folder: Path) -> View:
-        rng = np.random.default_rng(len(view.image) + int(view.camera.name[1:3]))
-        Image.fromarray(np.dstack([rng.integers(0, 256, (16, 16, 3)), np.full((16, 16), 255)]).astype(np.uint8)).save(folder / view.image)
-        return view
-
-    folder = ball(tmp_path / "poses", noise)
-    made = {policy: job(tmp_path / policy, settings(**QUICK, on_failure=policy), poses=folder) for policy in ("retry", "continue", "stop")}
-    train.run(made["retry"])
-    train.run(made["continue"])
-    tables = {policy: report(tmp_path / policy) for policy in ("retry", "continue")}
-    assert [len(table["early_check"]) for table in tables.values()] == [1, 1]
-    assert [table["chosen"] for table in tables.values()] == [None, None]
-    assert len(tables["retry"]["second_chances"]) > 1
-    assert tables["continue"]["second_chances"] == []
-    assert not list(tmp_path.glob("*/out/choices.json"))
-    for _ in range(2):  # what is found is noted: the second attempt ends at once
-        with pytest.raises(StageFailed) as failed:
-            train.run(made["stop"])
-        assert failed.value.exit_code == 3
-
-
 def test_candidates_are_what_would_change_anything(tmp_path: Path) -> None:
     photographs = scenes.load(poses(tmp_path / "photographs", photographs=True))
     names = second_chances.candidates(photographs, settings())
@@ -219,20 +187,3 @@ def test_candidates_are_what_would_change_anything(tmp_path: Path) -> None:
     assert second_chances.candidates(odd, settings())["near planes at most their median"].scene(odd).views[-2].near == photographs.views[-2].near
     own = TrainingChoices(near="off", masks=False, min_views=False, exposure=True, camera_refinement=True).settings(settings())
     assert (own.min_views, own.exposure, own.camera_refinement) == ("off", "on", "on")
-
-
-def test_a_trial_begins_with_what_is_stated_whatever_training_made_of_it(tmp_path: Path) -> None:
-    folder = ball(tmp_path / "poses", inverted)
-    views = scenes.views_of(scenes.load(folder), "train")
-    stated, changed = (pixels_of(folder, views) for _ in range(2))
-    changed.leave_out(np.arange(len(views)) == 2)
-    changed.set_cameras([views[0].camera for _ in views])
-    index = np.arange(len(stated))
-    own = second_chances._with_views(changed, views)
-    for mine, other in zip(own.rays(index), stated.rays(index), strict=True):
-        np.testing.assert_array_equal(mine, other)
-    np.testing.assert_array_equal(own.usable_at(index), stated.usable_at(index))
-    assert own.usable_count == stated.usable_count > changed.usable_count
-    unmasked = second_chances._with_views(changed, tuple(replace(view, mask=None) for view in views))
-    assert unmasked.usable_at(index).all()
-    assert not changed.usable_at(index).all()

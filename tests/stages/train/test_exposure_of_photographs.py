@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.verdict.looks import LEAST_POINTS, STEP, Look, look, of_other_exposure, over_points
+from stages.verdict.looks import LEAST_POINTS, over_points
 
 
 def photograph(light: np.ndarray, stops: float) -> np.ndarray:
@@ -24,19 +24,3 @@ def test_stops_are_those_of_the_exposure_whatever_is_shown(stops: float) -> None
     for shown in (np.sort(light)[:LEAST_POINTS], np.sort(light)[-LEAST_POINTS:]):
         found = over_points(photograph(shown, stops), places(LEAST_POINTS), shown)
         assert found == pytest.approx(stops, abs=0.05)
-
-
-def looks_of(brightness: list[float], over: list[float | None]) -> dict[str, Look]:
-    plain = look(np.full((64, 64), 100, np.uint8))
-    return {
-        f"{n}.jpg": Look(plain.sharpness, bright, 0.0, 0.0, 64, plain.small, over_points=stops)
-        for n, (bright, stops) in enumerate(zip(brightness, over, strict=True))
-    }  # fmt: skip
-
-
-def test_a_dark_subject_is_no_other_exposure_and_another_exposure_is_one() -> None:
-    dark = [-4.0, -1.0, -1.0, -1.2, -1.0]
-    assert of_other_exposure(looks_of(dark, [0.0, 0.1, 0.0, -0.1, 0.0])) == []
-    assert of_other_exposure(looks_of([-1.0] * 5, [0.0, 0.0, 1.01 * STEP, 0.0, 0.0])) == ["2.jpg"]
-    assert of_other_exposure(looks_of(dark, [None] * 5)) == ["0.jpg"]  # without points, brightness is all that there is
-    assert of_other_exposure({}) == []

@@ -26,14 +26,6 @@ def shown(tmp_path: Path, first: int, steps: Iterator[float], goal: int) -> dict
     return found
 
 
-def test_the_time_left_leaves_out_the_slow_first_step(tmp_path: Path) -> None:
-    found = shown(tmp_path, 1000, iter([3.0] + [0.05] * 60), 4000)
-    assert "left" not in found[1001]  # one step, in which kernels are loaded, says nothing: 3 s x 2999 would be 2.5 hours
-    assert found[1010]["left"] == pytest.approx(0.05 * 2990, abs=0.1)
-    assert found[1060]["left"] == pytest.approx(0.05 * 2940, abs=0.1)
-    assert found[1060]["samples_per_s"] == pytest.approx(50 / 0.05, rel=0.01)
-
-
 def test_the_time_left_follows_the_last_steps(tmp_path: Path) -> None:
     slow, fast = [0.2] * 300, [0.05] * (RECENT * EVERY + EVERY)
     found = shown(tmp_path, 0, iter(slow + fast), 2000)

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.training.pixels import Pixels
 from stages.train.pixel_file import PixelFile
-from tests.efficientnerf import balls
 
 
 def filled(folder: Path, channels: int = 3, count: int = 1000) -> tuple[PixelFile, np.ndarray]:
@@ -32,12 +30,6 @@ def test_rows_are_those_of_an_array(tmp_path: Path, channels: int) -> None:
     assert rows[at[:0]].shape == (0, channels)
 
 
-def test_the_file_has_no_name(tmp_path: Path) -> None:
-    rows, _ = filled(tmp_path)
-    assert list(tmp_path.iterdir()) == []
-    rows.close()
-
-
 def test_a_full_disk_shows_before_an_image_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -45,14 +37,3 @@ def test_a_full_disk_shows_before_an_image_is_read(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(OSError, match="space"):
         PixelFile(10, 3, tmp_path)
-
-
-def test_training_pixels_are_the_same_in_memory_and_in_a_file(tmp_path: Path) -> None:
-    cameras = balls.cameras(3)
-    images = [balls.photograph(cameras[0]), *(balls.picture(camera) for camera in cameras[1:])]  # without alpha, and with
-    near, far = np.full(3, 1.0), np.full(3, 5.0)
-    here = Pixels(cameras, images, [None] * 3, near, far, 4)
-    there = Pixels(cameras, images, [None] * 3, near, far, 4, PixelFile(len(here), 4, tmp_path))
-    index = here.choose(500, np.random.default_rng(0))
-    for a, b in zip(here.bundle(index), there.bundle(index), strict=True):
-        assert np.array_equal(a, b)

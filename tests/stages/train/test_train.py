@@ -5,14 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from efficientnerf.rendering.colour import linear_from_srgb
 from pipeline.errors import CorruptArtifact, Interrupted, UsageError
 from pipeline.stage import Job
 from stages.artifacts import TrainOutputs
@@ -20,15 +18,10 @@ from stages.io import refined_cameras
 from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
 from stages.io.field_file import load_exposure, load_renderer
-from stages.io.png import read_png, write_png
 from stages.io.refined_cameras import load_scene
-from stages.poses.settings import PosesSettings
-from stages.train import data
 from stages.train import run as train
 from stages.train.averaged import as_taken
 from stages.train.data import depth_range, pixels_of, sparse_depth_of
-from stages.train.exposure import begin_exposure
-from stages.train.settings import STAGE
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -228,44 +221,6 @@ def test_exposures_are_saved(tmp_path: Path) -> None:
     assert as_taken(tmp_path, s) is None
 
 
-@pytest.mark.parametrize("differ", [True, False])
-def test_whether_exposure_is_learned_is_told_by_sparse_points(tmp_path: Path, differ: bool) -> None:
-    """Photographs of the same points, of one brightness or of several; without points nothing is known, and before a constant background nothing is learned."""
-    scene = poses(tmp_path / "poses", photographs=True, points=True, side=32)
-    s = scenes.load(scene)
-    rng = np.random.default_rng(0)
-    for n, view in enumerate(s.views):
-        image = read_png(scene / view.image)
-        write_png(np.full_like(image, 120 if not differ else (70, 120, 180)[n % 3]) + rng.integers(0, 4, image.shape, np.uint8), scene / view.image)
-    xyz = rng.uniform(-0.2, 0.2, (60, 3))
-    scenes.save_points(SparsePoints(xyz, np.zeros((60, 3), np.uint8), np.zeros(60), ((0, 1, 2, 3, 4, 5, 6, 7),) * 60), scene)
-    used = {}
-    for choice in ("auto", "off", "on"):
-        used[choice] = begin_exposure(scene, s, pixels_of(scene, scenes.views_of(s, "train")), choice, "cpu")
-    assert (used["auto"] is not None) == differ
-    assert used["off"] is None
-    stops = used["on"].log_gains().detach().numpy()[:, 1] / np.log(2)
-    if differ:
-        assert stops[1] - stops[0] == pytest.approx(np.log2(linear_from_srgb(121.5 / 255) / linear_from_srgb(71.5 / 255)), abs=0.1)
-    else:
-        assert np.abs(stops).max() < 0.01
-    pixels = pixels_of(scene, scenes.views_of(s, "train"))
-    assert begin_exposure(scene, replace(s, points=False), pixels, "auto", "cpu") is None
-    assert begin_exposure(scene, replace(s, background=(1.0, 1.0, 1.0)), pixels, "auto", "cpu") is None
-
-
-def test_planes_are_stated_both_and_in_order_and_not_of_a_contracted_scene(scene: Path, tmp_path: Path) -> None:
-    for planes in ({"near_plane": 2.0}, {"far_plane": 6.0}, {"near_plane": 6.0, "far_plane": 6.0}):
-        chosen = settings(**QUICK, **planes)
-        for refused in (lambda chosen=chosen: STAGE.check({"train": chosen}), lambda chosen=chosen: train.run(job(tmp_path, chosen, poses=scene))):
-            with pytest.raises(UsageError, match=r"train\.near_plane=.*, train\.far_plane="):
-                refused()
-    chosen = settings(**QUICK, near_plane=2.0, far_plane=6.0)
-    with pytest.raises(UsageError, match=r"poses\.space=contracted"):
-        STAGE.check({"train": chosen, "poses": PosesSettings(space="contracted")})
-    STAGE.check({"train": chosen, "poses": PosesSettings()})
-
-
 def test_planes_that_miss_the_scene_are_refused(scene: Path) -> None:
     """The views have 1 to 5 of the training frame before them, which is 2 to 10 in the capture's units."""
     s = scenes.load(scene)
@@ -284,26 +239,6 @@ def test_planes_that_miss_the_scene_are_refused(scene: Path) -> None:
     assert told(2.0, 10.0) == told(0.0, 100.0) == told(2.5, 9.0) == []
     for near, far in ((5.0, 10.0), (1.0, 6.0)):
         assert [f"are {near:g} to {far:g} " in text and "miss a part of it" in text for text in told(near, far)] == [True]
-
-
-def test_of_many_observations_some_are_drawn_with_all_views_of_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = poses(tmp_path / "poses", points=True)
-    s, rng = scenes.load(folder), np.random.default_rng(0)
-    seen = tuple(tuple(sorted(rng.choice(7, rng.integers(3, 7), replace=False).tolist())) for _ in range(60))
-    scenes.save_points(SparsePoints(rng.uniform(-0.3, 0.3, (60, 3)), np.zeros((60, 3), np.uint8), np.zeros(60), seen), folder)
-    every = sparse_depth_of(folder, s)
-    assert len(every) == 2 * sum(map(len, seen))
-    monkeypatch.setattr(data, "POINTS_AT_ONCE", 40)  # the same of one point, or of a few at a time
-    again = sparse_depth_of(folder, s)
-    assert all(np.array_equal(getattr(again, name), getattr(every, name)) for name in ("origins", "directions", "distance"))
-    monkeypatch.setattr(data, "MOST_OBSERVATIONS", 100)
-    drawn = [sparse_depth_of(folder, s, seed) for seed in (0, 0, 1)]
-    assert all(2 * 90 < len(rays) <= 2 * 100 for rays in drawn)
-    assert np.array_equal(drawn[0].origins, drawn[1].origins)
-    assert not np.array_equal(drawn[0].distance[:50], drawn[2].distance[:50])
-    half = len(drawn[0]) // 2
-    known = {ray.tobytes() for ray in np.column_stack([every.origins, every.directions])[: len(every) // 2]}
-    assert {ray.tobytes() for ray in np.column_stack([drawn[0].origins, drawn[0].directions])[:half]} <= known
 
 
 @pytest.fixture

@@ -92,20 +92,6 @@ def test_every_scratch_file_of_a_turntable_may_be_damaged(tmp_path: Path, suffix
     assert [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"] == ["frame_0000.json"]
 
 
-def test_the_stage_reads_an_asset_file(tmp_path: Path) -> None:
-    from efficientnerf.asset.tree import tree_from_voxels
-
-    indices = np.stack(np.meshgrid(*[np.arange(2, 6)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    tree = tree_from_voxels((2, 2, 2), 0.25, np.full(3, -1.0), indices, np.full(64, 40.0), np.zeros((64, 1, 3)), background=(1.0, 1.0, 1.0))
-    (tmp_path / "bake").mkdir()
-    format.save(tree, tmp_path / "bake" / "asset.nerftree")
-    job = job_in(tmp_path, settings=TurntableSettings(frames=2, width=40, height=40, background="#000000"), inputs={"bake": tmp_path / "bake"})
-    STAGE.run(job)
-    frame = read_png(job.out / "frame_0000.png").astype(int)
-    assert (frame[0, 0] == 0).all()
-    assert abs(frame[20, 20] - 128).max() <= 3, "coefficients of zero are the middle of the sigmoid"
-
-
 def test_the_foreground_is_shown_unless_all_is_asked_for_and_framed_in_both(tmp_path: Path) -> None:
     from efficientnerf.asset.tree import Region, tree_from_voxels
 

@@ -12,13 +12,11 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import BadInput, Interrupted
-from pipeline.run import named
 from pipeline.stage import Job
 from stages.formats.importers import candidates, files
 from stages.io.material import find_material, photographs_of, with_frames
 from stages.io.photo import read_photo
 from stages.poses.settings import PosesSettings
-from stages.sfm.images import prepare_images
 from stages.video.frames import Chosen, Reader, frames_of, look
 from stages.video.reading import opened
 from tests.stages import captures, clips
@@ -108,46 +106,12 @@ def test_killed_at_any_moment_it_gives_the_same_frames(tmp_path: Path) -> None:
     assert contents(chosen(source, tmp_path / "killed")[0]) == expected
 
 
-def test_a_clip_that_shows_one_picture_is_refused(tmp_path: Path) -> None:
-    source = clips.write_clip(tmp_path / "clip.mp4", clips.pan(2))
-    with pytest.raises(BadInput, match="2 frames"):
-        record_of(source, tmp_path)
-    with pytest.raises(BadInput, match="1 frames"):
-        record_of(clips.write_clip(tmp_path / "still.mp4", clips.pan(8, 0.0)), tmp_path / "still")
-
-
 def test_a_video_is_the_source_of_a_run_by_its_content(tmp_path: Path) -> None:
     source = clip(tmp_path)
     settings = PosesSettings()
     assert candidates(source) == ["photographs"]
     assert files(source, settings) == [source]
     assert files(tmp_path, settings) == [source]
-
-
-def test_what_several_sources_hold_is_kept_apart(tmp_path: Path) -> None:
-    captures.write_pictures(tmp_path / "a" / "photos", ["1.png", "2.png", "3.png"])
-    captures.write_pictures(tmp_path / "b" / "photos", ["1.png", "2.png", "3.png"])
-    captures.write_picture(tmp_path / "b" / "photos" / "masks" / "2.png", captures.picture())
-    sources = named([tmp_path / "a" / "photos", tmp_path / "b" / "photos", clip(tmp_path / "c"), clip(tmp_path / "d" / "clips", "x.mov").parent])
-    found = find_material(sources, False, lambda text: None)
-    assert list(found.paths) == [f"{name}/{number}.png" for name in ("photos", "photos (2)") for number in (1, 2, 3)]
-    assert found.masks == {"photos (2)/2.png": tmp_path / "b" / "photos" / "masks" / "2.png"}
-    assert found.videos == {"clip.mp4": tmp_path / "c" / "clip.mp4", "clips/x.mov": tmp_path / "d" / "clips" / "x.mov"}
-
-
-def test_photographs_without_exif_share_a_camera_within_their_source(tmp_path: Path) -> None:
-    captures.write_pictures(tmp_path / "a", ["1.png", "2.png"])
-    captures.write_pictures(tmp_path / "b", ["1.png"])
-    exif = Image.Exif()
-    exif[271] = "Maker"
-    for folder in ("a", "b"):
-        Image.fromarray(captures.picture()).save(tmp_path / folder / "9.jpg", exif=exif)
-    paths = find_material(named([tmp_path / "a", tmp_path / "b"]), False, lambda text: None).paths
-    quiet: dict[str, Any] = {"progress": lambda *values: None, "safe_point": lambda: None, "warn": lambda text: None}
-    images, _ = prepare_images(paths, max_side=100, features=300, seed=0, masks={}, work=tmp_path / "work", **quiet)
-    keys = {image.name: image.camera_key for image in images}
-    assert keys["a/1.png"] == keys["a/2.png"] != keys["b/1.png"]
-    assert keys["a/9.jpg"] == keys["b/9.jpg"] not in (keys["a/1.png"], keys["b/1.png"])
 
 
 def test_panoramas_become_views_and_photographs_beside_them_stay(tmp_path: Path) -> None:

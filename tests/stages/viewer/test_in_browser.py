@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import re
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.format import FormatError, load, serialize
-from efficientnerf.asset.region import foreground
+from efficientnerf.asset.format import serialize
 from efficientnerf.asset.rendering import render
 from stages.viewer.page import viewer_page
 from tests.efficientnerf.hostile import HOSTILE
@@ -48,20 +46,6 @@ def test_a_page_renders_what_the_cpu_renders(kind: str, chromium: Any, tmp_path:
         assert np.median((shown * expected.normal).sum(axis=-1)[both]) > 0.95
         assert page.console == []
         assert [each for each in page.requests if not each.startswith(("file:", "data:"))] == []
-
-
-def test_the_subject_alone_is_what_the_region_says(chromium: Any, tmp_path: Path) -> None:
-    from efficientnerf.asset.quantisation import compacted
-
-    tree = compacted(TREES["whole"]())
-    camera = cameras_at(tree)[0]
-    with browser.opened(chromium, written(tmp_path, serialize(tree, "compact"))) as page:
-        page.ready()
-        page.page.select_option("#subject", "subject")
-        page.page.wait_for_selector("#loading", state="hidden")
-        expected = render(foreground(tree), camera, background=(1, 1, 1)).colour
-        assert np.abs(expected - render(tree, camera).colour).max() > 0.1
-        assert decibels(page.rendered(camera, background=(1, 1, 1), surroundings=False), expected) > 45
 
 
 @pytest.mark.parametrize("kind", ["asset", "Gaussians"])
@@ -146,28 +130,6 @@ def small_parts(monkeypatch: pytest.MonkeyPatch) -> int:
     return 3 * 2**12
 
 
-def test_a_page_of_parts_refuses_what_verify_refuses(chromium: Any, tmp_path: Path, small_parts: int) -> None:
-    """Cut short or altered anywhere: the asset in it, or the page itself."""
-    good = serialize(random_tree(1, shape=(6, 6, 6), degree=2, share=0.6), "compact")
-    assert len(good) > 3 * small_parts
-    start, rng = 8 + int.from_bytes(good[:8], "little"), np.random.default_rng(0)
-    wrong = {f"of {n} bytes": good[:n] for n in (start - 1, start, len(good) // 3, small_parts, len(good) - 1)} | {"longer": good + b"\0"}
-    for at in [start, *rng.integers(start, len(good), 4).tolist(), len(good) - 1]:
-        wrong[f"altered at {at}"] = good[:at] + bytes([good[at] ^ 1 << int(rng.integers(8))]) + good[at + 1 :]
-    one, two, three = (start + 4096 * n for n in (1, 2, 3))
-    wrong["with two blocks changed round"] = good[:one] + good[two:three] + good[one:two] + good[three:]
-    for name, asset in wrong.items():
-        (tmp_path / "a.nerftree").write_bytes(asset)
-        with pytest.raises(FormatError):
-            load(tmp_path / "a.nerftree")
-        with browser.opened(chromium, written(tmp_path, asset)) as page:
-            assert "The asset in this page is refused" in page.refusal(), name
-            assert page.console == [], name
-    with browser.opened(chromium, written(tmp_path, good)) as page:
-        page.ready()
-        assert page.console == []
-
-
 @pytest.mark.usefixtures("small_parts")
 def test_a_page_of_parts_that_was_damaged_says_so(chromium: Any, tmp_path: Path) -> None:
     text = viewer_page(serialize(random_tree(1, shape=(6, 6, 6), degree=2, share=0.6), "compact")).decode()
@@ -196,17 +158,6 @@ def test_a_page_of_parts_that_was_damaged_says_so(chromium: Any, tmp_path: Path)
         page.page.wait_for_selector("#late", state="visible")
         assert "cut short" in page.page.inner_text("#late")
         assert page.page.evaluate("typeof enerf") == "undefined"
-
-
-def test_its_own_digests_and_base64_are_those_of_the_standards(chromium: Any, tmp_path: Path) -> None:
-    with browser.opened(chromium, written(tmp_path, serialize(random_tree(1), "compact"))) as page:
-        for length in (0, 3, 55, 56, 63, 64, 65, 119, 120, 1000):
-            content = bytes(n % 251 for n in range(length))
-            assert page.page.evaluate("x => enerf.sha256(Uint8Array.from(x))", list(content)) == hashlib.sha256(content).hexdigest()
-            assert page.page.evaluate("x => Array.from(enerf.fromBase64(x))", base64.b64encode(content).decode()) == list(content)
-        for wrong in ("a", "ab", "abc", "a===", "ab=c", "abc\u0141", "ab c", "ab-d"):
-            said = page.page.evaluate("x => { try { enerf.fromBase64(x); return 'taken' } catch (error) { return error.message } }", wrong)
-            assert said.startswith("the page's data")
 
 
 JPEG = (

@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from tests.workflows.fleet_child import PRESETS
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -138,19 +138,6 @@ def test_mistakes_are_found_before_anything_runs(enerf: Enerf, scenes: Path, tmp
     assert not (tmp_path / "fleet").exists()
 
 
-def test_a_folder_of_something_else_is_left_alone(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("mine")
-    assert enerf("fleet", scenes, "--out", tmp_path / "mine").code == 2
-    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
-    assert enerf("run", scenes / "s1", "--out", tmp_path / "run", "--preset", "tiny").code == 0
-    assert enerf("fleet", scenes, "--out", tmp_path / "run").code == 2
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "index.html").write_text("mine")
-    assert enerf("fleet", scenes, "--out", tmp_path / "site").code == 2
-    assert (tmp_path / "site" / "index.html").read_text() == "mine"
-
-
 def test_pages_are_not_written_through_links(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
     fleet = tmp_path / "fleet"
     command = ["fleet", scenes / "s1", scenes / "s2", "--out", fleet, "--preset", "tiny"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -65,15 +64,6 @@ def test_scenes_on_dask_are_as_one_by_one(enerf: Enerf, scenes: Callable[..., Pa
     alone = tmp_path / "alone"
     assert enerf("run", tmp_path / "shoots" / "s0", "--out", alone, "--preset", "tiny", "--quiet").code == 0
     assert digests(fleet / "s0") == digests(alone)
-
-
-def test_what_ssh_needs_is_named(enerf: Enerf, scenes: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "asyncssh", None)
-    (tmp_path / "ssh.toml").write_text('hosts = ["localhost", "localhost"]\n', encoding="utf-8")
-    told = enerf("fleet", scenes(), "--out", tmp_path / "fleet", "--cluster", "ssh", "--cluster-options", tmp_path / "ssh.toml")
-    assert told.code == 2
-    assert "asyncssh is not installed" in told.err
-    assert "pip install 'efficientnerf[fleet]'" in told.err
 
 
 def _facts(process: int) -> list[str]:

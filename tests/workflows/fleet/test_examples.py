@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 import shlex
 import shutil
@@ -11,11 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import UsageError
-from pipeline.executors.dask import DaskWorkers
-from pipeline.fleet.state import check_scenes
 from workflows.asset import WORKFLOW
-from workflows.cli.resolve import read_toml
 from workflows.cli.run import run as run_command
 from workflows.fleet.command import fleet
 from workflows.fleet.manifest import read_manifest
@@ -23,13 +18,6 @@ from workflows.fleet.manifest import read_manifest
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "examples" / "fleet"
 SCRIPTS = sorted(path.name for path in EXAMPLES.glob("*.sh"))
-
-
-def test_both_manifests_say_the_same(tmp_path: Path) -> None:
-    scenes = read_manifest([str(EXAMPLES / "scenes.toml")], WORKFLOW, tmp_path, roots=[ROOT / "examples"])
-    check_scenes(scenes)
-    assert [scene.name for scene in scenes] == ["still-life", "still-life-small"]
-    assert scenes == read_manifest([str(EXAMPLES / "scenes.csv")], WORKFLOW, tmp_path, roots=[ROOT / "examples"])
 
 
 def test_manifests_of_the_documentation(tmp_path: Path) -> None:
@@ -56,34 +44,6 @@ def test_scripts_are_shell_and_their_options_exist(name: str) -> None:
     for word in words:
         if word.endswith((".toml", ".csv")):
             assert (EXAMPLES / word).is_file()
-
-
-@pytest.mark.parametrize(("name", "module", "kind"), [("ssh.toml", "distributed", "SSHCluster"), ("slurm.toml", "dask_jobqueue", "SLURMCluster")])
-def test_options_of_clusters_are_those_of_their_classes(name: str, module: str, kind: str) -> None:
-    options = read_toml("--cluster-options", EXAMPLES / name)
-    assert options
-    options.pop("jobs", None)
-    cluster = getattr(pytest.importorskip(module), kind)
-    known: set[str] = set()
-    for each in (cluster, *getattr(cluster, "__mro__", ())[1:2], *([cluster.job_cls, *cluster.job_cls.__mro__[1:2]] if hasattr(cluster, "job_cls") else [])):
-        known |= set(inspect.signature(each).parameters)
-    assert set(options) <= known
-
-
-def test_slurm_is_asked_for_what_the_template_says() -> None:
-    """The script that dask-jobqueue would hand to sbatch, which is not needed for it."""
-    jobqueue = pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed")
-    options = read_toml("--cluster-options", EXAMPLES / "slurm.toml")
-    assert options.pop("jobs") == 8
-    cluster = jobqueue.SLURMCluster(**options, scheduler_options={"dashboard_address": ":0", "host": "127.0.0.1"})
-    try:
-        script = cluster.job_script().splitlines()
-    finally:
-        cluster.close()
-    assert {"#SBATCH --cpus-per-task=8", "#SBATCH --mem=30G", "#SBATCH -t 08:00:00", "#SBATCH -n 1"} <= set(script)
-    assert "-m distributed.cli.dask_worker tcp://127.0.0.1:" in script[-1]
-    with pytest.raises(UsageError, match="--cluster slurm: processes"):  # dask-jobqueue would not ask for others when they have ended
-        DaskWorkers("toy", kind="slurm", options={"cores": 8, "memory": "8GB", "processes": 4, "jobs": 2})
 
 
 def test_snakemake_finds_the_jobs(tmp_path: Path) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
 
 import pytest
 
-from pipeline.errors import BadInput, Mistakes, PipelineError, UsageError
+from pipeline.errors import Mistakes, PipelineError, UsageError
 from pipeline.fleet.state import Scene, check_scenes
 from tests.workflows.command import Enerf
 from workflows.asset import WORKFLOW
@@ -89,15 +87,6 @@ def test_csv_says_the_same(place: Path, separator: str, mark: str) -> None:
     assert read(written(mark + "\r\n".join(map(separator.join, rows)), "fleet.csv")) == read(written(TOML))
 
 
-def test_the_command_line_is_over_the_manifest(place: Path) -> None:
-    given = {"train": {"iterations": Text("7")}, "poses": {"allow_outside": Text("true")}}
-    chair, table = read(written(TOML), over=Choice(given, preset="high", seed=9))
-    assert chair.settings["poses"]["allow_outside"] is True
-    for scene in (chair, table):
-        assert (scene.preset, scene.seed, scene.settings["train"]["iterations"]) == ("high", 9, 7)
-    assert chair.settings["bake"] == {"max_mib": 8.0}
-
-
 def test_a_folder_of_folders_and_videos(place: Path) -> None:
     """The fleet itself and runs in the folder are no scenes."""
     for name in (".git", "with space", "out", "run"):
@@ -106,23 +95,6 @@ def test_a_folder_of_folders_and_videos(place: Path) -> None:
     (place / "shoots" / "run" / "run.json").write_text("{}")
     scenes = read_manifest(["shoots"], WORKFLOW, place / "shoots" / "out")
     assert [(scene.name, Path(scene.sources[0]).name) for scene in scenes] == [("a", "a"), ("b", "b"), ("c", "c.mp4"), ("with_space", "with space")]
-
-
-def test_globs_and_what_a_shell_makes_of_them(place: Path) -> None:
-    assert [scene.name for scene in read("shoots/*/")] == ["a", "b"] == [scene.name for scene in read("shoots/a/", "shoots/b/")]
-    assert [scene.name for scene in read("shoots/*")] == ["a", "b", "c"]
-    for name in "ab":
-        (place / "shoots" / name / "photos").mkdir()
-    assert [scene.name for scene in read("shoots/*/photos/")] == ["a", "b"] == [scene.name for scene in read("shoots/a/photos", "shoots/b/photos")]
-    assert [scene.name for scene in read("*/?")] == ["shoots-a", "shoots-b"]
-
-
-@pytest.mark.parametrize("name", ["shoots/a", "shoots/c.mp4", "nowhere", "empty", "*/nothing*", "fleet.toml"])
-def test_what_holds_no_scenes_is_refused(place: Path, name: str) -> None:
-    (place / "empty").mkdir()
-    os.mkfifo("fleet.toml")
-    with pytest.raises((BadInput, UsageError), match=re.escape(name)):
-        read(name)
 
 
 def test_all_mistakes_at_once_with_their_lines(place: Path) -> None:
@@ -186,16 +158,6 @@ def test_settings_that_no_stage_can_work_with_are_mistakes_of_the_manifest(setti
     assert told.code == 2
     assert "scene a" in told.err
     assert not Path("fleet").exists()
-
-
-def test_mistakes_are_told_by_the_command_line(enerf: Enerf, place: Path) -> None:
-    """A line each, and in the JSON object."""
-    told = enerf("fleet", written("[scenes.a]\nsource = '\\u001b'\n\"\\u001b\" = 1\n"), "--out", "fleet", "--json")
-    assert told.code == 2
-    details = told.objects[-1]["details"]
-    assert len(details) == 2
-    assert told.err.splitlines()[1:] == [f"  {each}" for each in details]
-    assert "\x1b" not in told.err
 
 
 def test_sources_stay_in_the_manifests_folder(place: Path) -> None:
@@ -265,15 +227,3 @@ def test_hostile_manifests_are_refused_in_words(place: Path, name: str, data: by
     assert len(str(caught.value)) < 2000
     assert all(len(each) < 2000 for each in getattr(caught.value, "details", ()))
     assert len(getattr(caught.value, "details", ())) <= 51
-
-
-def test_absolute_sources_need_no_working_folder(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    gone = tmp_path / "gone"
-    gone.mkdir()
-    monkeypatch.chdir(gone)
-    gone.rmdir()
-    shoots = place / "shoots"
-    for sources, names in (([shoots], ["a", "b", "c"]), ([shoots / "a", shoots / "b"], ["a", "b"])):
-        assert [scene.name for scene in read_manifest([str(source) for source in sources], WORKFLOW, tmp_path / "fleet")] == names
-    with pytest.raises(FileNotFoundError):
-        read_manifest(["shoots/a", "shoots/b"], WORKFLOW, tmp_path / "fleet")

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import base64
-import csv
 import hashlib
-import io
-import os
 import random
 import re
 import threading
 from pathlib import Path
 from typing import Any
 
-import pytest
-from PIL import Image
-
-from pipeline.fleet.state import FleetState, SceneState
+from pipeline.fleet.state import FleetState
 from pipeline.text import printable
 from stages.figures.pareto import pareto_front, pareto_plot
-from stages.figures.thumbnails import HEIGHT, WIDTH, write_thumbnail
-from stages.io.pictures import UnreadableImage
 from tests.workflows.fleet.fleets import NASTY, done, facts, fleet, mixed, with_pictures
-from workflows.fleet.pages.comparison import best, mean_results, results, settings_of, write_comparison
+from workflows.fleet.pages.comparison import write_comparison
 from workflows.fleet.pages.index import index_page
-from workflows.fleet.pages.spreadsheet import fleet_csv
 from workflows.fleet.pages.updates import Pages
 
 
@@ -66,35 +57,6 @@ def test_the_policy_allows_the_pages_own_script_and_style_alone() -> None:
     assert not re.search(r"(?:https?:)?//\w", re.sub(r'<script id="data".*?</script>', "", page, flags=re.DOTALL))
 
 
-def test_figures_that_are_none_are_left_out() -> None:
-    for metrics in (
-        {},
-        {"asset": None},
-        {"asset": {"psnr": None}},
-        {"asset": {"psnr": "x"}},
-        {"asset": {"psnr": True}},
-        {"asset": []},
-        {"asset": {"psnr": 1e300}},
-    ):
-        scene = SceneState("a", "done", metrics=metrics, run="a")
-        assert facts(index_page(fleet(scene), title="t"))["scenes"][0]["psnr"] is None
-        assert fleet_csv(fleet(scene)).splitlines()[1].split(",")[3] == ""
-    only_field = SceneState("a", "done", metrics={"network": {"psnr": 20.0, "ssim": None}}, run="a")
-    assert facts(index_page(fleet(only_field), title="t"))["scenes"][0]["psnr"] == 20.0
-
-
-def test_csv_reads_back() -> None:
-    state = mixed()
-    state.scenes[0].sweep = {"train.iterations": 2000}
-    state.scenes[1].reason = "=1+1"
-    rows = list(csv.DictReader(io.StringIO(fleet_csv(state), newline="")))
-    assert [row["name"] for row in rows] == [scene.name for scene in state.scenes]
-    assert (float(rows[0]["psnr"]), rows[0]["train.iterations"], rows[1]["train.iterations"]) == (20.0, "2000", "")
-    assert rows[1]["reason"] == "'=1+1", "no spreadsheet takes it for a formula"
-    assert rows[3]["reason"].startswith("</script>")
-    assert "\x1b" not in fleet_csv(state)
-
-
 def shown(fleet: Path, name: str) -> list[Any]:
     """This of each scene of the page."""
     return [scene[name] for scene in facts((fleet / "index.html").read_text("utf-8"))["scenes"]]
@@ -125,38 +87,6 @@ def test_pages_are_written_once_it_is_time_and_at_the_end(tmp_path: Path) -> Non
     pages = Pages(tmp_path / "nowhere")
     pages(state)
     assert "nowhere" in (pages.trouble or ""), "it is told, not raised"
-
-
-def test_thumbnails_and_links_are_of_what_is_there(tmp_path: Path) -> None:
-    """A scene that failed may have a report of an earlier call; one that is done may have lost it."""
-    state = fleet(done("a"), done("b"), done("c"))
-    with_pictures(tmp_path, state)
-    (tmp_path / "b" / "report.html").unlink()
-    state.scenes[2].state, state.scenes[2].stages["turntable"].state = "failed", "failed"
-    Pages(tmp_path)(state)
-    assert shown(tmp_path, "report") == ["a/report.html", None, "c/report.html"]
-    thumbnail = tmp_path / "thumbnails" / "a.webp"
-    with Image.open(thumbnail) as image:
-        assert image.size == (WIDTH, HEIGHT)
-    assert thumbnail.stat().st_size < 10_000
-    before = thumbnail.stat().st_ino
-    Pages(tmp_path)(state)
-    assert thumbnail.stat().st_ino == before
-    os.utime(thumbnail, ns=(1, 1))
-    Pages(tmp_path)(state)
-    assert thumbnail.stat().st_ino != before, "it is made again of another picture only"
-
-
-def test_pictures_that_are_none_end_nothing(tmp_path: Path) -> None:
-    state = fleet(done("a"), done("b"), state="done")
-    with_pictures(tmp_path, state)
-    (tmp_path / "a" / "turntable" / "frame_0000.png").write_bytes(b"no picture")
-    (tmp_path / "b" / "turntable" / "frame_0000.png").unlink()
-    with pytest.raises(UnreadableImage):
-        write_thumbnail(tmp_path / "a" / "turntable" / "frame_0000.png", tmp_path / "x.webp")
-    pages = Pages(tmp_path)
-    pages(state)
-    assert (pages.trouble, shown(tmp_path, "picture")) == (None, [None, None])
 
 
 def test_a_page_that_another_wrote_is_not_linked(tmp_path: Path) -> None:
@@ -201,19 +131,6 @@ def sweep() -> FleetState:
                     scene.stages["poses"].seconds = 0.0
                 scenes.append(scene)
     return fleet(*scenes, state="done")
-
-
-def test_a_comparison_counts_what_was_shared_as_if_it_had_been_made() -> None:
-    state = sweep()
-    found = results(state, settings_of(state))
-    assert [(each.scene, each.seconds) for each in found] == [("a", 40.0)] * 4 + [("b", 40.0)] * 4
-    means = mean_results(found)
-    assert [each.values for each in means] == [(1, 8), (1, 24), (2, 8), (2, 24)]
-    assert [each.psnr for each in means] == [22.5, 24.5, 23.5, 25.5]
-    assert (best(means, "seconds"), best(means, "megabytes")) == ({3}, {2, 3})
-    state.scenes[0].state = "quarantined"
-    found = results(state, settings_of(state))
-    assert (found[0].psnr, mean_results(found), best(found, "seconds")) == (None, [], {7}), "one scene is no mean"
 
 
 def test_a_page_of_a_sweep(tmp_path: Path) -> None:

@@ -12,14 +12,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pipeline.fleet.state import is_scene_name
 from pipeline.run import Run
 from pipeline.runner import verify
 from tests.workflows.command import Enerf
 from tests.workflows.fleet.fleets import facts, mixed
 from tests.workflows.toys import TOYS
 from workflows.fleet.display import Show
-from workflows.fleet.pages import updates
 from workflows.fleet.table import LiveTable
 
 
@@ -53,24 +51,6 @@ def test_a_sweep_is_run_shared_and_shown(enerf: Enerf, manifest: Path, tmp_path:
     before = {name: (fleet / name / "points" / "points.ply").stat().st_ino for name in names}
     assert enerf(*command).code == 3
     assert {name: (fleet / name / "points" / "points.ply").stat().st_ino for name in names} == before
-
-
-def test_a_fleet_goes_on_without_its_damaged_json(enerf: Enerf, manifest: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet"
-    assert enerf("fleet", manifest, "--out", fleet).code == 3
-    (fleet / "fleet.json").write_text("{")
-    told = enerf("fleet", manifest, "--out", fleet)
-    assert (told.code, "fleet.json" in told.err) == (4, True)
-    (fleet / "fleet.json").unlink()
-    assert enerf("fleet", manifest, "--out", fleet).code == 3
-    (fleet / "fleet.json").unlink()
-    (fleet / "thesis.txt").write_text("years of work")
-    assert enerf("fleet", manifest, "--out", fleet).code == 2
-
-
-def test_names_are_those_that_a_file_system_has() -> None:
-    assert is_scene_name("é" * 100)
-    assert not any(map(is_scene_name, ["椅" * 100, *updates.FILES, *map(str.upper, updates.FILES), "fleet.json", "run.json"]))
 
 
 def test_a_terminal_has_the_table_and_what_goes_wrong_above_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -147,11 +147,3 @@ def test_a_fleet_runs_on_workers_that_ssh_starts(enerf: Enerf, toys: Path, serve
     assert ["distributed.Scheduler" in command for command in started] == [True, False]
     assert set(server.users) == {"operator"}
     assert all((fleet / scene["name"] / "train" / "field.txt").is_file() for scene in found["scenes"])
-
-
-def test_a_key_that_the_server_does_not_know_is_told(enerf: Enerf, toys: Path, server: Server, tmp_path: Path) -> None:
-    asyncssh.generate_private_key("ssh-ed25519").write_private_key(str(tmp_path / "strange_key"))
-    chosen = options(tmp_path, server.port, key="strange_key")
-    result = enerf("fleet", manifest(tmp_path, 1), "--out", tmp_path / "fleet", "--cluster", "ssh", "--cluster-options", chosen)
-    assert (result.code, "--cluster ssh" in result.err, "Permission denied" in result.err) == (2, True, True)
-    assert not server.commands

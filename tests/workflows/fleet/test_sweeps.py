@@ -6,34 +6,16 @@ import itertools
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
-from pipeline.errors import Mistakes, UsageError
-from pipeline.fleet.state import MOST_SCENES, Scene, check_scenes
+from pipeline.fleet.state import Scene, check_scenes
 from pipeline.runner import run_stages, verify
 from pipeline.sharing import take_over
 from tests.workflows.toys import TOYS
-from workflows.asset import STAGES, WORKFLOW
+from workflows.asset import STAGES
 from workflows.cli.request import Options, plan_run
-from workflows.fleet.sweeps import Sweep, read_sweeps, shared, split_values, swept, unswept
+from workflows.fleet.sweeps import Sweep, shared, swept
 from workflows.workflow import Workflow
 
 CHAIR, TABLE = Scene("chair", ("/chair",)), Scene("table", ("/table",))
-
-
-def test_values_are_those_of_set() -> None:
-    found = read_sweeps(["train.iterations=2000,4000,2000", "bake.max_mib=8,24.5", "mesh.max_faces=20k,100k"], WORKFLOW)
-    assert found == [Sweep("train", "iterations", (2000, 4000)), Sweep("bake", "max_mib", (8.0, 24.5)), Sweep("mesh", "max_faces", ("20k", "100k"))]
-    assert read_sweeps(["poses.mask_model=off,/net.onnx"], WORKFLOW) == [Sweep("poses", "mask_model", ("off", "/net.onnx"))], "it is given by hand"
-    assert split_values("[1, 2],[3,4]") == ["[1, 2]", "[3,4]"]
-    assert split_values("'a,b', \"c,'d\"") == ["'a,b'", '"c,\'d"']
-    assert split_values("1,,2") == split_values("") == split_values("1,") == []
-    with pytest.raises(Mistakes) as caught:
-        read_sweeps(["train.iterations", "train.iterations=5,many", "bake.max_mb=8", "=1", "train.iterations=1", "train.seed=1,"], WORKFLOW)
-    assert len(caught.value.details) == 6
-    values = tuple(range(200))
-    with pytest.raises(UsageError, match=str(MOST_SCENES)):
-        swept([CHAIR], [Sweep("train", "iterations", values), Sweep("train", "seed", values)], STAGES)
 
 
 def test_combinations_share_what_comes_before_the_swept_stage() -> None:
@@ -55,15 +37,6 @@ def test_scenes_of_different_sources_presets_or_seeds_share_nothing() -> None:
     for another in ({"sources": ("/other",)}, {"preset": "tiny"}, {"seed": 1}):
         assert shared([CHAIR, replace(CHAIR, name="x", **another)], STAGES)[1].shares == {}  # type: ignore[arg-type]
     assert shared([CHAIR, replace(CHAIR, name="x")], STAGES)[1].shares == {stage.name: "chair" for stage in STAGES}
-
-
-def test_long_names_are_numbered_and_the_swept_scene_is_known() -> None:
-    for name, values in (("c" * 100, ("x" * 50, "x" * 51)), ("a--" + "c" * 80, ("x" * 50, "x" * 51)), ("chair", ("a b", "a_b", "", "é/../")),
-                         ("椅" * 66, ("a", "b")), ("a--b", ("-1", "0")), ("a--0001x", ("1",))):  # fmt: skip
-        made = swept([Scene(name, ("/c",))], [Sweep("bake", "licence", values)], STAGES)
-        check_scenes(made)
-        assert [scene.name[-6:] for scene in made] == ["--0001", "--0002"] or len(values[0]) < 50
-        assert {unswept(scene.name, scene.sweep or {}) for scene in made} == {name} or len(name.encode()) > 83
 
 
 def test_what_is_shared_has_the_same_request(toys: Path, tmp_path: Path) -> None:

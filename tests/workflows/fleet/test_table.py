@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from tests.workflows.fleet.fleets import NASTY, mixed
+from tests.workflows.fleet.fleets import mixed
 from workflows.fleet.table import LiveTable, overview
 
 
@@ -42,14 +42,3 @@ def test_what_runs_stands_first_and_the_rest_is_counted() -> None:
     for name in ("scene-001", "scene-020"):
         table({"event": "scene_done", "scene": name})
     assert [line.split()[0] for line in printed(table).splitlines()[1:4]] == ["scene-020", "scene-001", "scene-000"], "what ended last"
-
-
-def test_names_and_messages_do_nothing_to_the_terminal() -> None:
-    out = console()
-    with LiveTable(out) as table:
-        table.written(mixed(10))
-        table.say(NASTY)
-    text = out.file.getvalue()  # type: ignore[attr-defined]
-    assert "\\x1b[2J" in text
-    assert "\x1b[2J" not in text
-    assert "\x1b[2J" not in printed(table)

@@ -31,21 +31,6 @@ def ball(folder: Path) -> Path:
     return folder
 
 
-def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
-    whole, small = (settings_of(Row("n4"), scale) for scale in (1.0, 0.001))
-    assert (whole["train"]["iterations"], whole["train"]["hidden_dim"], whole["poses"]["max_image_size"]) == (1_000_000, 256, 800)
-    smaller = ("iterations", "max_rays_per_batch", "hidden_dim", "coarse_hidden_dim", "num_layers", "occupancy_resolution")
-    assert all(small["train"][name] < whole["train"][name] for name in smaller)
-    assert small["poses"]["max_image_size"] < 800
-    assert small["bake"]["resolution"] < whole["bake"]["resolution"]
-    kept = ("num_coarse_samples", "samples_per_pivot", "near_plane", "far_plane", "sh_degree", "pivotal_threshold", "occupancy_beta", "sampling", "max_pivots")
-    assert all(small["train"][name] == whole["train"][name] for name in kept)
-    light, standard = small["train"], settings_of(Row("nerf", tables.NERF), 0.001)["train"]
-    assert light["coarse_hidden_dim"] < standard["coarse_hidden_dim"] == standard["hidden_dim"]
-    differ = {name for name in light if light[name] != standard[name]}
-    assert differ == {"field", "sampling", "num_coarse_samples", "coarse_hidden_dim", "coarse_num_layers"}  # so the rest is shared
-
-
 def made_up(steady: float, psnr: float) -> Figures:
     tree = {"psnr": psnr - 0.5, "ssim": 0.9, "fps": 20.0, "frame": "100x100", "mib": 3.0}
     return Figures(psnr, 0.95, 2 * steady, steady, 1.0, 12.0, 24.0, 0.1, 0.04, ([1.0, 2.0], [20.0, psnr]), tree)

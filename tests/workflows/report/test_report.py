@@ -13,12 +13,10 @@ from urllib.parse import unquote
 import pytest
 
 from pipeline.run import Run
-from pipeline.runner import Outcome
 from tests.workflows.command import Enerf
 from tests.workflows.toys import TOYS
 from workflows.report import page as page_module
 from workflows.report.page import page, write_report
-from workflows.report.summary import in_words, summary
 
 
 class Links(HTMLParser):
@@ -86,33 +84,6 @@ def test_a_page_that_a_kill_prevented_is_written_by_the_next_run(enerf: Enerf, t
     assert page_file.read_bytes() == text
 
 
-def test_it_points_only_to_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = a_run(tmp_path / "run")
-    assert links(page(run, [])) == []
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "is_file", lambda path: True)  # it was there a moment ago
-        assert links(page(run, [])) == []
-    shown = {"turntable/turntable.mp4", "mesh/preview.png", "train/previews/preview 1.png"}
-    shown |= {"bake/previews/preview_000008.png", "bake/curve.png", "bake/asset.nerftree"}
-    for name in (*shown, "turntable/frame_0000.png"):
-        (run.path / name).parent.mkdir(parents=True, exist_ok=True)
-        (run.path / name).write_bytes(b"x")
-    found = links(page(run, []))
-    assert all((run.path / name).is_file() for name in found)
-    assert shown <= set(found)
-
-
-def test_names_and_reasons_are_text_not_markup(tmp_path: Path) -> None:
-    view = {"name": "<script>x</script>.jpg", "network": None, "asset": {"psnr": 21.257, "ssim": 0.5}}
-    run = a_run(tmp_path / "a run & more", {"network": {"psnr": 20.0, "ssim": 0.5}, "views": [view]})
-    write(run, "poses/report.json", json.dumps({"registered": [1], "rejected": [{"name": "<i>", "reason": "blur & fog"}]}))
-    write(run, "bake/report.json", json.dumps({"voxels": 5, "resolution_decided_by": "pixels & room"}))
-    text = page(run, [])
-    links(text)
-    assert all(shown in text for shown in ("pixels &amp; room", "blur &amp; fog", "21.26"))
-    assert not any(raw in text for raw in ("<script", "<b>chairs", "<i>"))
-
-
 POOR = {
     "network": {"psnr": 29.84, "ssim": 0.91, "psnr_colour_fitted": 30.5, "floaters": 0.01},
     "asset": {"psnr": 27.95, "ssim": 0.87, "psnr_colour_fitted": 28.25},
@@ -152,28 +123,6 @@ def test_the_page_shows_the_asset_against_its_network_and_the_verdict(tmp_path: 
         "Raise bake.max_mib.",
     )
     assert [each for each in figures if each not in text] == []
-
-
-@pytest.mark.parametrize("picture", ["../../etc/passwd", "/etc/passwd", "javascript:alert(1)", "poses/images/a.png", "evaluate/strip_worst.png/..", ""])
-def test_a_finding_links_to_no_other_picture(tmp_path: Path, picture: str) -> None:
-    run = a_run(tmp_path / "run", POOR, VERDICT | {"problems": [PROBLEM | {"picture": picture}]})
-    (run.path / "evaluate/strip_worst.png").write_bytes(b"x")
-    assert set(links(page(run, []))) == {"evaluate/metrics.json", "evaluate/verdict.json", "evaluate/strip_worst.png"}
-
-
-def test_the_closing_summary_begins_with_the_grade(tmp_path: Path) -> None:
-    run = a_run(tmp_path / "run", POOR, VERDICT)
-    (run.path / "evaluate/strip_worst.png").write_bytes(b"x")
-    lines = in_words(run.path, [])
-    assert "poor" in lines[0]
-    figures = ("29.84", "0.910", "27.95", "-1.89", "-0.040", "3.40 %", "5.10 %", "Few rays.", "bake.max_mib", "evaluate/strip_worst.png")
-    assert [each for each in figures if each not in "\n".join(lines)] == []
-    assert not any("poor" in line for line in in_words(run.path, [Outcome("train", "ran", "never run", 1.0, 1, "x")])), "of an earlier command"
-    assert "poor" in in_words(run.path, [Outcome("evaluate", "ran", "never run", 1.0, 1, "x")])[0]
-    good = a_run(tmp_path / "good", POOR, {"grade": "good", "summary": "Result: good.", "problems": []})
-    assert "good" in in_words(good.path, [])[0]
-    assert summary(good.path, [])["result"]["grade"] == "good"
-    assert summary(a_run(tmp_path / "none", POOR).path, [])["result"] is None
 
 
 def write(run: Run, name: str, text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -41,42 +40,6 @@ def test_a_run_gets_a_page_with_its_cameras_and_photographs(run: Run) -> None:
     path = write_run_viewer(run, anew=True)
     assert path is not None
     assert "data:image/webp" not in path.read_text(encoding="utf-8"), "without cameras, too"
-
-
-def test_a_page_is_made_again_when_the_asset_is_another(run: Run) -> None:
-    path = write_run_viewer(run)
-    assert path is not None
-    os.utime(path)
-    first = path.stat().st_ino
-    assert write_run_viewer(run) == path
-    assert path.stat().st_ino == first  # nothing changed: nothing is written
-    shutil.copytree(run.path / "bake", run.path / "new")
-    save(random_tree(4), run.path / "new/asset.nerftree", "compact")
-    shutil.rmtree(run.path / "bake")
-    (run.path / "new").rename(run.path / "bake")
-    write_run_viewer(run)
-    assert path.stat().st_ino != first
-    again = path.stat().st_ino
-    write_run_viewer(run, anew=True)
-    assert path.stat().st_ino != again
-
-
-def test_there_is_no_page_of_no_asset_a_damaged_one_or_one_too_large(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    asset = run.path / "bake/asset.nerftree"
-    assert write_run_viewer(run) is not None
-    with monkeypatch.context() as patch:
-        patch.setattr("workflows.report.signature.LARGEST", 100)
-        assert write_run_viewer(run, anew=True) is None
-    assert not (run.path / "viewer.html").exists()
-    assert write_run_viewer(run) is not None
-    asset.write_bytes(asset.read_bytes()[:-1])
-    assert write_run_viewer(run, anew=True) is None
-    asset.unlink()
-    asset.symlink_to("/etc/passwd")
-    assert write_run_viewer(run) is None
-    asset.unlink()
-    assert write_run_viewer(run) is None
-    assert not (run.path / "viewer.html").exists()
 
 
 def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Path) -> None:

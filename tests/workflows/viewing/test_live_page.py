@@ -115,25 +115,6 @@ def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(browser: An
         assert live.console == []
 
 
-def test_the_viewer_works_without_an_origin_and_reads_nothing_else(browser: Any, run: Run, server: Server, tmp_path: Path) -> None:
-    asset = BakeOutputs.of_run(run.path).asset
-    asset.parent.mkdir()
-    save(random_tree(1), asset)
-    with opened(browser, server.url, viewport={"width": 900, "height": 900}) as live:
-        live.page.frame_locator("#viewer").locator("body.ready").wait_for(timeout=60_000)
-        frame = next(each for each in live.page.frames if each.url.endswith("/viewer.html"))
-        assert frame.evaluate("self.origin") == "null"
-        assert frame.evaluate("fetch('/status.json').then(() => 'read', () => 'refused')") == "refused"
-        assert frame.evaluate("(() => { try { return parent.document.title } catch (error) { return error.name } })()") == "SecurityError"
-        with live.page.expect_download() as download:
-            frame.locator("#save").click()
-        assert Path(download.value.path()).read_bytes().startswith(b"\x89PNG")
-    with opened(browser, f"{server.url}viewer.html", viewport={"width": 900, "height": 900}) as alone:
-        alone.ready()
-        assert alone.page.evaluate("self.origin") == "null"
-        assert alone.console == []
-
-
 def test_a_page_that_another_put_in_its_place_runs_nothing(browser: Any, tmp_path: Path) -> None:
     page = tmp_path / "viewer.html"
     page.write_text("<!doctype html><title>mine</title><body><script>document.title = 'run'</script><img src=x onerror='document.title = 2'>", encoding="utf-8")
@@ -143,13 +124,3 @@ def test_a_page_that_another_put_in_its_place_runs_nothing(browser: Any, tmp_pat
             shown.page.wait_for_timeout(200)
             assert shown.page.title() == "mine"
         made.shutdown()
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(340, "light"), (700, "dark")])
-def test_nothing_runs_over_a_narrow_page(browser: Any, run: Run, server: Server, picture: bytes, width: int, scheme: str) -> None:
-    put(scratch(run), 7, [3, 5], picture)
-    with opened(browser, server.url, viewport={"width": width, "height": 700}, color_scheme=scheme) as live:
-        until(live, "document.querySelector('.preview img')?.naturalWidth === 12")
-        assert live.page.evaluate("document.documentElement.scrollWidth") <= width
-        paper = live.page.evaluate("getComputedStyle(document.body).backgroundColor")
-        assert (int(paper[4:-1].split(",")[0]) > 200) == (scheme == "light")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,14 +21,11 @@ from stages.viewer.page import script_text
 from tests.stages.formats.gaussians import scattered
 from tests.workflows.report.records import record, record_splats
 from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
-from workflows.asset import STAGES
-from workflows.cli.main import main
 from workflows.report.signature import write_page
 from workflows.viewing import progress, sites
 from workflows.viewing.page import make_page, present_page
-from workflows.viewing.progress import MOST_POINTS, MOST_PREVIEWS, Progress
 from workflows.viewing.server import Answer
-from workflows.viewing.sites import LIVE_POLICY, AssetSite, RunSite
+from workflows.viewing.sites import AssetSite, RunSite
 
 
 @pytest.fixture
@@ -73,71 +68,6 @@ def test_what_is_being_made_is_shown_as_it_comes(run: Run, tmp_path: Path, monke
     assert body(answer) == PNG + b"\x05"
 
 
-def test_nothing_is_written_into_the_run(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["status", str(run.path), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    served = json.loads(RunSite(run.path, STAGES, tmp_path).status())
-    assert {name: served[name] for name in told} == told
-    put(scratch(run), 3, [1])
-    before = {path: path.lstat().st_mtime_ns for path in [run.path, *run.path.rglob("*")]}
-    site = site_of(run, tmp_path / "pages")
-    for path in ("/", "/status.json", "/viewer.html", "/previews/train/preview_000001.png"):
-        body(site(path))
-    assert {path: path.lstat().st_mtime_ns for path in [run.path, *run.path.rglob("*")]} == before
-
-
-def test_a_run_is_looked_at_no_more_often_than_it_takes_a_tenth_of_the_time(run: Run) -> None:
-    now, looks = [0.0], [0]
-    shown = Progress(run.path, (TRAIN,), clock=lambda: now[0])
-    look = shown._look
-
-    def slow() -> dict[str, Any]:
-        looks[0] += 1
-        now[0] += 0.5
-        return look()
-
-    shown._look = slow  # type: ignore[method-assign]
-    for _ in range(100):
-        shown.state()
-        now[0] += 0.1
-    assert looks[0] == 2  # in ten seconds and a half
-
-
-def test_a_run_that_cannot_be_looked_at_keeps_what_was_seen(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "PAUSE", 0.0)
-    monkeypatch.setattr(progress, "SHARE", 1e9)
-    shown = Progress(run.path, (TRAIN,))
-    assert shown.state()["error"] is None
-    (run.path / "train").symlink_to("/etc")
-    state = shown.state()
-    assert "train" in state["error"]
-    assert state["stages"][0]["state"] == "missing"
-    (run.path / "train").unlink()
-    assert shown.state()["error"] is None
-
-
-BROKEN = ["{", "null", '{"step": -1}', '{"step": 7, "psnr": 1e400}', '{"psnr": 3}', "[" * 5000, "\0"]
-
-
-def test_a_log_ends_at_a_line_that_is_none(run: Run, tmp_path: Path) -> None:
-    for line in BROKEN:
-        put(scratch(run), 4, [])
-        with open(scratch(run) / "log.jsonl", "a", encoding="utf-8") as file:
-            file.write(line + '\n{"step": 9}\n')
-        assert json.loads(site_of(run, tmp_path).status())["training"]["train"]["step"] == 3, line
-
-
-def test_long_curves_are_thinned_and_keep_their_end(run: Run, tmp_path: Path) -> None:
-    put(scratch(run), 5000, [])
-    for step in range(3 * MOST_PREVIEWS):
-        (scratch(run) / f"preview_{step * 10:06d}.png").write_bytes(PNG)
-    shown = json.loads(site_of(run, tmp_path).status())["training"]["train"]
-    assert len(shown["psnr"]) == MOST_POINTS
-    assert (shown["psnr"][0][0], shown["psnr"][-1][0]) == (0, 4999)
-    assert len(shown["previews"]) == MOST_PREVIEWS
-    assert (shown["previews"][0], shown["previews"][-1]) == ("preview_000000.png", "preview_002990.png")
-
-
 HOSTILE = ["/previews/train/../../run.json", "/previews/train/%2e%2e/run.json", "/previews/train/..%2f..%2frun.json", "/previews//preview_000001.png",
            "/previews/../preview_000001.png", "/previews/train/preview_000001.png/", "/previews/train/preview_000001.png?x", "/previews/train/preview_1.png",
            "/previews/train/", "/previews/train/preview_000001.PNG", "/previews/train/preview_000001.png%00", "/previews/train/preview_000001.png\n",
@@ -174,17 +104,6 @@ def test_a_preview_that_became_a_link_is_not_followed(run: Run, tmp_path: Path) 
     (run.path / ".work" / "train").rename(tmp_path / "moved")
     (run.path / ".work" / "train").symlink_to(tmp_path / "moved")
     assert site("/previews/train/preview_000002.png") is None
-
-
-def test_the_live_page_asks_for_nothing_but_what_is_served(run: Run, tmp_path: Path) -> None:
-    answers = [site_of(run, tmp_path)(path) for path in ("/", "/live.js", "/live.css")]
-    assert all(answer is not None and answer.policy == LIVE_POLICY for answer in answers)
-    texts = [answer.data.decode("utf-8") for answer in answers if answer is not None]
-    assert set(re.findall(r'(?:src|href)="([^"]+)"', texts[0])) == {"data:,", "/live.css", "/live.js", "/viewer.html"}
-    everything = "".join(texts)
-    assert re.findall(r"https?://[^\"' ]+", everything) == ["http://www.w3.org/2000/svg"]
-    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|style=|<style|\bon[a-z]+=\"", everything)
-    assert "unsafe" not in LIVE_POLICY
 
 
 def asset(path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import urllib.error
@@ -81,19 +80,6 @@ def test_a_page_that_another_wrote_is_never_opened(enerf: Enerf, run: Path, open
     assert b"<script>" not in page.read_bytes()
 
 
-def test_of_an_asset_file_the_page_lies_elsewhere(enerf: Enerf, run: Path, opened: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And of a run that cannot be written."""
-    asset = BakeOutputs.of_run(run).asset
-    pages = [Path(enerf("view", asset, "--no-browser", "--json").object["page"]) for _ in range(2)]
-    monkeypatch.setattr(serving.os, "access", lambda path, mode, **_: mode != os.W_OK)
-    pages += [Path(enerf("view", run, "--json").object["page"])]
-    assert len(set(pages)) == 3
-    assert all(page.is_file() and page.parent.parent == tmp_path / "temporary" for page in pages)
-    assert pages[0].parent.stat().st_mode & 0o77 == 0, "nobody else can put another page there"
-    assert [each.name for each in asset.parent.iterdir()] == [asset.name]
-    assert not (run / "viewer.html").exists()
-
-
 def test_without_a_screen_no_browser_takes_the_terminal(enerf: Enerf, run: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -160,18 +146,3 @@ def test_a_run_is_served_until_a_signal(enerf: Enerf, run: Path, opened: list[st
     assert not (run / "viewer.html").exists()
     with pytest.raises(OSError, match=r"refused|Connection"):
         got(urls[0])
-
-
-def test_a_signal_ends_it_cleanly(tmp_path: Path) -> None:
-    run = Run.create(tmp_path / "run", Path("/photographs"), {}).path
-    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, "-m", "workflows.cli.main", "view", str(run), "--serve", "0", "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment, text=True) as process:
-        assert process.stdout is not None
-        url = json.loads(process.stdout.readline())["url"]
-        assert json.loads(got(url + "status.json"))["error"] is None
-        process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=20)
-    assert (process.returncode, err) == (0, "")
-    assert json.loads(out) == {"event": "summary", "ok": True, "exit_code": 0}
-    assert [each.name for each in tmp_path.iterdir()] == ["run"]
