@@ -11,13 +11,10 @@ from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corn
 from efficientnerf.backends.numba.vector.halves import mix_pairs, store_halves
 from efficientnerf.backends.numba.vector.maths import (
     absolute,
-    arctangent,
     bits_of,
     ceil,
-    exp,
     exp2_neg,
     floor,
-    fma,
     lowest_bit,
     mask_of,
     maximum,
@@ -175,14 +172,6 @@ def test_sums_over_lanes_parts_of_vectors_and_cycles() -> None:
     np.testing.assert_array_equal(out[16:23], [*(floats[3:8] + np.float32(1)), 1, 1])
     assert (out[23:32] == -5).all()
     np.testing.assert_array_equal(out[32:], floats[2:5][(4 + np.arange(16)) % 3])
-
-
-@numba.njit(error_model="numpy")
-def functions(floats, out):  # type: ignore[no-untyped-def]
-    x = load(pointer(floats), 0, 32)
-    store(pointer(out), 0, exp(x))
-    store(pointer(out), 32, arctangent(absolute(x)))
-    store(pointer(out), 64, fma(x, np.float32(3), x))
 
 
 @numba.njit(error_model="numpy")

@@ -118,10 +118,3 @@ def test_a_fields_picture_is_what_lies_before_in_and_behind_the_box(contracted: 
         np.testing.assert_allclose(seen.behind, 1, atol=1e-5)
         np.testing.assert_allclose(seen.inside_opacity, seen.opacity, atol=1e-5)
     assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
-
-
-def dense(*, contracted: bool) -> FieldRenderer:
-    m = untrained(contracted=contracted)
-    m.fine.weights[-1].data.mul_(30)
-    m.fine.table.data.mul_(3e3)
-    return FieldRenderer(m, 0.5, 30.0)

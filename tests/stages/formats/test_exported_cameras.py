@@ -113,11 +113,6 @@ def test_splits_bounds_masks_and_bad_frames(tmp_path: Path) -> None:
 # --- images elsewhere
 
 
-def moved(folder: Path, to: str) -> Path:
-    (folder / "images").rename(folder / to)
-    return folder
-
-
 # --- hostile
 
 

@@ -224,14 +224,3 @@ def test_what_three_photographs_show_is_in_the_box_of_silhouettes(kind: str, far
 
 
 # ------------------------------------------------------------------------------------------------------------- real captures
-
-DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
-
-
-def real(name: str, form: str) -> Capture:
-    from stages.formats.importers import IMPORTERS
-    from stages.poses.settings import PosesSettings
-
-    if not (DATA / name).is_dir():
-        pytest.skip(f"shared/data/{name} is not there")
-    return IMPORTERS[form].read(DATA / name, PosesSettings())

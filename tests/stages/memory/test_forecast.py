@@ -91,13 +91,6 @@ def test_a_stage_writes_what_was_predicted_and_no_less_than_half(run: tuple[Path
     assert written <= predicted <= 2 * written + 3 * LEAST
 
 
-def photographs(where: Path, count: int) -> Path:
-    where.mkdir()
-    for number in range(count):
-        (where / f"{number:03}.jpg").write_bytes(bytes(3_000_000))
-    return where
-
-
 def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
     """No features are looked for, and none of the pictures is enlarged: a fleet of such scenes fits on a disk of 60 MB."""
     nerfstudio(tmp_path / "source", cameras(8))

@@ -134,10 +134,6 @@ def test_other_alpha_masks(tmp_path: Path, opaque: int, without: int, alpha: str
             np.testing.assert_array_equal(mask, np.broadcast_to(np.arange(WIDTH) >= WIDTH // 2, (HEIGHT, WIDTH)))
 
 
-def photos(splits: list[str | None]) -> list[Photo]:
-    return [Photo(camera, Path(camera.name), split=split) for camera, split in zip(captures.cameras(len(splits)), splits, strict=True)]
-
-
 def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = tmp_path / "source"
     made = captures.cameras()

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import binary_dilation
 
 from efficientnerf.surface.mesh import face_areas, face_neighbours
-from efficientnerf.surface.texturing.atlas import Atlas, atlas_of, gap_of
+from efficientnerf.surface.texturing.atlas import atlas_of, gap_of
 from efficientnerf.surface.texturing.charts import charts_of
 from efficientnerf.surface.texturing.filling import texture_from
 
@@ -140,7 +140,3 @@ def test_empty_texels_have_the_colour_of_the_nearest() -> None:
         same = (colours == texture[tuple(place)]).all(1)
         assert same.any()
         assert apart[same].min() <= 1.1 * apart.min() + 0.5  # chamfer distances
-
-
-def mirrored(atlas: Atlas) -> np.ndarray:
-    return np.asarray(atlas.coordinates * [atlas.size, -atlas.size] + [0, atlas.size])
