@@ -254,7 +254,7 @@ def test_settings_that_cannot_work_are_refused_before_the_first_stage_runs(run: 
         raise UsageError("double cannot work with count")
 
     def refused(**selection: Any) -> None:
-        with pytest.raises(UsageError, match="double cannot work"):
+        with pytest.raises(UsageError):
             run_stages(run, stages, **selection)
 
     stages = replaced("double", check=refuse)

@@ -95,9 +95,9 @@ def test_colours_of_vertices_are_asked_of_photographs_where_there_are_any(run: P
     PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
     with pytest.raises(pytest.fail.Exception, match=r"made again, with .*texture='photographs'"):
         export(run, "b.ply", chosen=other)
-    with pytest.raises(UsageError, match="keeps a texture"):
+    with pytest.raises(UsageError):
         export(run, "b.stl", texture="photographs")
-    with pytest.raises(UsageError, match="keeps a texture"):
+    with pytest.raises(UsageError):
         export(run, "b.ply", picture="jpeg")
 
 

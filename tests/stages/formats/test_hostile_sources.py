@@ -99,7 +99,7 @@ def test_no_link_out_of_the_source_is_followed(tmp_path: Path, opened: list[str]
         path.symlink_to(elsewhere)
     settings = Settings()
     for attempt in (lambda: importers.files(source, settings), lambda: run(source, tmp_path / "out"), lambda: describe_source(source)):
-        with pytest.raises(BadInput, match=r"leads out of the source folder .* pass --allow-outside"):
+        with pytest.raises(BadInput, match="--allow-outside"):
             attempt()
     assert not [path for path in opened if path.startswith(os.path.realpath(tmp_path / "elsewhere"))]
     assert len(run(source, tmp_path / "allowed", allow_outside=True)[0].views) == 6

