@@ -44,38 +44,3 @@ def test_what_a_dead_child_started_ends(tmp_path: Path, monkeypatch: pytest.Monk
         time.sleep(0.02)
     assert not is_alive(left)
     children.close()
-
-
-SERVES = """
-import json, os, sys
-sys.stdin.readline()
-for line in sys.stdin:
-    request = json.loads(line)
-    if request["kind"] == "end":
-        break
-    print("words of " + request["run"], file=sys.stderr, flush=True)
-    more = {"resident": request["resident"]} if request["kind"] == "finish" else {}
-    print(json.dumps({"event": "result", "ok": True, "pid": os.getpid(), **more}), flush=True)
-"""
-
-
-def test_a_small_child_goes_on_with_the_next_run_and_a_large_one_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "serving_child.py").write_text(SERVES)
-    monkeypatch.syspath_prepend(tmp_path)
-    children = Children("serving_child", 2)
-
-    def scene(run: str, resident: int | None, gpus: tuple[int, ...] = ()) -> set[int]:
-        requests = [{"kind": "prepare", "run": run}, {"kind": "stage", "run": run, "stage": "a"}, {"kind": "finish", "run": run, "resident": resident}]
-        answers = [children.work(request, lambda event: None, cores=1, gpus=gpus) for request in requests]
-        assert not any("resident" in answer for answer in answers)
-        return {answer["pid"] for answer in answers}
-
-    (first,) = scene("a", 2**20)
-    assert scene("b", 2**31) == {first}, "kept from a to b"
-    (third,) = scene("c", None)
-    assert third != first, "b held too much memory"
-    assert scene("d", 2**20).isdisjoint({first, third}), "where the system does not say how much, a new one is taken"
-    (with_device,) = scene("e", 2**20, gpus=(0,))
-    assert with_device not in scene("f", 2**20, gpus=(0,)), "what torch keeps of a device is given back"
-    children.close()
-    assert not children._children

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import time
 from pathlib import Path
@@ -74,14 +73,3 @@ def test_a_damaged_memory_is_ignored(tmp_path: Path, text: str) -> None:
     cache.write_text(text)
     path = old_file(tmp_path / "a", b"one")
     assert Hashes(cache).digest("k", path) == hashlib.sha256(b"one").hexdigest()
-
-
-def test_forgetting(tmp_path: Path, later: None) -> None:
-    cache = tmp_path / "h.json"
-    path = old_file(tmp_path / "a", b"one")
-    hashes = Hashes(cache)
-    for key in ("train/a", "train/b", "bake/a"):
-        hashes.digest(key, path)
-    hashes.forget("train/", {"train/b"})
-    hashes.save()
-    assert json.loads(cache.read_text())["files"].keys() == {"bake/a", "train/b"}

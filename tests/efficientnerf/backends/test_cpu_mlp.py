@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import numba
@@ -18,7 +14,6 @@ from efficientnerf.backends.numba.vector import products
 from efficientnerf.backends.numba.vector.memory import pointer
 from tests.efficientnerf.networks import passes, weights_of
 
-ROOT = Path(__file__).resolve().parents[3]
 SHAPES = [(24, 64, 2, 28), (24, 32, 1, 1), (6, 8, 1, 13), (2, 40, 3, 4), (10, 20, 4, 49), (34, 100, 2, 16)]  # inputs, width, hidden layers, outputs
 
 
@@ -121,30 +116,3 @@ def test_conversion_to_bfloat16_rounds_as_torch_does() -> None:
     again = np.empty((10, 48), np.int32)
     _pack_row_pairs(out, again)
     assert np.array_equal(again, paired)
-
-
-PROGRAM = """
-import sys
-import numpy as np
-from efficientnerf.backends.numba.vector import products
-from tests.efficientnerf.networks import passes, weights_of
-
-assert not products.DOTS and products.VECTORS == 1
-rng = np.random.default_rng(5)
-weights = weights_of(24, 64, 2, 28, rng)
-features, grad = rng.normal(size=(24, 200)).astype(np.float32), rng.normal(size=(200, 28)).astype(np.float32)
-np.savez(sys.argv[1], *passes(features, weights, grad, True))
-"""
-
-
-@pytest.mark.slow
-def test_a_processor_without_wide_registers_gives_the_same(tmp_path: Path) -> None:
-    """Compiled for the oldest there is of this kind: pairs are multiplied in float32, and tiles are small."""
-    environment = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
-    subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path / "out.npz")], cwd=ROOT, env=environment, check=True)
-    rng = np.random.default_rng(5)
-    weights = weights_of(24, 64, 2, 28, rng)
-    features, grad = rng.normal(size=(24, 200)).astype(np.float32), rng.normal(size=(200, 28)).astype(np.float32)
-    with np.load(tmp_path / "out.npz") as there:
-        for here, other in zip(passes(features, weights, grad, True), there.values(), strict=True):
-            assert np.linalg.norm(here - other) < 1e-2 * np.linalg.norm(here)

@@ -49,7 +49,7 @@ def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opa
 def test_values_and_gradients_through_cascades_are_those_of_autograd(count: int, brick: int, degree: int, lookup: str) -> None:
     tree = replace(random_cascades(count, count=count, brick=brick, degree=degree, lookup=lookup), environment=None)
     tree = replace(tree, density_values=tree.density_values / 8)
-    origins, directions = (a[np.arange(80) % 4 != 3] for a in nested_rays(tree, 40))
+    origins, directions = (a[np.arange(40) % 4 != 3] for a in nested_rays(tree, 40))
     seen = seen_at_random(len(origins), 0.4)
     found, wanted = device_gradients(tree, origins, directions, seen, DEVICE), gradients_by_autograd(tree, origins, directions, seen)
     # A sample at a face of a voxel, or at the end of its part, may lie on the other side in float32.

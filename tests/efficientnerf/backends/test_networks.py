@@ -57,24 +57,3 @@ def test_nerfs_colour_depends_on_the_direction_and_its_density_does_not() -> Non
     torch.testing.assert_close(first[:, 0], second[:, 0])
     torch.testing.assert_close(first[:, 0], field.density(points))
     assert (first[:, 1:] - second[:, 1:]).abs().min() > 0
-
-
-@pytest.mark.parametrize(("vendor", "flags", "chain_type", "fused_type"), [
-    ("AuthenticAMD", "avx512f avx512_bf16", torch.bfloat16, torch.bfloat16),
-    ("GenuineIntel", "avx512f avx512_bf16 amx_bf16", torch.bfloat16, torch.float32),
-    ("AuthenticAMD", "avx512f", torch.float32, torch.float32),
-    (None, "", torch.float32, torch.float32),
-])  # fmt: skip
-def test_bfloat16_is_used_where_it_is_faster(
-    vendor: str | None, flags: str, chain_type: torch.dtype, fused_type: torch.dtype, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Fused networks multiply by dot products of AVX-512, which are slow on Intel's processors; layers one by one by AMX where there is any."""
-    monkeypatch.setattr(linear_chain, "cpu_facts", lambda: {"flags": flags} | ({} if vendor is None else {"vendor_id": vendor}))
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
-    linear_chain.has_bfloat16.cache_clear()
-    try:
-        assert linear_chain.precision_of("auto", "cpu") is chain_type
-        assert linear_chain.fused_precision_of("auto", "cpu") is fused_type
-        assert {linear_chain.fused_precision_of(name, "cpu") for name in ("float32", "bfloat16")} == {torch.float32, torch.bfloat16}
-    finally:
-        linear_chain.has_bfloat16.cache_clear()

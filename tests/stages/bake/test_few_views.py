@@ -84,20 +84,6 @@ def test_weights_count_by_the_views_of_their_cells(capture: tuple[Scene, NdcSpac
     assert {tuple(cell) for cell in chosen // BRICK} == {tuple(cell) for cell in np.stack(np.unravel_index(cells[wanted.any(1)], shape), -1)}
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 6, 7, 9])
-def test_of_few_photographs_half_see_well(
-    count: int, capture: tuple[Scene, NdcSpace, tuple[int, int, int], float], tmp_path: Path
-) -> None:
-    """Not all voxels are of few views, whatever the number of views: else faint ones were kept everywhere."""
-    s, space, _, _ = capture
-    fewer = replace(s, views=tuple(replace(view, split="train") for view in s.views[:count]))
-    points = np.random.default_rng(0).uniform(*space.bounds, (2000, 3))
-    seen = in_view(space.ndc.world(points), [view.camera for view in fewer.views]).sum(axis=0)
-    few = seen_by_few(made(tmp_path), fewer, space.ndc, points)
-    np.testing.assert_array_equal(few, seen < {1: 1, 2: 1, 3: 2, 6: 3, 7: 4, 9: 4}[count])
-    assert not few[seen == count].any()
-
-
 def tree_of(capture: tuple[Scene, NdcSpace, tuple[int, int, int], float]) -> NerfTree:
     _, space, shape, voxel = capture
     rng = np.random.default_rng(2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from stages.io.scene import Scene
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
 from tests.stages import captures
-from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS
+from tests.stages.captures import HEIGHT, SHARED, WIDTH
 
 
 def run(source: Path, out: Path, **settings: Any) -> tuple[Scene, list[str]]:
@@ -29,36 +28,6 @@ def run(source: Path, out: Path, **settings: Any) -> tuple[Scene, list[str]]:
     job = Job(settings=PosesSettings(**settings), out=out / "poses", work=out / "work", source=source, stage="poses", report=events.append)
     poses.run(job)
     return scene.load(out / "poses"), [event["text"] for event in events if event["event"] == "warning"]
-
-
-@pytest.mark.parametrize("how", WRITERS)
-def test_every_format_becomes_a_scene(how: str, tmp_path: Path) -> None:
-    source = WRITERS[how][1](tmp_path / "source")
-    made, warnings = run(source, tmp_path)
-    shutil.rmtree(source)
-    folder = tmp_path / "poses"
-    assert not warnings
-    assert len(made.views) == 6
-    assert {view.name.rsplit("/", 1)[-1] for view in made.views} == {f"img_{i}.png" for i in range(6)}
-    assert [view.split for view in made.views].count("test") == (2 if how == "blender" else 1)
-    np.testing.assert_allclose(np.abs(made.bounds).max(), 1)
-    truth = {camera.name: camera for camera in captures.cameras()}
-    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
-    for view in made.views:
-        assert scene.read_image(folder, view).shape == (HEIGHT, WIDTH, 4 if how == "blender" else 3)
-        camera = truth[view.name.rsplit("/", 1)[-1]]
-        np.testing.assert_allclose(view.source_camera.world_from_camera, camera.world_from_camera, atol=1e-6)
-        # The same point, mapped to the training frame, is seen on the same spot.
-        np.testing.assert_allclose(project(view.camera, made.world_from_capture.points(inside))[0], project(camera, inside)[0], atol=1e-4)
-    assert made.points == (WRITERS[how][0] == "colmap")
-    if made.points:
-        points = scene.read_points(folder)
-        np.testing.assert_allclose(np.sort(made.world_from_capture.inverse().points(points.xyz), 0), np.sort(captures.sparse_points(), 0))
-    with Image.open(folder / "contact_sheet.png") as sheet:
-        assert sheet.width > 500
-    report = json.loads((folder / "report.json").read_text())
-    assert len(report["registered"]) == 6
-    assert report["rejected"] == []
 
 
 def test_unchanged_images_are_copied_and_others_are_lossless(tmp_path: Path) -> None:

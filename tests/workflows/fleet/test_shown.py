@@ -10,15 +10,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from pipeline.run import Run
 from pipeline.runner import verify
 from tests.workflows.command import Enerf
-from tests.workflows.fleet.fleets import facts, mixed
+from tests.workflows.fleet.fleets import facts
 from tests.workflows.toys import TOYS
-from workflows.fleet.display import Show
-from workflows.fleet.table import LiveTable
 
 
 @pytest.fixture
@@ -51,18 +48,3 @@ def test_a_sweep_is_run_shared_and_shown(enerf: Enerf, manifest: Path, tmp_path:
     before = {name: (fleet / name / "points" / "points.ply").stat().st_ino for name in names}
     assert enerf(*command).code == 3
     assert {name: (fleet / name / "points" / "points.ply").stat().st_ino for name in names} == before
-
-
-def test_a_terminal_has_the_table_and_what_goes_wrong_above_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = io.StringIO()
-    with LiveTable(Console(file=out, width=100, height=12, force_terminal=True, color_system=None)) as table:
-        show = Show(tmp_path, as_json=False, quiet=False, table=table)
-        show.written(mixed(10))
-        show({"event": "stage_done", "scene": "scene-007", "stage": "train", "seconds": 3.0})
-        show({"event": "retry", "scene": "scene-007", "stage": "train", "text": "memory ran out"})
-    assert "scene-007: memory ran out" in out.getvalue()
-    assert (tmp_path / "index.html").is_file()
-    show = Show(tmp_path / "nowhere", as_json=False, quiet=True)
-    for _ in range(3):
-        show.written(mixed(10, state="done"))
-    assert len(capsys.readouterr().err.splitlines()) == 1, "pages that cannot be written are told once"
