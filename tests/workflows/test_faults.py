@@ -10,7 +10,7 @@ from tests.workflows.torment import torment
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)  # three minutes of a core, on a machine that may be very busy
+@pytest.mark.timeout(1800)  # a minute of a core, on a machine that may be very busy
 def test_failing_operations_lose_nothing(tmp_path: Path) -> None:
-    result = torment(tmp_path, "benchmarks.torture.faults", "--sources", "blender", "--share", "15")
-    assert result["cases"] >= 50
+    result = torment(tmp_path, "benchmarks.torture.faults", "--sources", "blender", "--share", "45")
+    assert result["cases"] >= 15

