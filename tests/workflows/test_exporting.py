@@ -19,7 +19,7 @@ from efficientnerf.surface.mesh import Texture
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.run import Run
 from pipeline.stage import settings_dict
-from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
 from stages.mesh.settings import MeshSettings
@@ -84,21 +84,6 @@ def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dic
         monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: SimpleNamespace(fresh=False, manifest=None))
     with pytest.raises(pytest.fail.Exception, match="made again"):
         export(run, "mesh.glb", chosen=settings(**change), **more)
-
-
-def test_colours_of_vertices_are_asked_of_photographs_where_there_are_any(run: Path) -> None:
-    """A texture is made for a PLY, too: of a run that has photographs."""
-    other = settings(texture="photographs")
-    (without,) = export(run, "a.ply", chosen=other)
-    assert without["faces"] == 12
-    PosesOutputs.of_run(run).folder.mkdir()
-    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
-    with pytest.raises(pytest.fail.Exception, match=r"made again, with .*texture='photographs'"):
-        export(run, "b.ply", chosen=other)
-    with pytest.raises(UsageError):
-        export(run, "b.stl", texture="photographs")
-    with pytest.raises(UsageError):
-        export(run, "b.ply", picture="jpeg")
 
 
 def test_a_page_for_browsers_holds_the_asset_or_what_is_asked_for_of_it(run: Path, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 import torch
 from torch import nn
 
-from efficientnerf.backends.numba import adam as cpu_adam
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.training.optimiser import BETA1, Adam, ParameterGroup
 from efficientnerf.training.pixels import Pixels
@@ -38,28 +37,6 @@ def test_adam_is_torchs() -> None:
         optimiser.param_groups[0]["lr"] = rate
         optimiser.step()
     torch.testing.assert_close(stepped(gradients()), theirs, rtol=2e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("size", [15, 8192 + 16])
-def test_lines_of_a_table_are_stepped_like_single_numbers(size: int) -> None:
-    """To the byte, and where a line has no gradient nothing is touched, not even what is no number."""
-    rng = np.random.default_rng(0)
-    grad = np.where(rng.random(size) < 0.1, rng.normal(size=size), 0).astype(np.float32)
-    grad[4000:4100] = 0
-    value, first, second = rng.normal(size=size).astype(np.float32), rng.normal(size=size).astype(np.float32), rng.random(size).astype(np.float32)
-    first[4010:4020] = np.nan
-    numbers = [np.float32(x) for x in (0.01, 0.9, 0.99, 0.5, 0.25, 1e-15)]
-    whole, parts = ([a.copy() for a in (value, grad, first, second)] for _ in range(2))
-    cpu_adam.adam(*whole, *numbers, True)
-    for begin in range(0, size, 15):  # fewer than fill a line
-        cpu_adam.adam(*(a[begin : begin + 15] for a in parts), *numbers, True)
-    for one, other in zip(whole, parts, strict=True):
-        assert one.tobytes() == other.tobytes()
-    assert not whole[1].any()
-    stays = grad == 0
-    for after, before in zip((whole[0], whole[2], whole[3]), (value, first, second), strict=True):
-        assert np.array_equal(after[stays], before[stays], equal_nan=True)
-        assert (after[~stays] != before[~stays]).all()
 
 
 def rotation(seed: int) -> np.ndarray:

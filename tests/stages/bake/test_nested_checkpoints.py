@@ -82,25 +82,3 @@ def test_cascades_of_another_tree_are_told(pruned: bool, change: Callable[[dict[
     change(tensors)
     with pytest.raises(ValueError, match=r"voxels|cascades"):
         checkpoint.check(tensors, tree, SCHEDULE)
-
-
-ERRORS: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
-    "missing": lambda tensors: tensors.pop("errors"),
-    "of other cells": lambda tensors: tensors.update(errors=np.zeros((2, 6), np.float32)),
-    "wide": lambda tensors: tensors.update(errors=tensors["errors"].astype(np.float64)),
-    "no numbers": lambda tensors: tensors.update(errors=np.full((2, 5), np.nan, np.float32)),
-}
-
-
-@pytest.mark.parametrize("change", ERRORS.values(), ids=ERRORS)
-def test_errors_of_another_map_are_told(change: Callable[[dict[str, np.ndarray]], Any], tmp_path: Path) -> None:
-    from safetensors.numpy import load_file, save_file
-
-    tree, made = random_cascades(3), job(tmp_path)
-    checkpoint.save(made, Point(some_state(tree, False), SCHEDULE))
-    path = made.work / checkpoint.CHECKPOINT
-    tensors = load_file(path)
-    change(tensors)
-    save_file(tensors, path, metadata={"sha256": checkpoint.digest_of(tensors)})
-    assert checkpoint.restored(made, tree, SCHEDULE, cells=5) is None
-    assert not path.exists()

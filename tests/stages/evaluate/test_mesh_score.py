@@ -12,13 +12,12 @@ from efficientnerf.asset import region
 from efficientnerf.asset.rendering import Rendering
 from efficientnerf.asset.tree import Region
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.surface.mesh import Texture
-from stages.evaluate.mesh import EvaluatedMesh, evaluated_mesh, mesh_image
+from stages.evaluate.mesh import EvaluatedMesh, mesh_image
 from stages.evaluate.run import evaluate
 from stages.io.scene import Scene, load
 from tests.efficientnerf.trees import random_cascades
 from tests.fakes import WHITE, BallField
-from tests.stages.evaluate.balls import BALL_MESH, TREE, ball_mesh, figures_of, job_in, make_scene, settings
+from tests.stages.evaluate.balls import BALL_MESH, TREE, figures_of, job_in, make_scene, settings
 
 
 def score(tmp_path: Path, mesh: EvaluatedMesh, *, background: tuple[float, float, float] | None = WHITE, masked: bool = False) -> dict:
@@ -40,21 +39,6 @@ def test_the_true_surface_is_about_as_good_as_the_asset(tmp_path: Path, backgrou
     assert mesh["psnr_vertex_colours"] == mesh["psnr"], "it has no texture"
     assert mesh["covered"] == pytest.approx(np.pi * (0.6 * 70 / np.sqrt(3**2 - 0.6**2)) ** 2 / (60 * 44), rel=0.05)
     assert mesh["psnr"] == pytest.approx(np.mean([view["mesh"]["psnr"] for view in found["views"]]))
-
-
-def test_the_texture_counts_and_the_vertices_beside_it(tmp_path: Path) -> None:
-    """A texture with a texel for each face, in the right colours, on a mesh whose vertices are black."""
-    whole = ball_mesh()
-    side = 36  # 1296 texels
-    place = (np.stack([np.arange(1280) % side, side - 1 - np.arange(1280) // side], 1) + 0.5) / side
-    picture = np.zeros((side * side, 3), np.uint8)
-    picture[:1280] = np.round(255 * TREE.colour(whole.vertices[whole.faces].mean(1)))
-    texture = Texture(np.repeat(place[:, None], 3, 1), picture.reshape(side, side, 3))
-    mesh = replace(whole, colours=np.zeros_like(whole.colours), texture=texture)
-    found = score(tmp_path, evaluated_mesh(mesh, None))["mesh"]
-    assert found["psnr"] > 27
-    assert found["psnr_vertex_colours"] < 15
-    assert found["texture_size"] == side
 
 
 def flat(colour: tuple[float, float, float], depth: float):  # type: ignore[no-untyped-def]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 
 import pytest
@@ -36,26 +35,6 @@ def test_every_display_takes_every_event(capsys: pytest.CaptureFixture[str]) -> 
 
 HOSTILE = "a\x1b]0;title\x07\n\u202eb\udcff\x9b"
 ESCAPED = "a\\x1b]0;title\\x07\\n\\u202eb\\udcff\\x9b"
-
-
-def test_each_of_several_stages_has_a_bar_and_lines_of_its_own() -> None:
-    stream = io.StringIO()
-    with Bars() as bars, Lines(stream) as lines:
-        for stage in ("mesh", "splats"):
-            for each in (event("stage_started", stage=stage), event("progress", stage=stage, done=1, total=4, text=stage)):
-                bars(each)
-                lines(each)
-        assert {task.fields["stage"]: task.completed for task in bars.progress.tasks} == {"mesh": 1, "splats": 1}
-        bars(event("progress", stage="mesh", done=3, total=4))
-        bars(event("stage_done", stage="splats"))
-        assert {task.fields["stage"]: task.completed for task in bars.progress.tasks} == {"mesh": 3}
-        lines.last["mesh"] = lines.last["splats"] = (-1e9, 0.0)
-        for share in (2, 3):
-            for stage in ("mesh", "splats"):
-                lines(event("progress", stage=stage, done=share, total=4))
-    assert [line.split()[:2] for line in stream.getvalue().splitlines()] == [
-        ["mesh", "started"], ["splats", "started"], ["mesh", "50%"], ["splats", "50%"],
-    ]  # fmt: skip
 
 
 def test_hostile_text_reaches_no_display_raw(capsys: pytest.CaptureFixture[str]) -> None:
