@@ -82,6 +82,21 @@ def test_one_stage_alone_uses_what_there_is_and_warns_of_what_is_stale(run: Run)
     assert read_manifest(run.folder("count")).request.settings["steps"] == 6
 
 
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(run: Run, tmp_path: Path) -> None:
+    events = Events()
+    assert set(actions(run_stages(run, STAGES, dry_run=True, report=events)).values()) == {"would run"}
+    assert sorted(os.listdir(run.path)) == [".lease", ".lock", "run.json"]
+    assert "list: would run (never run)" in events.text()
+    run_stages(run, STAGES)
+    set_one(run, "count", steps=9)
+    planned = {"list": "skipped", "count": "would run", "double": "may run", "report": "may run"}
+    assert actions(run_stages(run, STAGES, dry_run=True)) == planned
+    assert actions(run_stages(run, STAGES, dry_run=True, start="report"))["report"] == "would run"
+    assert actions(run_stages(run, STAGES, dry_run=True, only="double")) == {"double": "skipped"}
+    assert actions(run_stages(Run(tmp_path / "new", run.source), STAGES, dry_run=True, until="list")) == {"list": "would run"}
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_stage_that_raises(run: Run) -> None:
     run_stages(run, STAGES)
     before = contents(run.path)
@@ -254,7 +269,7 @@ def test_settings_that_cannot_work_are_refused_before_the_first_stage_runs(run: 
         raise UsageError("double cannot work with count")
 
     def refused(**selection: Any) -> None:
-        with pytest.raises(UsageError):
+        with pytest.raises(UsageError, match="double cannot work"):
             run_stages(run, stages, **selection)
 
     stages = replaced("double", check=refuse)

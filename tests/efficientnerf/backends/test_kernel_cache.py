@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -371,29 +370,4 @@ def test_folders_out_of_use_are_removed_and_nothing_else(tmp_path: Path) -> None
     assert kernel_cache.first_private([root], KEY) == (own, [])
     assert all(place.exists() for place in (*recent, own, foreign))
     assert not any(place.exists() for place in (*week, old))
-    assert now - own.stat().st_mtime < 60
-
-
-def test_states_of_a_modules_sources_out_of_use_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The present one stays, however old, and so do those of other modules; of modules that are gone none is present."""
-    adam, gone = f"{kernel_cache.KERNELS}.adam", f"{kernel_cache.KERNELS}.gone"
-    now, root = time.time(), tmp_path / "cache" / "kernels" / kernel_cache.key()
-
-    def made(module: str, name: str, days: float) -> Path:
-        (root / module / name).mkdir(parents=True)
-        (root / module / name / "code.nbc").touch()
-        os.utime(root / module / name, (now - days * kernel_cache.DAY,) * 2)
-        return root / module / name
-
-    own, old, other = made(adam, KEY, 100), made(adam, "a" * 16, 31), made(f"{kernel_cache.KERNELS}.mlp", "b" * 16, 31)
-    week = [made(adam, f"c{number:015x}", 7 + number / 100) for number in range(kernel_cache.KEPT + 2)]
-    left, removed = made(gone, "d" * 16, 7), made(gone, "e" * 16, 31)
-    monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
-    for each in (tmp_path / "cache", root.parent, root):
-        each.chmod(0o700)
-    for function in (kernel_cache.folder, kernel_cache.folder_of):
-        monkeypatch.setattr(kernel_cache, function.__name__, function.__wrapped__)
-    assert kernel_cache.folder_of(adam, KEY) == own
-    assert all(place.exists() for place in (own, other, left, *week[: kernel_cache.KEPT]))
-    assert not any(place.exists() for place in (old, removed, *week[kernel_cache.KEPT :]))
     assert now - own.stat().st_mtime < 60

@@ -83,19 +83,6 @@ def test_what_fits_nowhere_runs_alone_with_what_there_is_and_that_is_told(tmp_pa
     assert trainings(workers).index("s3") < 11
 
 
-def test_what_is_not_known_has_a_share_and_a_limit_that_is_not_known_is_none(tmp_path: Path) -> None:
-    workers = Simulated([Worker("a", 8, 8 * GIB, slots=4), Worker("b", 8, None, slots=4)])
-    assert run(tmp_path / "one", workers, scenes(20)).state == "done"
-    given = {(task.worker, task.request["kind"], task.memory) for task in workers.tasks}
-    assert given >= {("a", "stage", 2 * GIB), ("b", "stage", None), ("a", "prepare", GIB // 2), ("b", "finish", None)}
-    assert {task.request["memory"] for task in workers.tasks if what(task.request) == "prepare"} == {2 * GIB, None}, "for warnings"
-    workers = Simulated([Worker("a", 8, None, slots=2)], taking({("s0", "train"): 900 * GIB}))
-    found = run(tmp_path / "two", workers, scenes(3))
-    assert found.state == "done"
-    assert {task.request["memory"] for task in workers.tasks if task.request["kind"] == "stage"} == {None}
-    assert not state_of(found, "s0").warnings
-
-
 def test_a_refusal_is_believed_before_the_estimate(tmp_path: Path) -> None:
     """It may come twice: as the stage begins, and once it has counted."""
     steps = itertools.chain([6 * GIB, 9 * GIB], itertools.repeat(0))

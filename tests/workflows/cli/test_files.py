@@ -17,9 +17,13 @@ from efficientnerf.asset import format
 from efficientnerf.asset.cascades import cascade_grids, nested
 from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import UsageError
+from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters.splats.ply import read_splats
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
 from tests.workflows.command import Result
+from workflows.exporting import faces_from_text
 
 Enerf = Callable[..., Result]
 SCALE = 0.5
@@ -73,6 +77,43 @@ def test_a_texture_of_the_asset_in_all_formats(enerf: Enerf, ball: Path, tmp_pat
     assert enerf("inspect", without / "p.ply", "--json").object["vertices"] == 300
     for path in (*(tmp_path / name for name in names[:3]), without / "a.ply"):  # in the frame of the capture
         np.testing.assert_allclose(enerf("inspect", path, "--json").object["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 0.6 / SCALE, atol=0.1)
+
+
+@pytest.mark.parametrize(("text", "expected"), [("20k", 20_000), ("0.5K", 500), ("1m", 1_000_000), ("150000", 150_000)])
+def test_faces_may_be_given_in_thousands(text: str, expected: int) -> None:
+    assert faces_from_text(text) == expected
+    for other in ("", "k", "-5", "1e6", "nan", "0", "5kk", "٣k", "1_000"):
+        with pytest.raises(UsageError, match="--faces"):
+            faces_from_text(other)
+
+
+def test_a_volume_of_what_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    """The foreground is the red ball, with fewer voxels than all; a grid of its own for what lies around it."""
+    for name, more in (("subject", []), ("all", ["--region", "all"])):
+        result = enerf("export", scene, "--to", tmp_path / f"{name}.vdb", *more, "--json")
+        assert result.code == 0, result.err
+        assert result.objects[-1]["written"][0]["voxels"] > 1000
+    subject, everything = ((tmp_path / f"{name}.vdb").read_bytes() for name in ("subject", "all"))
+    assert b"density_1" in everything
+    assert b"density_1" not in subject
+    again = enerf("export", scene, "--to", tmp_path / "all.vdb")
+    assert (again.code, (tmp_path / "all.vdb").read_bytes()) == (2, everything)
+    assert enerf("export", scene, "--to", tmp_path / "few.vdb", "--memory", "100m").code == 2
+
+
+def test_splats_of_what_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    """All with its surroundings, unless a region says otherwise; in the capture's frame, where the red ball has a radius of 1.2."""
+    few = ["--set", "splats.count=400", "--set", "splats.iterations=2", "--set", "splats.sh_degree=0"]
+    result = enerf("export", scene, "--splats", "--to", *(tmp_path / f"all{each}" for each in SPLAT_EXPORTERS), *few, "--json")
+    assert result.code == 0, result.err
+    written = result.objects[-1]["written"]
+    assert [entry["bytes"] for entry in written] == [(tmp_path / f"all{each}").stat().st_size for each in SPLAT_EXPORTERS]
+    assert enerf("export", scene, "--splats", "--to", tmp_path / "subject.ply", "--region", "foreground", *few).code == 0
+    everything, subject = (np.abs(read_splats(tmp_path / f"{name}.ply").means).max() for name in ("all", "subject"))
+    assert everything > 3.5
+    assert subject < 1.6
+    assert written[0]["Gaussians"] == len(read_splats(tmp_path / "all.ply")) <= 400
+    assert enerf("export", scene, "--splats", "--to", tmp_path / "all.spz", *few).code == 2, "it is there"
 
 
 def test_every_frame_has_its_passes_where_asked_for(enerf: Enerf, ball: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from msgspec import Meta
 from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from workflows.asset import STAGES
-from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, shown, table_of
+from workflows.cli.resolve import Settings, metres_of, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,16 @@ def test_the_last_word_wins_and_comes_back_from_a_record() -> None:
         assert value in parse_value(shown(value))
 
 
+def test_config_files(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('preset = "tiny"\nseed = 3\n[toy]\nsteps = 4\nbox = "auto"\n', encoding="utf-8")
+    config = read_config(path)
+    assert config.options == {"preset": "tiny", "seed": 3}
+    settings = Settings(TYPES)
+    settings.put_table(config.table, "config")
+    assert settings.resolved()["toy"] == Toy(steps=4)
+
+
 @pytest.mark.parametrize("content", [b"steps = ", b"\xff\xfe", b"steps = 3", b"seed = 'x'", None])
 def test_broken_config_files(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "mine.toml"
@@ -109,6 +119,14 @@ def test_broken_config_files(tmp_path: Path, content: bytes | None) -> None:
         read_preset("previw")
 
 
+@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("10m", 600), ("1h30m", 5400), ("1.5m", 90), (" 2m30s ", 150), ("0", 0)])
+def test_times_are_read(text: str, seconds: float) -> None:
+    assert seconds_of(text) == seconds
+    for other in ("", "soon", "10 minutes", "m", "-3s", "5s1m"):
+        with pytest.raises(UsageError, match="as in 90s, 10m or 1h30m"):
+            seconds_of(other)
+
+
 @pytest.mark.parametrize("text", ["turntable.background=pink", "turntable.background=#12345", "mesh.density_threshold=0", "points.density_threshold=-3.5"])
 def test_values_that_no_stage_can_work_with_are_refused_when_they_are_given(text: str) -> None:
     settings = Settings({stage.name: stage.settings for stage in STAGES})
@@ -116,3 +134,11 @@ def test_values_that_no_stage_can_work_with_are_refused_when_they_are_given(text
         settings.put_option(text)
     for value in ("#00ff7F", "transparent"):
         settings.put_option(f"turntable.background={value}")
+
+
+@pytest.mark.parametrize(("text", "metres"), [("50mm", 0.05), ("5cm", 0.05), ("0.05m", 0.05), ("2 in", 0.0508)])
+def test_lengths_have_a_unit(text: str, metres: float) -> None:
+    assert metres_of(text) == pytest.approx(metres, rel=1e-12)
+    for other in ("50", "mm", "-5cm", "5 ft", ""):
+        with pytest.raises(UsageError, match="expected a length with its unit"):
+            metres_of(other)

@@ -97,6 +97,15 @@ def test_a_folder_of_folders_and_videos(place: Path) -> None:
     assert [(scene.name, Path(scene.sources[0]).name) for scene in scenes] == [("a", "a"), ("b", "b"), ("c", "c.mp4"), ("with_space", "with space")]
 
 
+def test_globs_and_what_a_shell_makes_of_them(place: Path) -> None:
+    assert [scene.name for scene in read("shoots/*/")] == ["a", "b"] == [scene.name for scene in read("shoots/a/", "shoots/b/")]
+    assert [scene.name for scene in read("shoots/*")] == ["a", "b", "c"]
+    for name in "ab":
+        (place / "shoots" / name / "photos").mkdir()
+    assert [scene.name for scene in read("shoots/*/photos/")] == ["a", "b"] == [scene.name for scene in read("shoots/a/photos", "shoots/b/photos")]
+    assert [scene.name for scene in read("*/?")] == ["shoots-a", "shoots-b"]
+
+
 def test_all_mistakes_at_once_with_their_lines(place: Path) -> None:
     text = """preset = "tinny"
 trian.iterations = 5
