@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import threading
 from collections.abc import Iterator
@@ -16,9 +17,12 @@ import pytest
 from pipeline.errors import CorruptArtifact, RunLocked
 from pipeline.locks import lease
 from pipeline.locks.lease import EXPIRY, Held, Lease, acquire
-from pipeline.locks.lock import lock
+from pipeline.locks.lock import holder_of, lock
+from pipeline.run import Run
 from pipeline.runner import run_stages
 from tests.pipeline.toy import STAGES, make_run
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @contextmanager
@@ -61,6 +65,16 @@ def test_another_machine_waits_until_the_lease_has_expired(tmp_path: Path) -> No
     other.beat()
     assert other.lost()
     other.release()
+
+
+def test_who_has_this_machines_lock_takes_over_from_a_dead_process_at_once(tmp_path: Path) -> None:
+    dead = acquire(tmp_path, decisive=True)
+    with pytest.raises(Held):  # without such locks nobody knows that it is dead
+        acquire(tmp_path, decisive=False)
+    acquire(tmp_path, decisive=True).release()
+    dead.beat()
+    assert dead.lost() is not None
+    dead.release()
 
 
 def test_a_slow_taker_of_an_old_lease_gets_no_number_that_was_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,6 +151,27 @@ def test_what_a_stranger_left_in_it_is_no_lease(tmp_path: Path) -> None:
         acquire(tmp_path, decisive=True)
 
 
+def test_a_run_says_who_holds_it(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "run")
+    other = Run.open(run.path)
+    with on("a"), run.locked():
+        (run.path / ".lock").unlink()  # another machine does not see this one's lock
+        with on("b"), pytest.raises(RunLocked, match=rf"process {os.getpid()} on .* \d s ago"), other.locked():
+            pass
+
+
+def test_a_process_of_another_machine_that_renews_nothing_has_ended(tmp_path: Path) -> None:
+    note = {"pid": 1, "host": "elsewhere", "since": 1.0, "command": "enerf"}
+    (tmp_path / ".lock.json").write_text(json.dumps(note))
+    assert holder_of(tmp_path) is not None, "of a version without leases"
+    with on("a"):
+        held = acquire(tmp_path, decisive=True)
+    assert holder_of(tmp_path) is not None
+    held._done.set()
+    age(tmp_path, 11 * EXPIRY)
+    assert holder_of(tmp_path) is None
+
+
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
 def test_without_locks_of_the_system_the_lease_alone_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     def refused(*arguments: object) -> None:
@@ -174,3 +209,14 @@ def test_who_lost_the_lease_publishes_nothing(tmp_path: Path) -> None:
     taken[0].beat()
     assert taken[0].lost() is None
     taken[0].release()
+
+
+def test_a_killed_process_blocks_nobody_on_its_machine(tmp_path: Path) -> None:
+    for _ in range(2):
+        pid = os.fork()
+        if pid == 0:
+            with lock(tmp_path):
+                os.kill(os.getpid(), 9)
+        assert os.waitpid(pid, 0)[1] == 9
+    with lock(tmp_path) as held:
+        assert held.lost() is None

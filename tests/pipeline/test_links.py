@@ -134,6 +134,20 @@ def test_a_file_with_a_second_name_outside_is_not_written(tmp_path: Path, outsid
     assert (outside / "thesis.txt").read_text() == "years of work"
 
 
+def test_a_copy_of_hard_links_is_a_run(tmp_path: Path) -> None:
+    """As backups are made: published files are replaced, never written in place."""
+    run = make_run(tmp_path)
+    run_stages(run, STAGES)
+    shutil.copytree(run.path, tmp_path / "copy", copy_function=os.link)
+    before = contents(run.path)
+    copy = Run.open(tmp_path / "copy")
+    set_one(copy, "count", steps=9)
+    run_stages(copy, STAGES)
+    verify(copy, STAGES)
+    verify(run, STAGES)
+    assert contents(run.path) == before
+
+
 def test_links_of_the_user_are_left_alone(tmp_path: Path, outside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside the artifacts, and to the run itself; folders nested too deeply and a run that cannot be listed are refused."""
     run = make_run(tmp_path)
@@ -184,6 +198,22 @@ def test_a_temporary_file_is_new_and_has_the_permissions_of_the_umask(tmp_path: 
     assert (outside / "thesis.txt").read_text() == "years of work"
 
 
+def test_what_kills_left_of_temporary_files_goes_and_links_stay(tmp_path: Path, outside: Path) -> None:
+    run = make_run(tmp_path)
+    (run.path / ".cache").mkdir()
+    ours = [".run.json.17.part", ".run.json.0123456789abcdef.part", "..lock.json.99.part", ".cache/.hashes.json.0123456789abcdef.part"]
+    others = [".run.json.part", ".run.json.x.part", ".run.json.0123456789ABCDEF.part", "run.json.17.part", ".report.html.17.part"]
+    for name in (*ours, *others):
+        (run.path / name).write_text("")
+    (run.path / ".report.html.0123456789abcdef.part").write_text("")
+    os.utime(run.path / ".report.html.0123456789abcdef.part", (0, 0))
+    (run.path / ".run.json.18.part").symlink_to(outside / "thesis.txt")
+    with run.locked():
+        pass
+    left = {path.relative_to(run.path).as_posix() for path in run.path.rglob("*") if ".lease" not in path.parts}
+    assert left == {".cache", ".lock", "run.json", ".run.json.18.part", *others}
+
+
 def test_only_names_that_the_engine_gives_are_put_right(done: Run) -> None:
     """Other names below .work stay, and a folder that is no artifact of the stage takes the place of none."""
     good = contents(done.folder("count"))
@@ -202,6 +232,14 @@ def test_only_names_that_the_engine_gives_are_put_right(done: Run) -> None:
     assert (done.path / "notes" / "mine.txt").read_text() == "mine"
     run_stages(done, STAGES)
     verify(done, STAGES)
+
+
+@pytest.mark.parametrize("name", [*WORKPLACES[1:], "count", "double"])
+def test_a_file_in_the_place_of_a_folder_is_replaced(done: Run, name: str) -> None:
+    there(done, name).write_text("a file")
+    run_stages(done, STAGES)
+    verify(done, STAGES)
+    assert os.listdir(done.path / WORK) == []
 
 
 @pytest.mark.parametrize("there", [True, False])

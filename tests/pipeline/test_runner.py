@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import errno
 import itertools
 import os
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pipeline import artifact
+from pipeline import artifact, files
 from pipeline.decide import decide, survey
 from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, StageFailed, UsageError
 from pipeline.executors import local
@@ -20,7 +21,7 @@ from pipeline.run import Run
 from pipeline.runner import run_stages, verify
 from pipeline.stage import Job, Stage
 from tests.pipeline.kills import run_and_kill
-from tests.pipeline.toy import COUNT, STAGES, Events, actions, contents, make_run, raising, replaced, set_one
+from tests.pipeline.toy import COUNT, LIST, STAGES, Events, actions, contents, make_run, raising, replaced, set_one
 
 
 @pytest.fixture
@@ -45,6 +46,20 @@ def test_all_run_once_and_then_nothing(run: Run) -> None:
     assert [event["event"] for event in events] == ["stage_skipped"] * 4
     after = {path: path.lstat().st_mtime_ns for path in run.path.rglob("*") if ".lease" not in path.parts}
     assert {path for path in before | after if before.get(path) != after.get(path)} <= {run.path, run.path / ".cache", run.cache}
+
+
+def test_the_manifest_says_what_made_it(run: Run) -> None:
+    run_stages(run, STAGES, until="count")
+    made = read_manifest(run.folder("count"))
+    assert made.request.settings == {"steps": 6, "rate": 0.5, "name": None}
+    assert made.request.inputs == {"list": read_manifest(run.folder("list")).digest}
+    assert made.outputs["log.jsonl"].volatile
+    assert made.peak_memory > 2**20
+    assert made.cpu_seconds >= 0
+    assert made.cores >= 1
+    assert made.facts == {"counted": {"steps": 6}}
+    assert not made.resumed
+    assert sorted(read_manifest(run.folder("list")).request.source or {}) == ["0.jpg", "1.jpg", "2.jpg"]
 
 
 def test_only_what_changed_runs_again(run: Run) -> None:
@@ -82,6 +97,17 @@ def test_one_stage_alone_uses_what_there_is_and_warns_of_what_is_stale(run: Run)
     assert read_manifest(run.folder("count")).request.settings["steps"] == 6
 
 
+def test_one_stage_alone_without_what_it_needs(run: Run) -> None:
+    with pytest.raises(BadInput, match="run the stages until count of "):
+        run_stages(run, STAGES, only="count")
+    run_stages(run, STAGES)
+    for name in ("count.txt", "manifest.json"):
+        (run.folder("count") / name).write_text("{")
+        with pytest.raises(CorruptArtifact) as caught:
+            run_stages(run, STAGES, only="double", force=True)
+        assert f"count/{name}" in caught.value.files
+
+
 def test_a_dry_run_says_what_would_be_done_and_does_nothing(run: Run, tmp_path: Path) -> None:
     events = Events()
     assert set(actions(run_stages(run, STAGES, dry_run=True, report=events)).values()) == {"would run"}
@@ -95,6 +121,32 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(run: Run, tmp_path: 
     assert actions(run_stages(run, STAGES, dry_run=True, only="double")) == {"double": "skipped"}
     assert actions(run_stages(Run(tmp_path / "new", run.source), STAGES, dry_run=True, until="list")) == {"list": "would run"}
     assert not (tmp_path / "new").exists()
+
+
+def test_a_vanished_source(run: Run, tmp_path: Path) -> None:
+    run_stages(run, STAGES)
+    assert run.source is not None
+    shutil.rmtree(run.source)
+    events = Events()
+    set_one(run, "count", steps=9)
+    assert actions(run_stages(run, STAGES, report=events))["report"] == "ran"
+    assert str(run.source) in events.text()
+    set_one(run, "list", upper=True)
+    for each in (run, Run.create(tmp_path / "new", tmp_path / "none"), Run.create(tmp_path / "other")):
+        with pytest.raises(BadInput):
+            run_stages(each, STAGES)
+    assert contents(run.folder("list"))
+
+
+def test_a_stage_sees_the_source_only_if_it_reads_it(run: Run) -> None:
+    seen = {}
+
+    def look(job: Job) -> None:
+        seen.update(source=job.source, device=job.device, inputs=job.inputs)
+        (job.out / "a").write_text("a")
+
+    run_stages(run, [LIST, Stage("look", 1, COUNT.settings, ("list",), look)], device="cuda")
+    assert seen == {"source": None, "device": "cuda", "inputs": {"list": run.folder("list")}}
 
 
 def test_a_stage_that_raises(run: Run) -> None:
@@ -138,6 +190,35 @@ def test_what_the_user_sees_of_an_error(run: Run, error: Exception, kind: type[E
     assert type(caught.value) is kind
     assert "\n" not in str(caught.value)
     assert kind is not StageFailed or str(caught.value).startswith("count: ")
+
+
+def test_a_disk_that_fills_up_while_publishing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At whichever step: the former artifact, or the new one, stands; and the next run goes on."""
+    run_stages(run, STAGES)
+    set_one(run, "count", steps=9)
+    for moment in itertools.count(1):
+        left = [moment]
+        for name in ("rename", "sync_folder", "sync_file"):
+            monkeypatch.setattr(files, name, _failing(getattr(files, name), left))
+        with contextlib.suppress(DiskFull):
+            run_stages(run, STAGES, only="count", force=True)
+        monkeypatch.undo()
+        made = read_manifest(run.folder("count"))
+        assert not artifact.differences(run.folder("count"), made.outputs).damaged
+        if left[0] > 0:
+            break
+    assert moment > 10
+    assert actions(run_stages(run, STAGES))["double"] == "ran"
+
+
+def _failing(step: object, left: list[int]) -> object:
+    def call(*arguments: object) -> object:
+        left[0] -= 1
+        if left[0] == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return step(*arguments)  # type: ignore[operator]
+
+    return call
 
 
 def test_a_failed_stage_keeps_its_checkpoint_and_goes_on(run: Run) -> None:
@@ -189,6 +270,25 @@ def test_interrupted_and_resumed_gives_the_same_bytes(run: Run, tmp_path: Path) 
     run_stages(changed, STAGES, report=events)
     assert not events.named("stage_started")[0]["resumed"]
     assert b"0.5" not in contents(changed.folder("count"))["count.txt"]
+
+
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (Interrupted(15), 143)])
+def test_an_interruption_that_a_library_wrapped(run: Run, error: BaseException, code: int) -> None:
+    with pytest.raises(Interrupted) as caught:
+        run_stages(run, replaced("count", run=raising(_wrapped(error))))
+    assert caught.value.exit_code == code
+
+
+def test_an_interrupted_forced_run_goes_on_when_forced_again(run: Run) -> None:
+    run_stages(run, STAGES)
+    before = contents(run.path)
+    with pytest.raises(Interrupted):
+        run_stages(run, replaced("count", run=_count_until(3)), only="count", force=True)
+    assert decide(COUNT, run).fresh
+    events = Events()
+    run_stages(run, STAGES, only="count", force=True, report=events)
+    assert events.named("stage_started")[0]["resumed"]
+    assert contents(run.path) == before
 
 
 def test_a_stage_that_was_done_but_not_published_is_not_run_again(run: Run) -> None:

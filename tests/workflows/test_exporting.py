@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os
 import re
 import zlib
 from dataclasses import replace
@@ -15,16 +16,19 @@ import pytest
 
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Texture
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.run import Run
 from pipeline.stage import settings_dict
-from stages.artifacts import BakeOutputs, MeshOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
+from stages.framing.true_frame import AS_CAPTURED, Ground, TrueFrame, save_frame
+from stages.mesh.files import read_mesh, read_vertices
 from stages.mesh.settings import MeshSettings
 from stages.points.settings import PointsSettings
-from tests.stages.io.meshes import block
+from tests.stages.io.meshes import accessor, block, glb_document
 from workflows import exporting
 from workflows.cli.resolve import Settings, table_of
 from workflows.exporting import Export
@@ -74,6 +78,40 @@ def test_what_the_stage_has_made_is_written_as_it_made_it(run: Path) -> None:
         assert (run.parent / path.name).read_bytes() == path.read_bytes(), path.name
 
 
+def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(run: Path) -> None:
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    save_frame(TrueFrame(Similarity(3.0, np.eye(3), np.zeros(3)), 0.01, ()), run)
+    export(run, "mesh.obj", "mesh.ply", "mesh.glb")
+    before, after = (read_vertices(SimpleNamespace(ply=path)) for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
+    np.testing.assert_allclose(after, 3 * before, rtol=1e-6)
+    assert b"unit metre" in (run.parent / "mesh.obj").read_bytes()[:200]
+
+
+def test_what_the_stage_has_made_is_written_upright_where_up_was_set(run: Path) -> None:
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    up = np.array([0.48, -0.6, -0.64])
+    save_frame(AS_CAPTURED.with_ground(Ground(tuple(up.tolist()), 0.5, [])), run)
+    export(run, "mesh.ply", "mesh.glb")
+    before, after = (read_vertices(SimpleNamespace(ply=path)) for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
+    np.testing.assert_allclose(after[:, 2], before @ up - 0.5, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(after - after[0], axis=1), np.linalg.norm(before - before[0], axis=1), rtol=1e-5)
+    assert b"up 0 0 1; unit metre" in (run.parent / "mesh.ply").read_bytes()[:200]
+    document, blob = glb_document(run.parent / "mesh.glb")
+    heights = accessor(document, blob, document["meshes"][0]["primitives"][0]["attributes"]["POSITION"])[:, 1]
+    np.testing.assert_allclose([heights.min(), heights.max()], [after[:, 2].min(), after[:, 2].max()], atol=1e-5)
+    assert document["nodes"][0]["extras"]["source_frame"]["capture_up"] == [0, 0, 1]
+
+
+def test_a_texture_may_be_left_out_of_it(run: Path) -> None:
+    (entry,) = export(run, "mesh.glb", texture="off")
+    assert "texels a side" not in entry
+    assert b"COLOR_0" in (run.parent / "mesh.glb").read_bytes()
+    (shape,) = export(run, "mesh.stl", chosen=settings(texture="asset", texture_size=512))
+    assert shape["faces"] == 12, "a texture that no file shows is not asked for"
+
+
 @pytest.mark.parametrize(
     ("change", "more"),
     [({"max_faces": 400}, {}), ({"texture_size": 512}, {}), ({}, {"texture": "asset"}), ({}, {"region": "all"}), ({"smoothing_iterations": 3}, {}),
@@ -84,6 +122,69 @@ def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dic
         monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: SimpleNamespace(fresh=False, manifest=None))
     with pytest.raises(pytest.fail.Exception, match="made again"):
         export(run, "mesh.glb", chosen=settings(**change), **more)
+
+
+def test_a_normal_map_is_left_out_where_it_is_not_asked_for(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = replace(MADE, normal_map=True)
+    fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(made))))
+    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
+    outputs = MeshOutputs.of_run(run)
+    mesh = read_mesh(outputs)
+    assert mesh.texture is not None
+    mesh = replace(mesh, texture=replace(mesh.texture, normals=255 - mesh.texture.colours))
+    for file in (outputs.glb, outputs.obj):
+        MESH_EXPORTERS[file.suffix](mesh, file, source_frame(METADATA))
+    for wanted in (True, None, False):
+        folder = run.parent / str(wanted)
+        folder.mkdir()
+        with_map = wanted is not False
+        entries = export(run, f"{wanted}/mesh.glb", f"{wanted}/mesh.obj", chosen=settings(normal_map=True), normal_map=wanted)
+        assert (b"normalTexture" in (folder / "mesh.glb").read_bytes()) == with_map
+        assert (folder / "mesh_normal.png").is_file() == with_map
+        assert (str(folder / "mesh_normal.png") in entries[1]["beside"]) == with_map
+
+
+def test_a_normal_map_wants_a_texture_to_lie_beside(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for names, more in ((("a.ply",), {}), (("a.glb",), {"texture": "off"}), (("a.xyz",), {"as_points": True})):
+        with pytest.raises(UsageError):
+            export(run, *names, normal_map=True, **more)
+    (entry,) = export(run, "a.ply", chosen=settings(normal_map=True))
+    assert entry["faces"] == 12, "a file without a place for it takes the mesh as it is"
+    monkeypatch.setattr("stages.formats.exporters.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[usd\]'"):
+        export(run, "b.glb", "b.usdz")
+    assert not (run.parent / "b.glb").exists()
+
+
+def test_colours_of_vertices_are_asked_of_photographs_where_there_are_any(run: Path) -> None:
+    """A texture is made for a PLY, too: of a run that has photographs."""
+    other = settings(texture="photographs")
+    (without,) = export(run, "a.ply", chosen=other)
+    assert without["faces"] == 12
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    with pytest.raises(pytest.fail.Exception, match=r"made again, with .*texture='photographs'"):
+        export(run, "b.ply", chosen=other)
+    with pytest.raises(UsageError, match="keeps a texture"):
+        export(run, "b.stl", texture="photographs")
+    with pytest.raises(UsageError, match="keeps a texture"):
+        export(run, "b.ply", picture="jpeg")
+
+
+@pytest.mark.parametrize("failing", [0, 1, 2])
+def test_a_full_disk_leaves_no_part_of_an_obj(run: Path, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
+    calls, real = iter(range(100)), os.fsync
+
+    def full(descriptor: int) -> None:
+        if next(calls) == failing:
+            raise OSError(28, "No space left on device")
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    before = sorted(run.parent.iterdir())
+    with pytest.raises(Exception, match=r"mesh\.obj"):
+        export(run, "mesh.obj")
+    assert sorted(run.parent.iterdir()) == before
 
 
 def test_a_page_for_browsers_holds_the_asset_or_what_is_asked_for_of_it(run: Path, tmp_path: Path) -> None:

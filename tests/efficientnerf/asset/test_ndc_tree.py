@@ -47,6 +47,18 @@ def test_lookups_take_points_of_the_world() -> None:
     assert not np.allclose(colour_at(tree, at[:1], towards), colour_at(tree, at[:1], -towards), atol=1e-2)
 
 
+def test_the_kernel_is_the_reference() -> None:
+    tree = wall(0.4, voxels=48)
+    rng = np.random.default_rng(1)
+    origins = rng.uniform(-1, 1, (64, 3)) + np.array([0.3, -1.0, 0.2])
+    directions = rng.normal(size=(64, 3)) * 0.3 + [0, 1, 0]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = render_rays(tree, origins, directions)
+    colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    np.testing.assert_allclose(seen.opacity, opacity.numpy(), atol=1e-3)
+    np.testing.assert_allclose(seen.colour, colour.numpy(), atol=1e-3)
+
+
 PLACES = {"reference": (0.0, 0.0, 0.0), "beside and behind": (0.8, -0.5, -0.4), "beyond the near plane": (0.2, 2.5, 0.1), "close": (0.1, 5.5, 0.0)}
 
 
@@ -103,6 +115,16 @@ def test_rays_that_are_warped_in_the_kernel_are_those_that_are_given(model: str,
         np.testing.assert_allclose(seen.depth.reshape(-1)[hit], depth[hit], rtol=1e-4)
         np.testing.assert_allclose(seen.normal.reshape(-1, 3), given.normal, atol=2e-3)
         assert hit.mean() > 0.3 or pose is turned or place == (0.0, 20.0, 0.0)
+
+
+def test_frame_rays_are_where_the_grid_is() -> None:
+    tree = wall()
+    origins, directions = np.array([[0.3, -1.0, 0.2]]), np.array([[0.1, 1.0, -0.05]]) / np.linalg.norm([0.1, 1.0, -0.05])
+    seen = render_rays(tree, origins, directions)
+    warped = tree.frame.rays(origins, directions)
+    point = tree.ndc.points(origins + seen.depth[:, None].astype(np.float64) * directions)
+    along = point - warped.origins
+    np.testing.assert_allclose(np.cross(along, warped.directions), 0, atol=1e-6)
 
 
 REFUSED = {

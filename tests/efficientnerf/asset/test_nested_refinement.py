@@ -4,22 +4,29 @@ threads and interruptions."""
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import numba
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, voxel_cascades
+from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested, subset, voxel_cascades
+from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.host import in_voxels
+from efficientnerf.asset.refinement.state import initial_state, subset_state
+from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import ray_parts, render_reference, tree_density
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import contributions as kernels
 from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree.nearest import render_rays as render_nearest
 from efficientnerf.rendering import environment
+from tests.efficientnerf.balls import pixels
 from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, tensors, uniform_tree
 
+WHITE = (1.0, 1.0, 1.0)
 # cascades, brick, degree, lookup
 NESTED = [(1, 3, 1, "trilinear"), (2, 1, 0, "trilinear"), (2, 2, 3, "trilinear"), (3, 3, 1, "trilinear"), (3, 4, 2, "nearest"), (2, 2, 0, "nearest")]
 
@@ -54,6 +61,18 @@ def test_rays_of_hundreds_of_samples_go_on_through_all_cascades() -> None:
     wanted, wanted_opacity = render_reference(tree, *tensors(origins, directions))
     np.testing.assert_allclose(opacity, wanted_opacity, atol=1e-3)
     np.testing.assert_allclose(colour, wanted, atol=1e-3)
+
+
+@pytest.mark.parametrize(("count", "step_size"), [(1, 0.5), (1, 1.0), (2, 0.5), (3, 0.7)])
+def test_nearest_renders_match_the_reference(count: int, step_size: float) -> None:
+    tree = replace(random_cascades(count, count=count, brick=4, degree=2, lookup="nearest"), environment=None, step_size=step_size)
+    origins, directions = nested_rays(tree, 400)
+    colour, opacity, depth, _ = render_nearest(tree, origins, directions)
+    wanted, wanted_opacity = render_reference(tree, *tensors(origins, directions))
+    np.testing.assert_allclose(opacity, wanted_opacity, atol=1e-3)
+    np.testing.assert_allclose(colour, wanted, atol=1e-3)
+    np.testing.assert_array_equal(np.isfinite(depth), opacity > 0.5)
+    assert 0.2 < (opacity > 0.05).mean() < 0.99
 
 
 def weights_by_sums(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, gain: np.ndarray) -> np.ndarray:
@@ -91,3 +110,54 @@ def test_greatest_weights_are_those_of_plain_sums_in_any_number_of_parts() -> No
     np.testing.assert_allclose(found[0], weights_by_sums(tree, origins, directions, gain), atol=1e-5)
     for n in range(3):
         assert (found[0][voxel_cascades(tree) == n] > 0).mean() > 0.1
+
+
+def fog(environment_map: bool = False) -> NerfTree:
+    """Thin grey fog in three cascades, of which the second reaches round the ball of the pictures."""
+    grids = cascade_grids(np.stack([np.full(3, -0.4), np.full(3, 0.4)]), 0.1, 2, 3)
+    trees = [replace(uniform_tree(s, brick=2, voxel=v, sigma=0.3, logit=0.0), bounds_min=low, background=WHITE) for s, v, low in grids]
+    tree = nested(trees, np.ones((4, 8, 3), np.float32) if environment_map else None)
+    sh = np.zeros((len(tree.density_values), 4, 3), np.float32)
+    return replace(tree, harmonics=sh)
+
+
+TOLD: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / 60), "seed": 1}
+
+
+def test_nested_fog_becomes_the_ball_of_the_pictures() -> None:
+    targets, state = Targets(pixels(10, 24), WHITE), initial_state(fog())
+    before = error(state.tree, targets, 2000, 0)
+    list(optimise(state, targets, until=60, **TOLD))
+    tree = state.result()
+    assert error(tree, targets, 2000, 0) < 0.1 * before
+    assert tree.outer is state.tree.outer
+    middle, outermost = (tree.density_values[voxel_cascades(tree) == n] for n in (0, 2))
+    assert np.median(outermost) < 0.3 / 2
+    assert middle.max() > 3
+
+
+def test_voxels_are_pruned_by_what_they_weigh_in_every_cascade() -> None:
+    targets, state = Targets(pixels(10, 24), WHITE), initial_state(fog())
+    list(optimise(state, targets, until=30, **TOLD))
+    weights = max_weights(state.tree, targets, 4000, 0)
+    keep = weights > np.quantile(weights, 0.6)
+    fewer = subset_state(state, keep, subset(state.tree, keep))
+    assert len(fewer.density) == len(fewer.visits) == keep.sum()
+    np.testing.assert_array_equal(voxel_cascades(fewer.tree), voxel_cascades(state.tree)[keep])
+    list(optimise(fewer, targets, until=60, **TOLD))
+    assert error(fewer.result(), targets, 2000, 0) < 0.15 * error(fog(), targets, 2000, 0)
+
+
+def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
+    targets = Targets(pixels(6, 16), WHITE)
+    whole, parts = initial_state(fog()), initial_state(fog())
+    list(optimise(whole, targets, until=12, **TOLD))
+    list(optimise(parts, targets, until=5, **TOLD))
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        list(optimise(parts, targets, until=12, **TOLD))
+    finally:
+        numba.set_num_threads(threads)
+    for name in ("density", "sh", "square_density", "square_sh", "visits"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))

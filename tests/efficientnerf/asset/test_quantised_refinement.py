@@ -46,6 +46,14 @@ def test_tables_that_are_off_are_put_right_and_codes_stay() -> None:
     assert error(found, seen, 4096, 1) < 0.8 * error(tree, seen, 4096, 1)
 
 
+def test_the_same_is_found_every_time_and_no_step_changes_nothing() -> None:
+    tree, seen = coded(0.4), targets()
+    first, second = (refit(tree, seen, 4, rays=512) for _ in range(2))
+    assert np.array_equal(first.density_values, second.density_values)
+    assert np.array_equal(first.sh, second.sh)
+    assert refit(tree, seen, 0) is tree
+
+
 def test_a_worse_tree_is_never_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that lead astray are not taken over."""
     from efficientnerf.asset.refinement import fit
@@ -59,3 +67,12 @@ def test_a_worse_tree_is_never_made(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit, "optimise", astray)
     tree = coded()
     assert refit(tree, targets(), 4) is tree
+
+
+def test_densities_that_would_meet_or_pass_each_other_keep_their_order() -> None:
+    from efficientnerf.asset.refinement.quantised import _rising
+
+    found = _rising(np.array([0, 3, 3, 1, 5], np.float32))
+    assert (np.diff(found) > 0).all()
+    np.testing.assert_allclose(found, [0, 3, 3, 3, 5], rtol=1e-6)
+    assert np.array_equal(_rising(found), found)

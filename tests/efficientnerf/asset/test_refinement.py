@@ -9,20 +9,23 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import voxel_coordinates
+from efficientnerf.asset.cascades import subset, voxel_coordinates
 from efficientnerf.asset.queries import density_at
-from efficientnerf.asset.refinement.fit import error, optimise
+from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.host import in_voxels
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.cells import cells_of
+from efficientnerf.backends.layout import EARLY_STOP
+from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree.contributions import max_contributions
+from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.training.pixels import Pixels
-from tests.efficientnerf.balls import cameras, picture, pixels
-from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
-from tests.efficientnerf.trees import random_tree, rays_at
+from tests.efficientnerf.balls import BOUNDS, cameras, picture, pixels
+from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random, sum_gradients
+from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
 
 @pytest.mark.parametrize(("brick", "degree", "opacity_weight"), [(1, 0, 0.0), (3, 1, 0.7), (4, 2, 0.0), (2, 3, 0.7)])
@@ -36,6 +39,33 @@ def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opa
     np.testing.assert_allclose(by_density, wanted_by_density, atol=2e-5 * np.abs(wanted_by_density).max())
     np.testing.assert_allclose(by_sh, wanted_by_sh, atol=2e-5 * np.abs(wanted_by_sh).max())
     assert (by_density != 0).mean() > 0.5
+
+
+def test_float32_and_the_early_stop_change_little() -> None:
+    tree = random_tree(3, brick=4, degree=2)
+    rays = rays_at(tree, 500)
+    exact = gradients(tree, *rays, seen_at_random(500, 0.3))
+    usual = gradients(tree, *rays, seen_at_random(500, 0.3, np.float32), np.float32, EARLY_STOP)
+    for a, b in zip(exact, usual, strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-3 * np.abs(a).max())
+
+
+def test_records_grow_until_all_samples_fit() -> None:
+    tree = uniform_tree((12, 12, 12), brick=2, sigma=0.05)
+    origins, directions = rays_at(tree, 300)
+    buffer = RecordBuffer()
+    buffer.capacity = 7
+    start, along, bases = in_voxels(tree, origins, directions)
+    o = initial_state(tree)
+    seen = seen_at_random(300, 0.0, np.float32)
+    cells = cells_of(tree)
+    dense = dense_densities(cells, voxel_places(cells, len(o.sh)), o.density)
+    _, records = kernels.forward_backward(cells, packets_of(300), start, along, bases, dense, o.sh, seen, buffer)
+    assert 7 < (records.begin[:, -1] - records.begin[:, 0]).max() <= buffer.capacity
+    by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
+    sum_gradients(records, by_density, by_sh)
+    expected = gradients(tree, origins, directions, seen, np.float32, EARLY_STOP)
+    np.testing.assert_array_equal(by_density, expected[1])
 
 
 def fitted(tree: NerfTree, targets: Targets, steps: int, **more: Any) -> tuple[NerfTree, list[float]]:
@@ -134,6 +164,23 @@ def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
     np.testing.assert_array_equal(again.result().sh, whole.sh)
     other, _ = fitted(ball_tree(), targets, 12, seed=2)
     assert not np.array_equal(other.sh, whole.sh)
+
+
+def test_weights_are_what_voxels_contribute() -> None:
+    """One voxel before another: the greatest weight of each, through what interpolation leaves it, against sums by hand."""
+    tree = uniform_tree((2, 2, 2), brick=4, voxel=0.25, sigma=4.0)
+    tree = replace(tree, bounds_min=BOUNDS[0], background=(1.0, 1.0, 1.0))
+    looked: list[tuple[int, int]] = []
+    weights = max_weights(tree, Targets(pixels(8, 24), (1.0, 1.0, 1.0)), 4000, 0, lambda *done: looked.append(done))
+    assert looked == [(4000, 4000)]
+    at = voxel_coordinates(tree)
+    skin = ((at == 0) | (at == 7)).any(axis=1)
+    assert weights.min() > 0
+    assert weights.max() <= 1 - np.exp(-4 * 0.125) + 1e-6  # of a single sample
+    assert weights[skin].mean() > 2 * weights[~skin].mean()
+    without = subset(tree, weights > np.median(weights))
+    assert len(without.density_values) == (weights > np.median(weights)).sum()
+    np.testing.assert_array_equal(voxel_coordinates(without), at[weights > np.median(weights)])
 
 
 def weights_by_hand(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, gain: np.ndarray) -> np.ndarray:

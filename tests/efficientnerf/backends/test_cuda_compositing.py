@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from efficientnerf.rendering import compositing
-from tests.efficientnerf.bundles import Bundle, in_float32
+from tests.efficientnerf.bundles import Bundle, bundle, in_float32
 from tests.efficientnerf.device import DEVICE
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.compositing")
@@ -41,3 +41,16 @@ def test_a_wall_hides_what_lies_behind_it_and_is_fully_seen(activation: str) -> 
     for ours, theirs in zip(values + grads, expected + expected_grads, strict=True):
         torch.testing.assert_close(ours.cpu().double(), theirs, rtol=1e-4, atol=3e-6)
     assert values[3][21:].max() < 1e-9
+
+
+def test_padding_has_neither_weight_nor_gradient() -> None:
+    b = there(bundle(1))
+    padded = b._replace(raw=torch.cat([b.raw, torch.full_like(b.raw, 5.0)]), length=torch.cat([b.length, b.length]))
+    (values, grads), (whole, expected) = (outcome(cuda.composite, x, "exp") for x in (b, padded))
+    samples = len(b.raw)
+    for a, c in zip(values[:3], whole[:3], strict=True):
+        assert torch.equal(a, c)
+    assert torch.equal(values[3], whole[3][:samples])
+    assert not whole[3][samples:].any()
+    assert not expected[0][samples:].any()
+    assert grads[0].shape == b.raw.shape

@@ -41,10 +41,10 @@ def agree(ours: Rendering, theirs: Rendering, faces: float = 0.0) -> None:
     assert (turned > 0.05).mean() <= max(faces, 0.02)
 
 
-@pytest.mark.parametrize(("brick", "degree", "step_size"), [(1, 0, 0.5), (4, 2, 1.0)])
+@pytest.mark.parametrize(("brick", "degree", "step_size"), [(1, 0, 0.5), (4, 2, 1.0), (2, 4, 0.5)])
 def test_rays_are_those_of_the_torch_function(brick: int, degree: int, step_size: float) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, step_size=step_size)
-    origins, directions = rays_at(tree, 60)
+    origins, directions = rays_at(tree, 96)
     colour, opacity = render_reference(tree, *tensors(origins, directions))
     found = device_rays(tree, origins, directions)
     # The kernel stops at 1e-3 of the light, and is in float32.
@@ -54,27 +54,43 @@ def test_rays_are_those_of_the_torch_function(brick: int, degree: int, step_size
     agree(found, render_rays(tree, origins, directions))
 
 
+@pytest.mark.parametrize("share", [0.1])
+def test_skipping_empty_space_changes_no_value(share: float) -> None:
+    tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
+    origins, directions = rays_at(tree, 96)
+    agree(device_rays(tree, origins, directions), render_rays(tree, origins, directions), faces=0.011)
+
+
 @pytest.mark.parametrize(("model", "params"), [
-    ("PINHOLE", (15.0, 16.0, 4.5, 6.0)), ("OPENCV", (15.0, 16.0, 4.5, 6.0, 0.05, -0.02, 0.003, 0.002)),
+    ("SIMPLE_PINHOLE", (15.0, 5.0, 6.5)), ("PINHOLE", (15.0, 16.0, 4.5, 6.0)), ("OPENCV", (15.0, 16.0, 4.5, 6.0, 0.05, -0.02, 0.003, 0.002)),
     ("OPENCV_FISHEYE", (12.0, 12.0, 5.0, 6.0, 0.02, 0.0, 0.0, 0.0)),
 ])  # fmt: skip
 def test_images_are_those_of_the_cpu(model: str, params: tuple[float, ...]) -> None:
     tree = random_tree(0, share=0.7, degree=2)
     camera = replace(looking(tree, 10), width=9, model=model, params=params)
-    background = None if model == "PINHOLE" else (0.2, 0.5, 1.0)
-    found, expected = device_image(tree, camera, background=background), render(tree, camera, background=background)
-    agree(found, expected, faces=0.02)
-    assert np.array_equal(np.isfinite(found.depth), found.opacity >= 0.5)
+    for background in (None, (1.0, 0.5, 0.0)) if model == "PINHOLE" else ((0.2, 0.5, 1.0),):
+        found, expected = device_image(tree, camera, background=background), render(tree, camera, background=background)
+        assert found.colour.shape == (camera.height, camera.width, 3)
+        agree(found, expected, faces=0.02)
+        assert np.array_equal(np.isfinite(found.depth), found.opacity >= 0.5)
 
 
-def test_rays_through_voxels_that_are_not_interpolated() -> None:
-    tree = random_tree(4, brick=4, degree=2, lookup="nearest")
-    origins, directions = rays_at(tree, 60)
+@pytest.mark.parametrize(("brick", "degree"), [(1, 0), (4, 2)])
+def test_rays_through_voxels_that_are_not_interpolated(brick: int, degree: int) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, lookup="nearest")
+    origins, directions = rays_at(tree, 96)
     found = device_rays(tree, origins, directions)
     assert 0.2 < (found.opacity > 0.05).mean() < 0.9
     agree(found, render_rays(tree, origins, directions), faces=0.02)  # samples at faces of voxels: float32 may see the one on the other side
-    other = render_rays(tree, *rays_at(replace(tree, lookup="trilinear"), 60))
+    other = render_rays(tree, *rays_at(replace(tree, lookup="trilinear"), 96))
     assert np.abs(other.colour - device_rays(replace(tree, lookup="trilinear"), origins, directions).colour).max() > 0.05
+
+
+def test_images_of_voxels_that_are_not_interpolated() -> None:
+    tree = random_tree(0, share=0.7, degree=2, lookup="nearest")
+    camera = looking(tree, 8)
+    for supersample in (1, 2):
+        agree(device_image(tree, camera, supersample=supersample), render(tree, camera, supersample=supersample), faces=0.03)
 
 
 def test_an_empty_tree_and_no_rays() -> None:
@@ -84,6 +100,23 @@ def test_an_empty_tree_and_no_rays() -> None:
     assert np.isinf(found.depth).all()
     np.testing.assert_allclose(found.colour, np.broadcast_to([0.2, 0.4, 0.6], found.colour.shape), atol=1e-6)
     assert device_rays(random_tree(0), np.zeros((0, 3)), np.zeros((0, 3))).colour.shape == (0, 3)
+
+
+def test_palettes_are_decoded() -> None:
+    from efficientnerf.asset.palettes import PaletteHarmonics
+
+    tree = random_tree(3, degree=1)
+    rng = np.random.default_rng(0)
+    count = len(tree.density_values)
+    codes = PaletteHarmonics(
+        rng.integers(0, 9, (count, 3), dtype=np.uint8), rng.normal(size=(9, 3)).astype(np.float32),
+        rng.integers(0, 7, (count, 2), dtype=np.uint8), rng.normal(size=(7, 3, 3)).astype(np.float32), (1, 2),
+    )  # fmt: skip
+    coded = replace(tree, harmonics=codes)
+    plain = replace(tree, harmonics=codes.decoded())
+    origins, directions = rays_at(tree, 40)
+    for name in ("colour", "opacity"):
+        assert np.array_equal(getattr(device_rays(coded, origins, directions), name), getattr(device_rays(plain, origins, directions), name))
 
 
 def test_rays_of_another_frame_have_the_colours_along_those_of_the_world() -> None:

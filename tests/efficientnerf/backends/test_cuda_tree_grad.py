@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
+from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.refinement.error_map import ErrorMap
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
@@ -30,7 +30,7 @@ kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
 device = pytest.importorskip("efficientnerf.asset.refinement.device")
 
 
-@pytest.mark.parametrize(("brick", "degree", "opacity_weight"), [(1, 0, 0.7), (4, 2, 0.25)])
+@pytest.mark.parametrize(("brick", "degree", "opacity_weight"), [(1, 0, 0.7), (4, 2, 0.0), (2, 3, 0.25)])
 def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opacity_weight: float) -> None:
     # Rays that stop early or run along a voxel's face depart from the exact sums: low densities, and rays at no angle of the grid.
     tree = random_tree(brick, brick=brick, degree=degree, sigma=4.0)
@@ -45,11 +45,11 @@ def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opa
     assert (found[1] != 0).mean() > 0.15
 
 
-@pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(3, 3, 0, "trilinear"), (2, 2, 1, "nearest")])
+@pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(2, 2, 1, "trilinear"), (3, 3, 0, "trilinear"), (3, 2, 1, "nearest")])
 def test_values_and_gradients_through_cascades_are_those_of_autograd(count: int, brick: int, degree: int, lookup: str) -> None:
     tree = replace(random_cascades(count, count=count, brick=brick, degree=degree, lookup=lookup), environment=None)
     tree = replace(tree, density_values=tree.density_values / 8)
-    origins, directions = (a[np.arange(40) % 4 != 3] for a in nested_rays(tree, 40))
+    origins, directions = (a[np.arange(80) % 4 != 3] for a in nested_rays(tree, 80))
     seen = seen_at_random(len(origins), 0.4)
     found, wanted = device_gradients(tree, origins, directions, seen, DEVICE), gradients_by_autograd(tree, origins, directions, seen)
     # A sample at a face of a voxel, or at the end of its part, may lie on the other side in float32.
@@ -59,6 +59,17 @@ def test_values_and_gradients_through_cascades_are_those_of_autograd(count: int,
         assert (off > 2e-3 * scale).mean() < 0.02
     for n in range(count):
         assert (found[1][voxel_cascades(tree) == n] != 0).mean() > 0.1
+
+
+def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
+    tree = random_tree(4, brick=2, degree=1, share=0.6)
+    origins, directions = rays_at(tree, 40)
+    seen = seen_at_random(40, 0.3, np.float32)
+    _, by_density, by_sh = device_gradients(tree, origins, directions, seen, DEVICE)
+    order = np.random.default_rng(0).permutation(40)
+    again = device_gradients(tree, origins[order], directions[order], RayTargets(*(part[order] for part in seen[:4]), seen.opacity_weight), DEVICE)
+    assert np.array_equal(by_density, again[1])
+    assert np.array_equal(by_sh, again[2])
 
 
 def test_sums_of_the_most_rays_cannot_overflow() -> None:
@@ -120,21 +131,31 @@ def test_steps_are_those_of_the_cpu(tree: NerfTree, total_variation: float) -> N
     on_host = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     on_device = on_host.sent(DEVICE)
     assert on_device.on_device
-    ours, errors = fitted(on_device, tree, [3], total_variation=total_variation)
-    theirs, wanted = fitted(on_host, tree, [3], total_variation=total_variation)
+    ours, errors = fitted(on_device, tree, [4], total_variation=total_variation)
+    theirs, wanted = fitted(on_host, tree, [4], total_variation=total_variation)
     assert (ours.visits == theirs.visits).mean() > 0.99
     assert len(np.unique(theirs.visits)) > 2
     for name in ("density", "sh", "square_density", "square_sh"):
         a, b = getattr(ours, name), getattr(theirs, name)
         assert (np.abs(a - b) > 1e-3 * np.abs(b) + 1e-3 * np.abs(b).max()).mean() < 0.02, name
     assert errors[0] == pytest.approx(wanted[0], rel=1e-5)
-    assert errors == [errors[0]] * 3  # nothing later has arrived
+    assert errors == [errors[0]] * 4  # nothing later has arrived
     assert error(ours.result(), on_device, 60, 0) == pytest.approx(error(theirs.result(), on_host, 60, 0), rel=1e-2)
+
+
+@pytest.mark.parametrize("tree", [random_tree(2), random_tree(3, brick=1), nested_balls()], ids=["one", "bricks of one voxel", "cascades"])
+def test_voxels_beside_are_a_step_away(tree: NerfTree) -> None:
+    beside, at, cascades = device.voxels_beside(tree), voxel_coordinates(tree), voxel_cascades(tree)
+    place = {(int(of), *map(int, row)): n for n, (of, row) in enumerate(zip(cascades, at, strict=True))}
+    for face in range(6):
+        step = np.eye(3, dtype=int)[face // 2] * (1 if face % 2 else -1)
+        wanted = [place.get((int(of), *map(int, row + step)), -1) for of, row in zip(cascades, at, strict=True)]
+        np.testing.assert_array_equal(beside[:, face], wanted)
 
 
 def test_interrupted_or_not_the_bytes_are_the_same() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0)).sent(DEVICE)
-    whole, apart = (fitted(targets, ball_tree(8), until, rays=8)[0] for until in ([2], [1, 2]))
+    whole, apart = (fitted(targets, ball_tree(8), until)[0] for until in ([4], [1, 3, 4]))
     for name in STATE:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -207,6 +208,17 @@ def damaged(content: bytes) -> dict[str, bytes]:
     return {"empty": b"", "cut": content[:middle], "zeros": bytes(len(content)), "garbage": b"\x80\x05K\x01.", "flipped": flipped}
 
 
+def test_an_empty_kernel_index_is_removed_and_compiled_again(package: Path, tmp_path: Path) -> None:
+    """As a power cut leaves it; numba alone would end with EOFError."""
+    cache = tmp_path / "cache"
+    folder = Path(run(package, ENERF_CACHE_DIR=str(cache))["folder"])
+    for path in folder.rglob("*.nbi"):
+        path.write_bytes(b"")
+    again = run(package, ENERF_CACHE_DIR=str(cache))
+    assert (again["result"], again["functions"]) == (16, 2)
+    assert "removed, and compiled again" in again["stderr"]
+
+
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -> None:
     from efficientnerf.backends.numba.runtime import KernelFiles
@@ -316,6 +328,23 @@ def test_who_needs_a_form_that_another_process_compiles_waits_for_it(tmp_path: P
         first.kill()
 
 
+def test_the_lock_of_a_form_that_cannot_be_compiled_is_given_back(package: Path, tmp_path: Path) -> None:
+    program = """
+import json
+from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba import runtime
+from efficientnerf.backends.numba.inner import inner
+try:
+    inner("text")
+except Exception as error:
+    refused = type(error).__name__
+held = (len(runtime._locks._held), len(runtime._compilations._forms))
+print(json.dumps({"refused": refused, "held": held, "result": inner(3), "after": (len(runtime._locks._held), len(runtime._compilations._forms))}))
+"""
+    found = run(package, program, ENERF_CACHE_DIR=str(tmp_path / "cache"))
+    assert (found["refused"], found["held"], found["result"], found["after"]) == ("TypingError", [0, 0], 4, [0, 0])
+
+
 def test_a_disk_that_takes_no_kernels_is_no_error(package: Path, tmp_path: Path) -> None:
     full = PROGRAM.replace(
         "started = []",
@@ -370,4 +399,29 @@ def test_folders_out_of_use_are_removed_and_nothing_else(tmp_path: Path) -> None
     assert kernel_cache.first_private([root], KEY) == (own, [])
     assert all(place.exists() for place in (*recent, own, foreign))
     assert not any(place.exists() for place in (*week, old))
+    assert now - own.stat().st_mtime < 60
+
+
+def test_states_of_a_modules_sources_out_of_use_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The present one stays, however old, and so do those of other modules; of modules that are gone none is present."""
+    adam, gone = f"{kernel_cache.KERNELS}.adam", f"{kernel_cache.KERNELS}.gone"
+    now, root = time.time(), tmp_path / "cache" / "kernels" / kernel_cache.key()
+
+    def made(module: str, name: str, days: float) -> Path:
+        (root / module / name).mkdir(parents=True)
+        (root / module / name / "code.nbc").touch()
+        os.utime(root / module / name, (now - days * kernel_cache.DAY,) * 2)
+        return root / module / name
+
+    own, old, other = made(adam, KEY, 100), made(adam, "a" * 16, 31), made(f"{kernel_cache.KERNELS}.mlp", "b" * 16, 31)
+    week = [made(adam, f"c{number:015x}", 7 + number / 100) for number in range(kernel_cache.KEPT + 2)]
+    left, removed = made(gone, "d" * 16, 7), made(gone, "e" * 16, 31)
+    monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
+    for each in (tmp_path / "cache", root.parent, root):
+        each.chmod(0o700)
+    for function in (kernel_cache.folder, kernel_cache.folder_of):
+        monkeypatch.setattr(kernel_cache, function.__name__, function.__wrapped__)
+    assert kernel_cache.folder_of(adam, KEY) == own
+    assert all(place.exists() for place in (own, other, left, *week[: kernel_cache.KEPT]))
+    assert not any(place.exists() for place in (old, removed, *week[kernel_cache.KEPT :]))
     assert now - own.stat().st_mtime < 60

@@ -6,16 +6,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import voxel_cascades, voxel_coordinates, voxel_sides
+from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_coordinates, voxel_sides
+from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import MIN_THICKNESS, MOST_VARIATION
 from efficientnerf.backends.numba.tree.cells import cells_of
-from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
-from efficientnerf.backends.numba.tree_training.steps import step, values_of
+from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
+from efficientnerf.backends.numba.tree_training.steps import Values, step, values_of
+from efficientnerf.backends.numba.vector.memory import pointer
 from tests.efficientnerf.refinements import GRIDS, gradients, gradients_by_autograd, moments_of, records_of, rule_of, seen_at_random, sum_gradients
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
@@ -42,6 +47,17 @@ def test_packets_of_parallel_rays_have_the_gradients_of_autograd(brick: int, deg
     for ours, theirs in zip(found, wanted_by, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=2e-5 * np.abs(theirs).max())
     assert (found[0] != 0).mean() > 0.03
+
+
+def test_a_packet_grows_until_all_its_rays_fit() -> None:
+    """All rays of a large tree in one packet: many times the blocks and samples that it begins with."""
+    tree = random_tree(3, shape=(7, 7, 7), brick=2, degree=0, share=0.9, sigma=0.5)
+    origins, directions = rays_at(tree, 600)
+    seen = seen_at_random(600, 0.2)
+    one, all_at_once = gradients(tree, origins, directions, seen), gradients(tree, origins, directions, seen, packet=600)
+    for a, b in zip(one, all_at_once, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(a).max())
+    assert (one[1] != 0).sum() > 2 * kernels.FIRST_BLOCKS
 
 
 @pytest.mark.parametrize("made", GRIDS)
@@ -73,6 +89,39 @@ def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree]) -> None:
         np.testing.assert_allclose(o.density, density, rtol=2e-3, atol=1e-5)
         np.testing.assert_allclose(o.sh, sh, atol=2e-3)
     assert len(np.unique(visits)) > 1  # some were not met by every bundle
+
+
+def test_the_same_bytes_on_any_number_of_threads() -> None:
+    tree, found = random_cascades(3, cells=8, brick=2, degree=2), []
+    threads = numba.get_num_threads()
+    origins, directions = nested_rays(tree, 1500)
+    seen = seen_at_random(1500, 0.2, np.float32)
+    start, along, bases = in_voxels(tree, origins, directions)
+    first = packets_of(1500, 7)
+    try:
+        for count in (1, threads):
+            numba.set_num_threads(count)
+            o = initial_state(tree)
+            moments, cells = moments_of(o), cells_of(tree)
+            values = values_of(cells, o.density, o.sh)
+            for _ in range(2):
+                loss, records = kernels.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer())
+                step(records, values, moments, rule_of())
+            found.append((loss, o.density, o.sh, *moments))
+    finally:
+        numba.set_num_threads(threads)
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@numba.njit
+def _slope_at(place, thickness, side, least, brick, dense, around):  # type: ignore[no-untyped-def]
+    return differences(place, thickness, side, least, brick, pointer(dense), pointer(around))
+
+
+def slope_of(values: Values, beside: Neighbours, v: int, thickness: float, side: float) -> float:
+    found: float = _slope_at(values.places[v], thickness, side, MIN_THICKNESS, beside.brick, values.dense, beside.around)
+    return found
 
 
 def penalty(tree: NerfTree, log_thickness: np.ndarray, old: np.ndarray, v: int) -> float:
@@ -111,6 +160,16 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
         assert moved[v] == pytest.approx(share * (ends[0] - ends[1]) / 2e-5, rel=2e-3, abs=1e-5)
 
 
+@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
+def test_values_know_their_voxels(made: Callable[[], NerfTree]) -> None:
+    tree = made()
+    values = values_of(cells_of(tree), tree.density_values, tree.sh.reshape(len(tree.sh), -1))
+    np.testing.assert_array_equal(values.cascades, voxel_cascades(tree))
+    np.testing.assert_allclose(values.sides, cascade_sides(tree), rtol=1e-15)
+    np.testing.assert_array_equal(values.dense[values.places], tree.density_values)
+    assert np.signbit(values.dense).sum() == len(values.dense) - len(values.density)
+
+
 @pytest.mark.parametrize("degree", [0, 2, 4])
 def test_rows_of_any_length_take_their_own_gradient_and_no_other(degree: int) -> None:
     """Rows lie end to end, and the groups of sixteen numbers that a step works in reach beyond them."""
@@ -126,3 +185,23 @@ def test_rows_of_any_length_take_their_own_gradient_and_no_other(degree: int) ->
     size = np.sqrt((by_sh**2).mean(axis=1, keepdims=True))
     np.testing.assert_allclose((before - o.sh)[met], (np.where(np.arange(by_sh.shape[1]) < 3, 0.01, 0.005) * by_sh / (size + 1e-12))[met], rtol=1e-3, atol=2e-6)
     np.testing.assert_allclose(np.sqrt(o.square_sh / 0.1)[met], size[met, 0], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("made", "brick"), [(random_tree, 1), (random_tree, 4), (random_cascades, 3)])
+def test_voxels_without_density_are_neighbours_and_absent_ones_are_not(made: Callable[..., NerfTree], brick: int) -> None:
+    tree = made(7, brick=brick, degree=0)
+    density = np.random.default_rng(0).uniform(1, 30, len(tree.density_values)).astype(np.float32)
+    density[::3] = 0
+    tree = replace(tree, density_values=density)
+    cells, sides = cells_of(tree), voxel_sides(tree)
+    values, beside = values_of(cells, density, tree.sh.reshape(len(density), -1)), neighbours_of(cells)
+    thickness = np.maximum(density * sides, MIN_THICKNESS)
+    at = np.concatenate([voxel_coordinates(tree), voxel_cascades(tree)[:, None]], axis=1)
+    number = {tuple(place): n for n, place in enumerate(at.tolist())}
+    counts = []
+    for v in np.random.default_rng(1).choice(len(density), min(40, len(density)), replace=False):
+        found = [number.get(tuple((at[v] + way * np.eye(4, dtype=int)[axis]).tolist())) for axis in range(3) for way in (-1, 1)]
+        wanted = sum(np.log(thickness[v] / thickness[n]) for n in found if n is not None)
+        assert slope_of(values, beside, v, thickness[v], sides[v]) == pytest.approx(wanted, rel=1e-5, abs=1e-5)
+        counts.append(sum(n is not None for n in found))
+    assert max(counts) > min(counts)

@@ -11,10 +11,15 @@ from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corn
 from efficientnerf.backends.numba.vector.halves import mix_pairs, store_halves
 from efficientnerf.backends.numba.vector.maths import (
     absolute,
+    arctangent,
     bits_of,
+    broadcast,
     ceil,
+    exp,
     exp2_neg,
     floor,
+    fma,
+    lane_numbers,
     lowest_bit,
     mask_of,
     maximum,
@@ -27,17 +32,22 @@ from efficientnerf.backends.numba.vector.maths import (
     sum_each,
     sum_lanes,
     to_float32,
+    to_float64,
     to_int32,
     unpack,
 )
 from efficientnerf.backends.numba.vector.memory import (
     gather,
+    gather_groups,
     load,
     load_cycle,
     load_first,
+    load_groups,
     pointer,
     store,
     store_first,
+    store_groups,
+    store_rows,
 )
 
 LANES = 32
@@ -152,6 +162,59 @@ def test_operators_on_lanes_are_numpys(count: int) -> None:
 
 
 @numba.njit(error_model="numpy")
+def in_groups(floats, ints, at, out):  # type: ignore[no-untyped-def]
+    """What comes of groups of four and of two numbers of a packet."""
+    a, b, c, d = load_groups(pointer(floats), 0, 4, LANES)
+    store(pointer(out), 0, a - b + c * d)
+    store_groups(pointer(out), LANES, (a, b))
+    store_groups(pointer(out), 3 * LANES, (a, b, c, d))
+    e, f = gather_groups(pointer(ints), pointer(at), 0, 2, LANES)
+    g, h, i, j = gather_groups(pointer(ints), pointer(at), 0, 4, LANES)
+    for n, value in enumerate((e, f, g, h, i, j)):
+        store(pointer(out), (7 + n) * LANES, to_float32(value))
+
+
+def test_groups_of_numbers_go_into_lanes_and_back() -> None:
+    rng = np.random.default_rng(1)
+    floats, ints, out = rng.normal(size=(LANES, 4)).astype(np.float32), rng.integers(-9999, 9999, 50).astype(np.int32), np.zeros(13 * LANES, np.float32)
+    at = rng.integers(0, 46, LANES).astype(np.int32)
+    in_groups(floats.reshape(-1), ints, at, out)
+    a, b, c, d = floats.T
+    np.testing.assert_allclose(out[:LANES], a - b + c * d, rtol=1e-6, atol=1e-6)
+    assert np.array_equal(out[LANES : 3 * LANES].reshape(-1, 2), floats[:, :2])
+    assert np.array_equal(out[3 * LANES : 7 * LANES], floats.reshape(-1))
+    assert np.array_equal(out[7 * LANES :].reshape(6, -1), [ints[at + n] for n in (0, 1, 0, 1, 2, 3)])
+
+
+@numba.njit(error_model="numpy")
+def in_doubles(doubles, floats, ints, rows, out):  # type: ignore[no-untyped-def]
+    """What operators on lanes of float64 make of two rows of them; rows of eight of the first as float32 and of the three of `floats`; the sum of `ints`."""
+    x, y = load(pointer(doubles), 0, LANES), load(pointer(doubles), LANES, LANES)
+    chosen = select((x < y) & (y != 0.5), 1.0 / x - y, maximum(x * 3.0, floor(y)))
+    store(pointer(out), 0, chosen + sqrt(absolute(x)) * sqrt(2.0))
+    store(pointer(out), LANES, to_float64(to_float32(y)) + lane_numbers(LANES) + broadcast(0.25, LANES))
+    a, b, c = load(pointer(floats), 0, LANES), load(pointer(floats), LANES, LANES), load(pointer(floats), 2 * LANES, LANES)
+    store_rows(pointer(rows), 1, 30, (to_float32(x),), 8)
+    store_rows(pointer(rows), 200, 40, (a, b, c), 8)
+    return sum_lanes(load(pointer(ints), 0, LANES))
+
+
+def test_lanes_of_float64_and_rows_of_pixels() -> None:
+    rng = np.random.default_rng(2)
+    doubles, floats, out = rng.normal(0, 3, 2 * LANES), rng.normal(size=3 * LANES).astype(np.float32), np.zeros((2, LANES))
+    ints, rows = rng.integers(-9999, 9999, LANES).astype(np.int32), np.zeros(360, np.float32)
+    assert in_doubles(doubles, floats, ints, rows, out) == ints.sum()
+    x, y = doubles.reshape(2, LANES)
+    np.testing.assert_array_equal(out[0], np.where(x < y, 1 / x - y, np.maximum(x * 3, np.floor(y))) + np.sqrt(np.abs(x)) * np.sqrt(2.0))
+    np.testing.assert_array_equal(out[1], y.astype(np.float32).astype(np.float64) + np.arange(LANES) + 0.25)
+    expected = np.zeros(360, np.float32)
+    for row in range(4):
+        expected[1 + 30 * row :][:8] = x[8 * row :][:8]
+        expected[200 + 40 * row :][:24] = floats.reshape(3, LANES)[:, 8 * row :][:, :8].T.reshape(-1)
+    np.testing.assert_array_equal(rows, expected)
+
+
+@numba.njit(error_model="numpy")
 def summed(floats, ints, out):  # type: ignore[no-untyped-def]
     x, y = load(pointer(floats), 0, 16), load(pointer(floats), 16, 16)
     store(pointer(out), 0, sum_each((x, y, x * y)))
@@ -172,6 +235,23 @@ def test_sums_over_lanes_parts_of_vectors_and_cycles() -> None:
     np.testing.assert_array_equal(out[16:23], [*(floats[3:8] + np.float32(1)), 1, 1])
     assert (out[23:32] == -5).all()
     np.testing.assert_array_equal(out[32:], floats[2:5][(4 + np.arange(16)) % 3])
+
+
+@numba.njit(error_model="numpy")
+def functions(floats, out):  # type: ignore[no-untyped-def]
+    x = load(pointer(floats), 0, 32)
+    store(pointer(out), 0, exp(x))
+    store(pointer(out), 32, arctangent(absolute(x)))
+    store(pointer(out), 64, fma(x, np.float32(3), x))
+
+
+def test_exponentials_and_arc_tangents() -> None:
+    x, out = np.random.default_rng(5).normal(0, 9, 32).astype(np.float32), np.zeros(96, np.float32)
+    functions(x, out)
+    exact = x.astype(np.float64)
+    np.testing.assert_allclose(out[:32], np.exp(exact), rtol=3e-6)
+    np.testing.assert_allclose(out[32:64], np.arctan(np.abs(exact)), atol=4e-7)
+    np.testing.assert_allclose(out[64:], 4 * exact, rtol=1e-6)
 
 
 @numba.njit(error_model="numpy")

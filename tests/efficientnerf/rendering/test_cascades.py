@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
 from efficientnerf.asset.rendering import Rendering, ray_parts, render, render_rays, render_reference, tree_density
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
@@ -101,6 +103,30 @@ def test_images_match_the_reference(count: int, brick: int, degree: int, model: 
     assert_as_the_reference(tree, render(tree, camera), *rays(camera))
 
 
+@pytest.mark.parametrize("layout", ["floats", "codes"])
+def test_view_colours_of_far_cascades_match_the_reference(layout: str) -> None:
+    """From so far away that colours are summed once for the view."""
+    tree = random_cascades(4, count=3, brick=4, degree=2, share=0.6)
+    if layout == "codes":
+        tree = in_palettes(tree)
+    camera = camera_of(tree, distance=400.0)
+    camera = replace(camera, params=(4000.0, 3600.0, 12.0, 10.0))
+    work = rendering.ray_statistics(tree, camera)
+    assert work[..., 3].sum() == work[..., 2].sum() > 0  # there every sample has its colour
+    assert_as_the_reference(tree, render(tree, camera), *rays(camera))
+
+
+def test_normals_are_those_of_the_cascade_that_is_hit() -> None:
+    tree = random_cascades(5, count=3, brick=4, share=0.5)
+    origins, directions = many_rays(tree, 200)
+    outputs = render_rays(tree, origins, directions)
+    hit = np.isfinite(outputs.depth)
+    at = origins[hit] + outputs.depth[hit, None] * directions[hit]
+    cascade = point_cascades(tree, at)
+    assert all((cascade == n).sum() > 20 for n in range(3))
+    assert np.quantile(np.abs(outputs.normal[hit] - normal_at(tree, at)), 0.97) < 1e-3
+
+
 @pytest.mark.parametrize("background", [(0.2, 0.5, 0.9)])
 def test_a_background_takes_the_place_of_the_environment(background: tuple[float, float, float]) -> None:
     tree = random_cascades(1)
@@ -135,6 +161,28 @@ def test_the_environment_is_seen_along_the_ray_through_what_is_not_opaque(lookup
     assert np.array_equal(seen.opacity, alone.opacity)
 
 
+def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = random_cascades(5, count=4, brick=4, degree=2, share=0.5)
+    packed_of(tree)
+    camera, calls = camera_of(tree, distance=1.7), []
+    usual, far = render(tree, camera, supersample=2), render(tree, replace(camera, world_from_camera=camera_of(tree, distance=90.0).world_from_camera))
+    whole = rendering.render_batch
+
+    def in_small_pieces(*given: Any) -> bool:
+        calls.append(len(given))
+        return bool(whole(*given[:9], 500, *given[10:]))
+
+    monkeypatch.setattr(rendering, "render_batch", in_small_pieces)
+    monkeypatch.setattr("numba.get_num_threads", lambda: 3)
+    for expected, found in (
+        (usual, render(tree, camera, supersample=2)),
+        (far, render(tree, replace(camera, world_from_camera=camera_of(tree, distance=90.0).world_from_camera))),
+    ):
+        for name in FIELDS:
+            assert np.array_equal(getattr(expected, name), getattr(found, name)), name
+    assert len(calls) > 20
+
+
 @pytest.mark.parametrize(("model", "share", "distance"), [("PINHOLE", 0.01, 9.0), ("OPENCV", 0.1, 1.5), ("OPENCV_FISHEYE", 0.1, 0.1)])
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_cascades(11, count=4, cells=6, brick=3, share=share)
@@ -145,6 +193,43 @@ def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, d
     usual, other = render(tree, camera), render(timid, camera)
     for name in FIELDS:
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize(("distance", "focal"), [(0.02, 8.0), (0.8, 200.0), (2.5, 20.0)])
+def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their colours are not summed. All samples have colours of the view here, and so would show what was left out."""
+    tree = random_cascades(8, count=3, cells=20, brick=2, degree=2, share=0.1)
+    camera = camera_of(tree, distance=distance)
+    camera = replace(camera, params=(focal, focal, *camera.params[2:]))
+    monkeypatch.setattr(rendering, "VOXELS_PER_SLOPE", -100.0)
+    filled, whole, huge = [], rendering.compute_view_colours, np.float16(6e4).view(np.uint16)
+
+    def over_huge(*given: Any) -> None:
+        if not filled:
+            given[-1][:-1] = huge
+        whole(*given)
+        filled.append((given[-1][:-1, 1] != huge).mean())
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rendering, "compute_view_colours", over_huge)
+        usual = render(tree, camera)
+    monkeypatch.setattr(rendering, "_cone", lambda camera: rendering.EVERYWHERE)
+    other = render(tree, camera)
+    assert other.opacity.max() > 0.5
+    assert focal < 200 or filled[-1] < 0.9
+    for name in FIELDS:
+        assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
+def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
+    tree = random_cascades(0, count=3)
+    origins, directions = np.full((4, 3), 0.5), np.full((4, 3), 0.5)
+    origins[0, 1], origins[1, 2], directions[2, 0], directions[3] = np.nan, np.inf, np.nan, np.inf
+    found = render_rays(tree, origins, directions)
+    assert not found.opacity.any()
+    assert np.isfinite(found.colour).all()
+    with pytest.raises(ValueError, match="not finite"):
+        render(tree, replace(camera_of(tree), params=(20.0, np.nan, 10.0, 10.0)))
 
 
 @pytest.mark.parametrize("least", [-1e-42, 1e-31, 0.0])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.geometry.spaces import BoundedSpace
+from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
+from efficientnerf.rendering.field_renderer import valid_count
 from efficientnerf.sampling.importance import IMPORTANCE_FLOOR, importance_samples
 from efficientnerf.sampling.pivotal import pivotal_samples
 from efficientnerf.sampling.samples import Samples
@@ -92,6 +95,47 @@ def test_importance_is_the_inverse_of_the_distribution() -> None:
     torch.testing.assert_close(SPACE.world(fine.point)[:, 0], torch.tensor(expected, dtype=torch.float64))
 
 
+def same_up_to(capacity: int, padded: Samples, exact: Samples) -> None:
+    """Filled from the beginning on, zeros behind; rays that end beyond the capacity are not complete."""
+    kept = min(capacity, len(exact.start))
+    assert torch.equal(padded.first, exact.first.clamp(max=kept))
+    assert torch.equal(padded.complete, exact.first[1:] <= capacity)
+    last = int(padded.first[:-1][padded.complete.logical_not()].min()) if not padded.complete.all() else kept  # a ray that is cut ends elsewhere
+    for ours, theirs in zip(padded[1:5], exact[1:5], strict=True):
+        assert len(ours) <= capacity
+        torch.testing.assert_close(ours[:last], theirs[:last], rtol=0, atol=1e-12)
+        assert not ours[kept:].any()
+
+
+@pytest.mark.parametrize(("capacity", "outside"), [(30, False), (70, True), (5000, True)])
+def test_a_capacity_pads_or_cuts_even_samples(outside: bool, capacity: int) -> None:
+    o, d, near, far = rays()
+    jitter = torch.rand(len(o), 10, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    exact, at = stratified_samples(SPACE, o, d, near, far, jitter, outside=outside)
+    padded, also_at = stratified_samples(SPACE, o, d, near, far, jitter, outside=outside, capacity=capacity)
+    same_up_to(capacity, padded, exact)
+    assert torch.equal(also_at[: len(at)], at[:capacity])
+    if outside and capacity >= 120:  # nothing is left out, so nothing is padded
+        assert len(padded.start) == 120
+
+
+@pytest.mark.parametrize(("padding", "capacity"), [(0, 40), (9, 90), (9, 5000)])
+def test_a_capacity_pads_or_cuts_samples_by_importance(padding: int, capacity: int) -> None:
+    """Of coarse samples that are padded themselves, or not; some rays have none, also the last."""
+    coarse, at = pruned()
+    o, d, _, _ = rays()
+    generator = torch.Generator().manual_seed(4)
+    weight = torch.rand(len(at) + padding, generator=generator, dtype=torch.float64)
+    quantile = torch.rand(len(o), 7, generator=generator, dtype=torch.float64)
+    exact = importance_samples(SPACE, o, d, coarse, at, weight[: len(at)], quantile)
+    more = Samples(coarse.first, *(torch.cat([t, t.new_zeros(padding, *t.shape[1:])]) for t in coarse[1:5]), coarse.tried)
+    padded = importance_samples(SPACE, o, d, more, torch.cat([at, at.new_zeros(padding)]), weight, quantile, capacity)
+    assert 90 < len(exact.start) < 5000
+    same_up_to(capacity, padded, exact)
+    if capacity == 5000 and not padding and (coarse.first.diff() > 0).all():
+        assert len(padded.start) == len(exact.start)
+
+
 def test_where_samples_lie_is_differentiable_in_the_rays() -> None:
     """Points and lengths of all samplers by origin, direction, near and far, against finite differences in float64."""
     o, d, near, far = (t[:3].clone() for t in rays())
@@ -135,3 +179,40 @@ def test_every_strategy_serves_every_field(field: str, strategy: str, contracted
     assert (len(first.coarse.start) == 0) == (strategy == "uniform")
     still, too = (render_rays(m, *bundle, offset, behind) for _ in range(2))  # renders are not random
     assert torch.equal(still.fine_colour, too.fine_colour)
+
+
+def test_counts_are_those_of_the_strategies() -> None:
+    """Between a stated near and far every ray has N_c samples, N_c + N_f in NeRF's fine stage and in uniform sampling."""
+    from efficientnerf.model import model
+    from tests.efficientnerf.balls import settings
+
+    some = pixels()
+    o, d, near, far, _ = some.bundle(some.choose(20, np.random.default_rng(0)))
+    near[:], far[:] = 1.0, 5.0
+    bundle = [torch.from_numpy(a) for a in (o, d, near, far)]
+    found = {}
+    for strategy in ("uniform", "hierarchical", "efficient"):
+        made = settings(
+            field="mlp", sampling=strategy, num_importance_samples=6, num_coarse_samples=10, near_plane=1.0, far_plane=5.0, exploration_fraction=0.0
+        )
+        m = model(SPACE, made, (1.0, 1.0, 1.0), "cpu", (1.0, 5.0))
+        assert m.step == pytest.approx(0.4)
+        found[strategy] = render_rays(m, *bundle, torch.full((20,), 0.5), torch.ones(20, 3))
+    assert len(found["uniform"].fine.start) == len(found["hierarchical"].fine.start) == 20 * 16
+    assert len(found["hierarchical"].coarse.start) == 20 * 10
+    assert 0 < len(found["efficient"].coarse.start) <= 20 * math.ceil(2 * math.sqrt(3) / 0.4)  # those in the box
+    with pytest.raises(ValueError, match="constant background"):
+        model(ContractedSpace(BOUNDS), settings(near_plane=1.0, far_plane=5.0), None, "cpu", (1.0, 5.0))
+
+
+@pytest.mark.parametrize("rule", ["momentum", "maximum"])
+def test_valid_samples_are_those_that_the_voxels_would_keep(rule: str) -> None:
+    """Equation 5 on a trained NeRF: density above zero, read as the voxels read it."""
+    m = untrained(field="mlp", sampling="hierarchical", occupancy_rule=rule, num_importance_samples=6, num_coarse_samples=10)
+    bundle = [torch.from_numpy(a) for a in pixels().bundle(np.arange(100, 140))[:4]]
+    seen = render_rays(m, *bundle, torch.full((40,), 0.5), torch.ones(40, 3))
+    raw = seen.coarse_raw[:, 0].detach()
+    expected = int((raw > 0).sum()) if rule == "momentum" else int((torch.nn.functional.softplus(raw) > m.voxels.threshold).sum())
+    assert valid_count(m, seen) == expected > 0
+    assert valid_count(m, seen._replace(coarse_raw=seen.coarse_raw * 0 - 50)) == 0
+    assert valid_count(untrained(), seen) == len(seen.coarse.start)

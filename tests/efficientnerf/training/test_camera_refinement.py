@@ -9,16 +9,20 @@ import pytest
 import torch
 
 from efficientnerf.geometry.cameras import Camera, project, rays
-from efficientnerf.training.alignment import EVERY
+from efficientnerf.training.alignment import EVERY, refine_cameras
 from efficientnerf.training.camera_refinement import (
     Alignment,
     CameraCorrections,
+    add_round,
     corrected,
     motion,
     rotation_matrix,
     rotation_vector,
+    solve,
     take_similarity_out,
 )
+from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.exposure.model import exposure_of
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
@@ -80,6 +84,32 @@ def alignment(true: Camera, found: Camera, rng: np.random.Generator) -> Alignmen
     return Alignment(at, seen - shade(point), gradient, point)
 
 
+def test_cameras_are_found_against_a_perfect_field() -> None:
+    rng, true = np.random.default_rng(4), cameras(6, 64)
+    # The prior holds the cameras, so that a tenth of the error may be left.
+    given = [moved(camera, rng, 0.7) for camera in true]
+    given = [replace(camera, params=(camera.params[0] * 1.002, *camera.params[1:])) for camera in given]
+    c = CameraCorrections.none(given)
+    for _ in range(12):
+        add_round(c, [alignment(a, b, rng) for a, b in zip(true, c.cameras, strict=True)])
+        solve(c)
+    assert error(c.cameras, true) < 0.35 * error(given, true)
+    assert solve(c) < 0.1
+
+
+def test_what_all_photographs_agree_on_stays() -> None:
+    """No residual, no motion; and a camera of which nothing was rendered stays where it is, but for the similarity."""
+    rng, true = np.random.default_rng(5), cameras(4, 64)
+    c = CameraCorrections.none(true)
+    add_round(c, [alignment(camera, camera, rng) for camera in true])
+    assert solve(c) < 1e-6
+    assert error(c.cameras, true) < 1e-6
+    c = CameraCorrections.none(true)
+    add_round(c, [None] * 4)
+    assert solve(c) == 0
+    assert not c.pose.any()
+
+
 def test_the_similarity_of_the_scene_stays() -> None:
     """All cameras turned, moved and scaled alike show the same photographs: nothing may be left of that."""
     c = CameraCorrections.none(cameras(5, 64))
@@ -96,6 +126,31 @@ def test_the_similarity_of_the_scene_stays() -> None:
 
 def photographs(true: list[Camera], given: list[Camera]) -> Pixels:
     return Pixels(given, [photograph(camera) for camera in true], [None] * len(true), np.full(len(true), 1.0), np.full(len(true), 50.0))
+
+
+@pytest.mark.parametrize("changes", [{}, {"sampling": "uniform", "field": "mlp"}], ids=["hash", "mlp"])
+def test_pixels_of_a_device_are_refined_alike(changes: dict[str, str]) -> None:
+    """Also with gains of the photographs, and with a field of which nothing is pruned."""
+    made = cameras(3, 16)
+    m = untrained(contracted=True, initial_density=3.0, **changes)
+    exposure = exposure_of(made, np.array([[0.05, 0.0, 0.0], [0.0, 0.0, 0.05], [-0.05, 0.0, -0.05]])).detached
+    found = []
+    for on_device in (False, True):
+        p = photographs(made, made)
+        source = DevicePixels(p, "cpu") if on_device else p
+        c = CameraCorrections.none(made)
+        moved_by = refine_cameras(m, p, source, c, np.random.default_rng(9), exposure)
+        assert 0 < moved_by <= 1
+        bundle = source.bundle(np.arange(0, 768, 7))
+        expected = photographs(made, c.cameras).bundle(np.arange(0, 768, 7))
+        for a, b in zip(bundle, expected, strict=True):
+            np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-6, atol=1e-6)
+        found.append(c)
+    np.testing.assert_allclose(found[0].pose, found[1].pose, rtol=1e-9, atol=1e-12)
+    plain = CameraCorrections.none(made)
+    p = photographs(made, made)
+    refine_cameras(m, p, p, plain, np.random.default_rng(9), None)
+    assert np.abs(plain.pose - found[0].pose).max() > 1e-9
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from efficientnerf.training import loop
 from efficientnerf.training.camera_refinement import rotation_matrix, rotation_vector
 from efficientnerf.training.loop import Trainer, restore, state_of, trainer
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.view_checks import residuals
 from efficientnerf.training.view_checks.checks import (
     MIN_VIEWS,
     MOST,
@@ -101,6 +102,15 @@ def test_turned_cameras_are_left_out_and_their_poses_found(field: Model) -> None
         assert c.replaced[n]
         assert angle(CAMERAS[n], replace(CAMERAS[n], world_from_camera=c.pose[n])) < 3
         assert c.evidence[n, 3] < 0.3 < c.evidence[n, 1]
+
+
+def test_swapped_photographs_are_left_out_and_their_cameras_found(field: Model) -> None:
+    cameras = list(CAMERAS)
+    cameras[4], cameras[15] = (replace(CAMERAS[a], world_from_camera=CAMERAS[b].world_from_camera) for a, b in ((4, 15), (15, 4)))
+    c = found(field, cameras, PICTURES)
+    assert np.flatnonzero(c.left_out).tolist() == [4, 15]
+    for n in (4, 15):
+        assert angle(CAMERAS[n], replace(CAMERAS[n], world_from_camera=c.pose[n])) < 3
 
 
 def test_a_photograph_of_something_else_is_left_out_and_no_pose_is_believed(field: Model) -> None:
@@ -242,3 +252,21 @@ def test_errors_do_not_depend_on_exposure_and_shifts_are_found() -> None:
     moved = turned(CAMERAS[0], np.array([5.0, -3.0]))
     at, _ = project(CAMERAS[0], (moved.centre + moved.forward)[None])
     np.testing.assert_allclose(at[0], [SIDE / 2 + 5, SIDE / 2 - 3], atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(300, 7), (64, 48)])
+def test_cells_are_the_same_of_a_photograph_as_of_bands_of_it(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    height, width = size
+    image = np.random.default_rng(0).integers(0, 255, (height, width, 4), np.uint8)
+    seen_by = Camera("a.png", width, height, "SIMPLE_PINHOLE", (50.0, width / 2, height / 2), np.eye(4))
+    pixels = Pixels([seen_by], [image], [image[..., 0] > 40], np.ones(1), np.full(1, 2.0))
+    monkeypatch.setattr(residuals, "MAX_CELLS", 100)
+    monkeypatch.setattr(residuals, "MIN_CELLS", 50)
+    every = residuals.cells_of(pixels, np.ones(3))
+    monkeypatch.setattr(residuals, "ROWS_AT_A_TIME", 1)
+    bands = residuals.cells_of(pixels, np.ones(3))
+    assert every.size == bands.size
+    assert every.size[0] > 1
+    for a, b in ((every.colour, bands.colour), (every.weight, bands.weight)):
+        np.testing.assert_array_equal(a[0], b[0])
+    assert every.weight[0].shape == residuals.middles(seen_by, every.size[0])[1]

@@ -79,6 +79,17 @@ def test_hostile_values_in_transforms(tmp_path: Path, kind: str, what: str) -> N
         assert_read_or_refused(lambda: json.dumps(describe_source(source), allow_nan=False))
 
 
+def test_what_a_list_names_is_searched_for_in_bounded_time(tmp_path: Path) -> None:
+    source = captures.nerfstudio(tmp_path / "source")
+    document = json.loads((source / "transforms.json").read_text())
+    names = ["a/" * 100_000 + "b.png", "\\".join(["a"] * 2000), "/" + "a/" * 2000 + "b.png"] * 20
+    document["frames"] += [{**document["frames"][0], "file_path": name} for name in names]
+    (source / "transforms.json").write_text(json.dumps(document))
+    capture = importers.IMPORTERS["nerfstudio"].read(source, Settings())
+    assert len(capture.rejected) == len(names)
+    assert max(len(name) for name, _ in capture.rejected) <= 200
+
+
 @pytest.mark.parametrize("what", HOSTILE)
 def test_hostile_values_in_camera_paths(tmp_path: Path, what: str) -> None:
     camera = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50.0}
@@ -130,6 +141,15 @@ def test_the_header_of_poses_bounds_is_not_believed(tmp_path: Path, data: bytes)
     finally:
         tracemalloc.stop()
     assert str(caught.value).isprintable()
+
+
+def test_other_types_and_orders_of_poses_bounds_are_read(tmp_path: Path) -> None:
+    from stages.formats.importers.llff import read_rows
+
+    rows = captures.llff_rows(captures.cameras())
+    for array in (rows.astype("<f4"), rows.astype(">f8"), np.asfortranarray(rows), rows.astype(np.float16)):
+        np.save(tmp_path / "a.npy", array)
+        np.testing.assert_array_equal(read_rows(tmp_path / "a.npy"), array.astype(np.float64))
 
 
 # --- COLMAP

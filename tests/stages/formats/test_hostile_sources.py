@@ -20,7 +20,7 @@ from pipeline.stage import Job
 from stages.formats import importers
 from stages.formats.importers.description import describe_source
 from stages.formats.importers.source import Source
-from stages.io import scene
+from stages.io import pictures, scene
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
 from tests.stages import captures
@@ -99,10 +99,22 @@ def test_no_link_out_of_the_source_is_followed(tmp_path: Path, opened: list[str]
         path.symlink_to(elsewhere)
     settings = Settings()
     for attempt in (lambda: importers.files(source, settings), lambda: run(source, tmp_path / "out"), lambda: describe_source(source)):
-        with pytest.raises(BadInput, match="--allow-outside"):
+        with pytest.raises(BadInput, match=r"leads out of the source folder .* pass --allow-outside"):
             attempt()
     assert not [path for path in opened if path.startswith(os.path.realpath(tmp_path / "elsewhere"))]
     assert len(run(source, tmp_path / "allowed", allow_outside=True)[0].views) == 6
+
+
+def test_a_link_is_followed_once(tmp_path: Path) -> None:
+    source = captures.nerfstudio(tmp_path / "source")
+    image = source / "images/img_2.png"
+    os.replace(image, source / "kept.png")
+    image.symlink_to(source / "kept.png")
+    capture = importers.IMPORTERS["nerfstudio"].read(source, Settings())
+    image.unlink()
+    image.symlink_to(captures.write_picture(tmp_path / "secret.png", RED))
+    photo = next(photo for photo in capture.photos if photo.camera.name.endswith("img_2.png"))
+    assert photo.image == source / "kept.png"
 
 
 # --- names
@@ -156,3 +168,13 @@ def test_a_run_below_its_source_is_no_part_of_it(tmp_path: Path) -> None:
     described = describe_source(source)
     assert described["count"] == 3
     assert "shots/run: a run inside the source folder; what was made there is not read." in described["warnings"]
+
+
+def test_pictures_are_read_where_the_gate_leads(tmp_path: Path) -> None:
+    """Headers, masks and pixels are asked for by paths without links."""
+    source = captures.colmap_bin(tmp_path / "source")
+    (source / "images").rename(source / "stored")
+    (source / "images").symlink_to("stored")
+    capture = importers.IMPORTERS["colmap"].read(source, Settings())
+    assert {photo.image.parent for photo in capture.photos} == {source / "stored"}
+    assert all(pictures.read_header(photo.image).size == (32, 24) for photo in capture.photos)

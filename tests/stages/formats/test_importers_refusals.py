@@ -13,9 +13,10 @@ import pytest
 
 from pipeline.errors import BadInput
 from stages.formats import importers
-from stages.formats.importers import llff
+from stages.formats.importers import llff, transforms
+from stages.io.json_file import read_json
 from tests.stages import captures
-from tests.stages.captures import Settings
+from tests.stages.captures import HEIGHT, WIDTH, Settings
 from tests.stages.exports import read
 
 
@@ -33,6 +34,18 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], Any], name: str = "tra
     change(document)
     (folder / name).write_text(json.dumps(document))
     return folder
+
+
+def test_folders_without_a_data_set(tmp_path: Path) -> None:
+    refusal(tmp_path / "absent", "absent")
+    refusal(tmp_path, "photographs")
+    (tmp_path / "1.psd").write_bytes(b"x")
+    refusal(tmp_path, "1 .psd")
+    folder = captures.nerfstudio(tmp_path / "a")
+    refusal(folder / "transforms.json", "transforms.json", "folder")
+    for name in ("llff", "colmap"):
+        with pytest.raises(BadInput, match="--as"):
+            importers.IMPORTERS[name].read(folder, Settings())
 
 
 # --- JSON
@@ -54,6 +67,14 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], Any], name: str = "tra
 def test_json_that_is_no_data_set(tmp_path: Path, text: bytes, named: str) -> None:
     (tmp_path / "transforms.json").write_bytes(text)
     refusal(tmp_path, named, "transforms.json")
+
+
+def test_json_is_bounded(tmp_path: Path) -> None:
+    path = captures.nerfstudio(tmp_path / "a") / "transforms.json"
+    with pytest.raises(BadInput, match="at most 5"):
+        transforms.read_document(path, max_frames=5)
+    with pytest.raises(BadInput, match="100 bytes"):
+        read_json(path, "Repair it.", limit=100)
 
 
 SHEAR = np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -99,6 +120,18 @@ def test_matrices_are_rigid_motions_however_they_are_rounded(tmp_path: Path) -> 
 )
 def test_lenses(tmp_path: Path, change: dict[str, Any], named: str) -> None:
     refusal(captures.nerfstudio(tmp_path / "a", **({"camera_model": "OPENCV"} | change)), named)
+
+
+def test_angles_of_view_and_no_focal_length(tmp_path: Path) -> None:
+    for angle in (0.0, 3.2, -0.5):
+        folder = captures.blender(tmp_path / str(angle))
+        for name in ("transforms_train.json", "transforms_test.json"):
+            edit(folder, lambda d, angle=angle: d.update(camera_angle_x=angle), name)
+        refusal(folder, "camera_angle_x")
+    refusal(edit(captures.nerfstudio(tmp_path / "a"), lambda d: [d.pop("fl_x"), d.pop("fl_y")]), "no focal length")
+    assert WIDTH / HEIGHT == 4 / 3
+    refusal(captures.nerfstudio(tmp_path / "aspect", w=400, h=225), "400x225", "32x24")
+    assert read(captures.nerfstudio(tmp_path / "near", w=400, h=301)).photos[0].camera.width == 32
 
 
 def test_files_missing_on_disk(tmp_path: Path) -> None:
@@ -182,6 +215,19 @@ def test_poses_bounds_that_are_none(tmp_path: Path) -> None:
 # --- COLMAP
 
 
+def test_colmap_names_absent_images(tmp_path: Path) -> None:
+    folder = captures.colmap_bin(tmp_path / "a")
+    (folder / "images/img_0.png").unlink()
+    capture = read(folder)
+    assert len(capture.photos) == 5
+    assert any("1 of 6" in warning and "img_0.png" in warning for warning in capture.warnings)
+    assert capture.points.tracks[0] == (0, 1, 2, 3, 4)
+    refusal(folder, "--strict", strict=True)
+    for path in (folder / "images").iterdir():
+        path.unlink()
+    refusal(folder, "6 of 6", "`images`")
+
+
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_colmap_binary_truncated_anywhere(tmp_path: Path, name: str) -> None:
     folder = captures.colmap_bin(tmp_path / "a")
@@ -203,4 +249,51 @@ def test_colmap_binary_with_impossible_content(tmp_path: Path, at: int, data: by
     path = folder / "sparse/0" / file
     whole = path.read_bytes()
     path.write_bytes(whole[:at] + data + whole[at + len(data) :])
+    refusal(folder, named)
+
+
+@pytest.mark.parametrize(
+    ("name", "cut", "named"),
+    [
+        ("cameras.txt", " 12.0", "SIMPLE_PINHOLE"),
+        ("images.txt", " 7 img_3.png", "line 9"),
+        ("images.txt", " -1", "POINT3D_ID"),
+        ("points3D.txt", " 16 59\n", None),
+        ("points3D.txt", " 0.5 11 3 ", "POINT3D_ID"),
+    ],
+)
+def test_colmap_text_truncated(tmp_path: Path, name: str, cut: str, named: str | None) -> None:
+    folder = captures.colmap_txt(tmp_path / "a")
+    path = folder / "sparse/0" / name
+    text = path.read_text()
+    path.write_text(text[: text.index(cut)])
+    if named is None:
+        assert read(folder).points is not None, "one observation fewer, and no way to tell"
+    else:
+        refusal(folder, named, name)
+    lines = text.splitlines(keepends=True)
+    path.write_text("".join(lines[: -2 if name == "images.txt" else -1]))
+    refusal(folder, "truncated", name)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "named"),
+    [
+        ("cameras.txt", "SIMPLE_PINHOLE", "FOV", "FOV"),
+        ("cameras.txt", "40.0", "0.0", "focal length 0"),
+        ("cameras.txt", "40.0", "nan", "finite"),
+        ("cameras.txt", "40.0", "forty", "line 2"),
+        ("cameras.txt", "32 24", "32 -24", "32x-24"),
+        ("cameras.txt", "32 24", "48 24", "48x24"),
+        ("cameras.txt", "7 SIMPLE", "8 SIMPLE", "camera 7"),
+        ("images.txt", "img_3.png", "../../../x.png", "--allow-outside"),
+        ("images.txt", "11 ", "eleven ", "not a whole number"),
+    ],
+)
+def test_colmap_text_with_impossible_content(tmp_path: Path, name: str, old: str, new: str, named: str) -> None:
+    folder = captures.colmap_txt(tmp_path / "a")
+    path = folder / "sparse/0" / name
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
     refusal(folder, named)

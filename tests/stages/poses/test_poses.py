@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,16 @@ import pytest
 from PIL import Image
 
 from efficientnerf.geometry.cameras import project
-from pipeline.errors import BadInput
-from pipeline.stage import Job
+from pipeline.errors import BadInput, UsageError
+from pipeline.stage import Job, settings_from
 from stages.io import scene
 from stages.io.capture import Capture, Photo
 from stages.io.scene import Scene
 from stages.poses import run as poses
+from stages.poses.run import assign_splits
 from stages.poses.settings import PosesSettings
 from tests.stages import captures
-from tests.stages.captures import HEIGHT, SHARED, WIDTH
+from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS
 
 
 def run(source: Path, out: Path, **settings: Any) -> tuple[Scene, list[str]]:
@@ -28,6 +30,45 @@ def run(source: Path, out: Path, **settings: Any) -> tuple[Scene, list[str]]:
     job = Job(settings=PosesSettings(**settings), out=out / "poses", work=out / "work", source=source, stage="poses", report=events.append)
     poses.run(job)
     return scene.load(out / "poses"), [event["text"] for event in events if event["event"] == "warning"]
+
+
+@pytest.mark.parametrize("how", WRITERS)
+def test_every_format_becomes_a_scene(how: str, tmp_path: Path) -> None:
+    source = WRITERS[how][1](tmp_path / "source")
+    made, warnings = run(source, tmp_path)
+    shutil.rmtree(source)
+    folder = tmp_path / "poses"
+    assert not warnings
+    assert len(made.views) == 6
+    assert {view.name.rsplit("/", 1)[-1] for view in made.views} == {f"img_{i}.png" for i in range(6)}
+    assert [view.split for view in made.views].count("test") == (2 if how == "blender" else 1)
+    np.testing.assert_allclose(np.abs(made.bounds).max(), 1)
+    truth = {camera.name: camera for camera in captures.cameras()}
+    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
+    for view in made.views:
+        assert scene.read_image(folder, view).shape == (HEIGHT, WIDTH, 4 if how == "blender" else 3)
+        camera = truth[view.name.rsplit("/", 1)[-1]]
+        np.testing.assert_allclose(view.source_camera.world_from_camera, camera.world_from_camera, atol=1e-6)
+        # The same point, mapped to the training frame, is seen on the same spot.
+        np.testing.assert_allclose(project(view.camera, made.world_from_capture.points(inside))[0], project(camera, inside)[0], atol=1e-4)
+    assert made.points == (WRITERS[how][0] == "colmap")
+    if made.points:
+        points = scene.read_points(folder)
+        np.testing.assert_allclose(np.sort(made.world_from_capture.inverse().points(points.xyz), 0), np.sort(captures.sparse_points(), 0))
+    with Image.open(folder / "contact_sheet.png") as sheet:
+        assert sheet.width > 500
+    report = json.loads((folder / "report.json").read_text())
+    assert len(report["registered"]) == 6
+    assert report["rejected"] == []
+
+
+def test_the_same_source_gives_the_same_bytes(tmp_path: Path) -> None:
+    source = captures.colmap_txt(tmp_path / "source")
+    for out in ("a", "b"):
+        run(source, tmp_path / out)
+    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
+    assert len(files) == 13
+    assert all((tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes() for path in files)
 
 
 def test_unchanged_images_are_copied_and_others_are_lossless(tmp_path: Path) -> None:
@@ -45,6 +86,20 @@ def test_unchanged_images_are_copied_and_others_are_lossless(tmp_path: Path) -> 
     np.testing.assert_array_equal(scene.read_image(folder, made.views[2]), np.repeat(captures.picture(2)[..., :1], 3, -1))
     assert scene.read_image(folder, made.views[3]).shape == (HEIGHT, WIDTH, 3)
     assert len({view.camera.world_from_camera.shape for view in made.views}) == 1
+
+
+def test_jpegs_are_copied_and_reduced_ones_become_png(tmp_path: Path) -> None:
+    source = captures.llff(tmp_path / "source")
+    for index in range(6):
+        (source / f"images_4/img_{index}.png").unlink()
+        captures.write_picture(source / f"images_4/img_{index}.jpg", captures.picture(index))
+    made, _ = run(source, tmp_path / "a")
+    assert made.views[0].image == "images/img_0.jpg"
+    assert (tmp_path / "a/poses/images/img_0.jpg").read_bytes() == (source / "images_4/img_0.jpg").read_bytes()
+    small, _ = run(source, tmp_path / "b", max_image_size=16)  # below the limit of the setting, which only the command line checks
+    assert small.views[0].image == "images/img_0.png"
+    assert (small.views[0].camera.width, small.views[0].camera.height) == (16, 12)
+    assert small.views[0].source_camera.width == WIDTH
 
 
 def test_exif_rotation_is_applied(tmp_path: Path) -> None:
@@ -103,6 +158,61 @@ def test_other_alpha_masks(tmp_path: Path, opaque: int, without: int, alpha: str
             np.testing.assert_array_equal(mask, np.broadcast_to(np.arange(WIDTH) >= WIDTH // 2, (HEIGHT, WIDTH)))
 
 
+@pytest.mark.parametrize("masks", ["auto", "ignore"])
+def test_masks_are_made_from_a_green_screen(tmp_path: Path, masks: str) -> None:
+    """Of photographs that have none; as silhouettes, unless they are to be ignored."""
+    made = captures.cameras()
+    source = captures.nerfstudio(tmp_path / "nerfstudio", made)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    for index, camera in enumerate(made):
+        inside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < 6 + index % 2
+        captures.write_picture(source / "images" / camera.name, np.where(inside[..., None], captures.picture(index), np.uint8([60, 190, 80])))
+    with pytest.raises(UsageError, match="#rrggbb"):
+        settings_from(PosesSettings, {"mask_from": "purple"})
+    plain, _ = run(source, tmp_path / "a")
+    assert plain.background is None
+    assert all(view.mask is None for view in plain.views)
+    keyed, _ = run(source, tmp_path / "b", mask_from="green", masks=masks)
+    assert keyed.background == (None if masks == "ignore" else (1.0, 1.0, 1.0))
+    assert all(view.mask is not None for view in keyed.views) == (masks == "ignore")
+    with pytest.raises(BadInput, match="--mask #800080"):
+        run(source, tmp_path / "c", mask_from="#800080")
+
+
+def test_masks_of_another_size(tmp_path: Path) -> None:
+    source = captures.colmap_bin(tmp_path / "source")
+    mask = np.zeros((2 * HEIGHT, 2 * WIDTH), np.uint8)
+    mask[:HEIGHT] = 255
+    captures.write_picture(source / "masks/img_0.png", mask)
+    made, warnings = run(source, tmp_path / "a")
+    assert any("the mask is 64x48, its image 32x24; it was resized" in warning for warning in warnings)
+    np.testing.assert_array_equal(scene.read_mask(tmp_path / "a/poses", made.views[0]), mask[::2, ::2] == 255)
+    captures.write_picture(source / "masks/img_0.png", mask[:, :40])
+    with pytest.raises(BadInput, match=r"masks/img_0.png: .*40x48.*32x24"):
+        run(source, tmp_path / "b")
+    (source / "masks/img_0.png").write_bytes(b"nothing")
+    made, warnings = run(source, tmp_path / "c")
+    assert len(made.views) == 5
+    assert any("its mask img_0.png is unreadable" in warning for warning in warnings)
+
+
+def photos(splits: list[str | None]) -> list[Photo]:
+    return [Photo(camera, Path(camera.name), split=split) for camera, split in zip(captures.cameras(len(splits)), splits, strict=True)]
+
+
+def test_splits() -> None:
+    assert assign_splits(photos(["train", "train", "test", "val"]), 8) == ["train", "train", "test", "val"]
+    assert assign_splits(photos([None] * 9), 8) == ["test", *["train"] * 7, "test"]
+    assert assign_splits(photos(["train"] * 9), 8) == ["test", *["train"] * 7, "test"], "nothing is held back by the source"
+    assert assign_splits(photos([None] * 3), 2).count("train") == 2
+    assert assign_splits(photos([None] * 2), 8) == ["train"] * 2
+    said: list[str] = []
+    assert assign_splits(photos(["test"] * 8 + ["train"]), 8, said.append).count("train") == 7
+    assert "at least 2" in said[0]
+    assert assign_splits(photos(["train", "train", "test", None]), 8, said.append)[3] == "train"
+    assert "1 images are in none" in said[1]
+
+
 def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = tmp_path / "source"
     made = captures.cameras()
@@ -128,6 +238,12 @@ def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest
     assert json.loads((tmp_path / "a/poses/report.json").read_text())["rejected"] == [{"name": "img_5.png", "reason": "overlaps no other"}]
     with pytest.raises(BadInput, match=r"img_5.png"):
         run(source, tmp_path / "b", strict=True)
+
+
+def test_a_box_and_an_up_axis_can_be_set(tmp_path: Path) -> None:
+    made, _ = run(captures.colmap_bin(tmp_path / "source"), tmp_path, up="z", crop_box=(-1.0, -0.5, -0.25, 1.0, 0.5, 0.25))
+    np.testing.assert_allclose(made.bounds, [[-1, -0.5, -0.25], [1, 0.5, 0.25]], atol=1e-12)
+    np.testing.assert_allclose(made.world_from_capture.matrix(), np.eye(4), atol=1e-12)
 
 
 def test_real_photographs_with_colmap_cameras(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -45,6 +46,17 @@ def test_a_run_and_its_summary(enerf: Enerf, toys: Path, tmp_path: Path) -> None
     assert not (tmp_path / "other").exists()
 
 
+def test_the_last_word_wins(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text('preset = "tiny"\nseed = 5\n[train]\nrate = 7\niterations = 8\n', encoding="utf-8")
+    run = tmp_path / "run"
+    assert enerf("run", toys, "--out", run, "--config", config, "--set", "train.iterations=9", "--until", "poses").code == 0
+    assert recorded(run)["train"] == {"iterations": 9, "rate": 7.0, "seed": 5, "fail": ""}
+    assert recorded(run)["points"] == {"seed": 5}
+    assert enerf("run", toys, "--out", tmp_path / "other", "--config", config, "--preset", "preview", "--seed", "6", "--until", "poses").code == 0
+    assert recorded(tmp_path / "other")["train"] == {"iterations": 8, "rate": 7.0, "seed": 6, "fail": ""}
+
+
 def test_going_on_keeps_what_was_recorded(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     enerf("run", toys, "--out", run, "--preset", "tiny", "--set", "train.seed=4")
@@ -55,6 +67,41 @@ def test_going_on_keeps_what_was_recorded(enerf: Enerf, toys: Path, tmp_path: Pa
     assert recorded(run)["train"] == {"iterations": 1, "rate": 3.0, "seed": 4, "fail": ""}
     assert enerf("run", "--out", run, "--preset", "preview").code == 0
     assert recorded(run)["train"] == {"iterations": 3, "rate": 0.5, "seed": 0, "fail": ""}
+
+
+def test_a_source_may_move_but_not_change(enerf: Enerf, toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, other = tmp_path / "run", tmp_path / "other"
+    enerf("run", toys, "--out", run)
+    shutil.copytree(toys, other)
+    refused = enerf("run", other, "--out", run)
+    assert refused.code == 2
+    assert str(toys) in refused.err
+    assert str(other) in refused.err
+    shutil.rmtree(toys)
+    for source in ((), (other,)):
+        summary = enerf("run", *source, "--out", run, "--json").objects[-1]
+        assert [stage["action"] for stage in summary["stages"]] == ["skipped"] * 3
+    monkeypatch.chdir(other)
+    shutil.rmtree(other)
+    assert enerf("status", "run").code == 2, "the working folder is gone"
+    assert enerf("status", run).code == 0
+
+
+def test_some_of_the_stages(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+
+    def done(*arguments: object) -> dict[str, str]:
+        return {stage["name"]: stage["action"] for stage in enerf(*arguments, "--json").objects[-1]["stages"]}
+
+    assert done("run", toys, "--out", run, "--until", "train") == {"poses": "ran", "train": "ran"}
+    assert done("run", "--out", run, "--from", "train") == {"poses": "skipped", "train": "ran", "points": "ran"}
+    assert done("stage", "points", run) == {"points": "skipped"}
+    assert done("stage", "points", run, "--force") == {"points": "ran"}
+    enerf("run", "--out", run, "--set", "train.rate=3", "--until", "poses")
+    assert "train is stale" in enerf("stage", "points", run, "--set", "points.seed=2").err
+    assert recorded(run)["points"] == {"seed": 2}
+    refused = enerf("stage", "points", run, "--set", "train.rate=3")
+    assert (refused.code, refused.out) == (2, "")
 
 
 def test_status_and_verify(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
@@ -114,6 +161,21 @@ def test_usage_errors_leave_nothing_behind(enerf: Enerf, toys: Path, tmp_path: P
     assert not (tmp_path / "run").exists()
 
 
+def test_memory_is_recorded_like_the_device_and_makes_nothing_stale(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+    run, settings = tmp_path / "run", None
+    for options, memory in ((["--memory", "1.5g"], 3 * 2**29), ([], 3 * 2**29), (["--memory", "1000t"], None), (["--memory", "auto"], None)):
+        source = () if run.exists() else (toys,)
+        result = enerf("run", *source, "--out", run, *options)
+        assert result.code == 0
+        assert settings in (None, recorded(run))
+        settings = recorded(run)
+        if memory:
+            assert json.loads((run / "run.json").read_text())["memory"] == memory
+        else:
+            assert ("--memory 1000t" in result.err) == ("1000t" in options), "more than the machine has"
+    assert json.loads((run / "run.json").read_text())["memory"] is None
+
+
 def test_a_run_that_is_being_written_is_left_alone(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     enerf("run", toys, "--out", run)
@@ -125,6 +187,14 @@ def test_a_run_that_is_being_written_is_left_alone(enerf: Enerf, toys: Path, tmp
         assert f"process {os.getpid()}" in enerf("status", run).out
     assert recorded(run) == before
     assert enerf("run", "--out", run).code == 0
+
+
+def test_presets_are_listed(enerf: Enerf, toys: Path) -> None:
+    assert "iterations = 1 " in enerf("presets", "train", "--preset", "tiny").out
+    listed = enerf("presets", "--json").object
+    assert [preset["name"] for preset in listed["presets"]] == ["preview", "tiny"]
+    assert listed["stages"]["train"][0]["meaning"] == "Steps."
+    assert enerf("presets", "trian").code == 2
 
 
 def test_help_names_all_commands(enerf: Enerf) -> None:
@@ -172,6 +242,20 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path, number: i
     assert child.returncode == code
     assert f"enerf run --out '{run}'" in err
     assert json.loads(out.splitlines()[-1])["exit_code"] == code
+
+
+def test_a_second_ctrl_c_at_the_end_prints_no_traceback(tmp_path: Path) -> None:
+    program = (
+        "import atexit, os, signal, sys, time; from workflows.cli import main, status\n"
+        "def interrupted(*_, **__): raise KeyboardInterrupt\n"
+        "status.status.callback = interrupted\n"
+        "atexit.register(lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(5)))\n"
+        f"sys.argv[1:] = ['status', {str(tmp_path)!r}]; sys.exit(main.main())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == -signal.SIGINT  # the process ended at once
+    assert "Traceback" not in done.stderr
+    assert "interrupted" in done.stderr.lower()
 
 
 @pytest.mark.parametrize(("grade", "fail_on", "code"), [

@@ -36,6 +36,26 @@ def missing_below(path: Path) -> Path:
 
 
 @kind
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+@kind
+def endless_device(path: Path) -> str:
+    return "/dev/zero"
+
+
+@kind
+def link_to_a_device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+@kind
+def link_to_itself(path: Path) -> None:
+    path.symlink_to(path)
+
+
+@kind
 def empty_folder(path: Path) -> None:
     path.mkdir()
 
@@ -59,8 +79,29 @@ def empty_file(path: Path) -> None:
 
 
 @kind
+def other_file(path: Path) -> None:
+    path.write_bytes(b"\x93NUMPY\xff\0\n" * 50)
+
+
+@kind
+def below_a_file(path: Path) -> Path:
+    path.write_text("mine", encoding="utf-8")
+    return path / "below"
+
+
+@kind
 def nul(path: Path) -> str:
     return f"{path}\0x"
+
+
+@kind
+def long_name(path: Path) -> Path:
+    return path / ("x" * 4096)
+
+
+@kind
+def long_path(path: Path) -> Path:
+    return path.joinpath(*["y" * 200] * 40)
 
 
 @kind
@@ -97,6 +138,7 @@ COMMANDS: dict[str, tuple[list[str], str, set[str]]] = {
     "render --path": (["render", "ASSET", "--out", "NEW", "--path", "X"], ".json", set()),
     "render --video": (["render", "ASSET", "--frames", "1", "--width", "16", "--height", "16", "--out", "NEW", "--video", "X"], ".mp4",
                        {"missing", "odd_name"}),
+    "paper --out": (["paper", "9", "--out", "X"], "", set()),
     "presets": (["presets", "X"], "", set()),
     "presets --preset": (["presets", "--preset", "X"], "", set()),
     "run --preset": (["run", "SOURCE", "--out", "NEW", "--preset", "X"], "", set()),
@@ -236,3 +278,19 @@ def test_metadata_of_a_stranger_are_described(enerf: Enerf, tmp_path: Path, asse
         elif "--json" in arguments:
             assert result.out.isascii()
             json.loads(result.out.splitlines()[-1] if arguments[0] == "verify" else result.out)
+
+
+def test_pipes_among_photographs_are_not_waited_for(tmp_path: Path) -> None:
+    from stages.sfm.images import prepare_images
+
+    names = ["a.png", "b.png"]
+    for name in (*names, "mask.png"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "work").mkdir()
+    signal.alarm(SECONDS)
+    images, rejected = prepare_images(
+        {name: tmp_path / name for name in names}, max_side=64, features=100, seed=0, masks={"a.png": tmp_path / "mask.png"}, work=tmp_path / "work",
+        progress=lambda *_: None, safe_point=lambda: None, warn=lambda *_, **__: None,
+    )  # fmt: skip
+    assert images == []
+    assert [name for name, _ in rejected] == names

@@ -1,0 +1,187 @@
+"""How far more cores help: each stage of a run on one core and on two, in turn; serial seconds, and what 4 to 64 cores would make of the rest.
+
+    python -m benchmarks.scaling RUN [--stages train bake ...] [--set STAGE.NAME=VALUE ...] [--repeats N] [--out FILE]
+
+RUN is a finished run; its stages run again in copies of it, on so many cores (affinity and threads), with kernels compiled. A thread looks every 5 ms which
+function of the project the main thread is in. Of a function that takes t1 seconds on one core and t2 on two,
+
+    serial = 2 t2 - t1          Amdahl: t(n) = serial + (t1 - serial) / n
+
+The prediction leaves out that cores share the memory's bandwidth: STREAM's triad on one core and on two says how near that is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from benchmarks.machine import processor
+from pipeline.executors.cores import VARIABLES
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = tuple(str(ROOT / name) + os.sep for name in ("pipeline", "stages", "efficientnerf", "workflows"))
+INTERVAL = 0.005  # seconds between two looks
+CORES = (4, 8, 16, 64)
+STAGES = ("poses", "train", "bake", "mesh", "splats", "evaluate", "turntable", "points")
+SHOWN = 12  # functions of a stage
+
+
+def serial_seconds(one: float, two: float) -> float:
+    """The part that does not become faster, of what takes `one` second on one core and `two` on two."""
+    return min(max(2 * two - one, 0.0), one)
+
+
+def predicted(one: float, two: float, cores: int) -> float:
+    serial = serial_seconds(one, two)
+    return serial + (one - serial) / cores
+
+
+class Watch:
+    """Seconds of the main thread by the innermost function of the project, sampled."""
+
+    def __init__(self) -> None:
+        self.seconds: Counter[str] = Counter()
+        self._main = threading.main_thread().ident
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        last = time.perf_counter()
+        while not self._ended.wait(INTERVAL):
+            name = _innermost(sys._current_frames().get(self._main or 0))
+            now = time.perf_counter()
+            self.seconds[name] += now - last
+            last = now
+
+
+def _innermost(frame: FrameType | None) -> str:
+    while frame is not None:
+        path = frame.f_code.co_filename
+        if path.startswith(PACKAGES):
+            return f"{Path(path).relative_to(ROOT).with_suffix('').as_posix()} {frame.f_code.co_qualname}"
+        frame = frame.f_back
+    return "libraries"
+
+
+def measure_stage(run_folder: Path, stage: str, sets: list[str], cores: int) -> dict[str, float]:
+    """Seconds by function of a stage that runs again, in this process; "" is all of it."""
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    from pipeline.executors.local import execute_alone
+    from pipeline.runner import run_stages
+    from workflows.asset import WORKFLOW
+    from workflows.cli.request import Options, plan_run
+
+    plan = plan_run(run_folder, WORKFLOW, Options(sets=tuple(sets)))
+    with plan.written() as run, Watch() as watch:
+        start = time.perf_counter()
+        run_stages(run, WORKFLOW.stages, only=stage, force=True, device="cpu", execute=execute_alone)
+        seconds = time.perf_counter() - start
+    return {"": seconds, **watch.seconds}
+
+
+def triad(cores: int) -> float:
+    """Bytes a second of STREAM's triad, a = b + s c, on so many cores: the best of several."""
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    import torch
+
+    torch.set_num_threads(cores)
+    a, b, c = (torch.ones(1 << 25) for _ in range(3))
+    best = 0.0
+    for _ in range(8):
+        start = time.perf_counter()
+        torch.add(b, c, alpha=3.0, out=a)
+        best = max(best, 3 * 4 * a.numel() / (time.perf_counter() - start))
+    return best
+
+
+def _apart(arguments: list[str], cores: int) -> Any:
+    """What this program answers in a process on so many cores."""
+    environment = {**os.environ, **dict.fromkeys(VARIABLES, str(cores)), "ENERF_PRECOMPILE": "off"}
+    command = [sys.executable, "-m", "benchmarks.scaling", *arguments, "--cores", str(cores)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def measure(run: Path, stages: list[str], sets: list[str], repeats: int) -> dict[str, Any]:
+    """Of each stage and function the median seconds on one core and on two."""
+    found: dict[str, Any] = {"processor": processor(), "triad": [_apart(["--triad"], cores) for cores in (1, 2)], "sets": sets, "stages": {}}
+    for stage in stages:
+        times: dict[int, list[dict[str, float]]] = {1: [], 2: []}
+        for _ in range(repeats):
+            for cores in (2, 1):
+                with tempfile.TemporaryDirectory(dir=run.parent) as folder:
+                    copy = Path(folder) / "run"
+                    shutil.copytree(run, copy)
+                    arguments = [str(copy), "--stages", stage, *(word for text in sets if text.startswith(f"{stage}.") for word in ("--set", text))]
+                    times[cores].append(_apart(arguments, cores))
+        names = {name for each in times[1] + times[2] for name in each}
+        medians = {name: [statistics.median(each.get(name, 0.0) for each in times[cores]) for cores in (1, 2)] for name in names}
+        found["stages"][stage] = dict(sorted(medians.items(), key=lambda item: -serial_seconds(*item[1])))
+        print(f"{stage}: {medians[''][0]:.1f} s on one core, {medians[''][1]:.1f} on two", file=sys.stderr)
+    return found
+
+
+def as_markdown(found: dict[str, Any]) -> str:
+    """Tables: the stages, and of each the functions with most serial seconds."""
+    one, two = (speed / 1e9 for speed in found["triad"])
+    lines = [f"{found['processor']}; STREAM triad {one:.1f} GB/s on one core, {two:.1f} on two", ""]
+    head = "| serial s | serial | " + " | ".join(f"{cores} cores" for cores in CORES) + " |"
+    lines += [f"| stage | 1 core, s | 2 cores, s {head}", "|---|" + "--:|" * (4 + len(CORES))]
+    rows = {stage: times[""] for stage, times in found["stages"].items()}
+    rows["all"] = [sum(times[index] for times in rows.values()) for index in (0, 1)]
+    lines += [_row(stage, times) for stage, times in rows.items()]
+    for stage, times in found["stages"].items():
+        lines += ["", f"| {stage}, by function | 1 core, s | 2 cores, s {head}", "|---|" + "--:|" * (4 + len(CORES))]
+        lines += [_row(name, each) for name, each in list(times.items()) if name][:SHOWN]
+    return "\n".join(lines) + "\n"
+
+
+def _row(name: str, times: list[float]) -> str:
+    serial = serial_seconds(*times)
+    ahead = " | ".join(f"{predicted(*times, cores):.1f}" for cores in CORES)
+    return f"| {name} | {times[0]:.1f} | {times[1]:.1f} | {serial:.1f} | {serial / max(times[0], 1e-9):.0%} | {ahead} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, nargs="?")
+    parser.add_argument("--stages", nargs="+", default=list(STAGES), choices=STAGES)
+    parser.add_argument("--set", dest="sets", action="append", default=[])
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--cores", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--triad", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.triad:
+        print(json.dumps(triad(given.cores)))
+    elif given.cores:
+        print(json.dumps(measure_stage(given.run, given.stages[0], given.sets, given.cores)))
+    else:
+        found = measure(given.run.absolute(), given.stages, given.sets, given.repeats)
+        print(as_markdown(found))
+        if given.out is not None:
+            given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
