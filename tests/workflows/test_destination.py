@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -114,6 +115,22 @@ def test_links_pipes_and_devices_are_neither_followed_nor_replaced(enerf: Enerf,
     for place in ("/dev/null", victim, out / "link.ply"):
         assert enerf("render", asset, "--out", place, "--force").code == 2
     assert contents(tmp_path) == before
+
+
+def test_what_is_read_is_no_target(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
+    before = asset.read_bytes()
+    hard = tmp_path / "hard.nerftree"
+    os.link(asset, hard)
+    for target in (asset, hard, tmp_path / "." / "asset.nerftree"):
+        refused = enerf("convert", asset, target, "--force")
+        assert (refused.code, "is the file that is read" in refused.err) == (2, True)
+    path = tmp_path / "frame_0000.png"  # a camera path by the name of a frame
+    matrix = [1, 0, 0, 0, 0, 0, -1, -4, 0, 1, 0, 0, 0, 0, 0, 1]
+    path.write_text(json.dumps({"render_width": 16, "render_height": 16, "camera_path": [{"camera_to_world": matrix, "fov": 60}]}), encoding="utf-8")
+    assert enerf("render", asset, "--out", tmp_path, "--path", path, "--force").code == 2
+    assert enerf("export", asset, "--to", tmp_path / "a.ply", tmp_path / "./a.ply").code == 2
+    assert asset.read_bytes() == before
+    assert not (tmp_path / "a.ply").exists()
 
 
 def test_a_full_disk_leaves_no_half_file(enerf: Enerf, asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

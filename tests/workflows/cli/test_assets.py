@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.file import memory
-from efficientnerf.asset.format import describe, load, save
+from efficientnerf.asset.format import WRITERS, describe, load, save
 from tests.efficientnerf.trees import random_tree
 from tests.workflows.command import Result
 from workflows.cli.assets import LAYOUTS
@@ -25,6 +25,42 @@ def asset(tmp_path: Path) -> Path:
     path = tmp_path / "asset.nerftree"
     save(random_tree(3, shape=(5, 5, 5), brick=4, degree=2, sigma=60.0, metadata={"licence": "CC0-1.0", "provenance": {"tool": "a test"}}), path)
     return path
+
+
+def test_a_bare_asset_is_verified(enerf: Enerf, asset: Path) -> None:
+    assert tuple(WRITERS) == LAYOUTS
+    result = enerf("verify", asset)
+    assert (result.code, "format 1.0, sparse" in result.out) == (0, True), result.err
+    assert enerf("verify", asset, "--json").object["damaged"] == []
+    assert enerf("verify", asset, "--quiet") == Result(0, "", "")
+    data = asset.read_bytes()
+    for damaged in (data[:-100] + bytes([data[-100] ^ 1]) + data[-99:], data[:-1]):
+        asset.write_bytes(damaged)
+        broken = enerf("verify", asset, "--json")
+        assert (broken.code, broken.objects[-1]["damaged"]) == (4, [str(asset)])
+    assert enerf("verify", asset.with_name("none.nerftree")).code == 2
+
+
+def test_what_differs_is_said(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
+    other = tmp_path / "b.nerftree"
+    other.write_bytes(asset.read_bytes())
+    assert enerf("diff", asset, other, "--views", 2, "--size", 32).code == 0
+    found = enerf("diff", asset, other, "--views", 2, "--json").object
+    assert (found["equal"], found["psnr"], set(found["tensors"].values())) == (True, 100.0, {"same"})
+    tree = load(asset)
+    save(replace(tree, density_values=tree.density_values * 2).with_metadata(licence="MIT"), other)
+    result = enerf("diff", asset, other, "--size", 48)
+    assert result.code == 6
+    assert all(name in result.out for name in ("CC0-1.0", "MIT", "voxel.density"))
+    assert "voxel.sh" not in result.out
+    found = enerf("diff", asset, other, "--size", 48, "--json").object
+    assert (found["exit_code"], found["equal"], found["metadata"]) == (6, False, {"licence": ["CC0-1.0", "MIT"]})
+    assert {name for name, said in found["tensors"].items() if said != "same"} == {"voxel.density"}
+    assert (len(found["views"]), 5 < found["psnr"] < 40) == (4, True)
+    assert enerf("diff", asset, other, "--views", 0, "--json").object["psnr"] is None
+    assert enerf("diff", asset, other, "--views", 0, "--quiet") == Result(6, "", "")
+    other.write_bytes(asset.read_bytes()[:-1])
+    assert enerf("diff", asset, other).code == 4
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -48,6 +84,29 @@ def test_every_layout_can_be_had_of_every_other(enerf: Enerf, asset: Path, tmp_p
     assert kept == {key: about[key] for key in kept}
 
 
+def test_resolution_and_degree(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "less.nerftree"
+    result = enerf("convert", asset, out, "--resolution", 10, "--sh-degree", 1, "--layout", "compact")
+    assert result.code == 0, result.err
+    about = describe(out)
+    assert (about["resolution"], about["sh_degree"], about["layout"]) == ([12, 12, 12], 1, "compact")
+    assert about["voxel_side"] == pytest.approx(2 * describe(asset)["voxel_side"])
+    (tmp_path / "folder.nerftree").mkdir()
+    (tmp_path / "odd.nerftree").write_bytes(b"no asset")
+    for name, more in (
+        ("more.nerftree", ("--sh-degree", 3)),
+        ("more.nerftree", ("--resolution", 21)),
+        ("a.ply", ()),
+        ("none/a.nerftree", ()),
+        ("folder.nerftree", ()),
+    ):
+        refused = enerf("convert", asset, tmp_path / name, *more)
+        assert (refused.code, str(more[1] if more else name) in refused.err) == (2, True)
+    assert enerf("convert", tmp_path / "none.nerftree", tmp_path / "more.nerftree").code == 2
+    assert enerf("convert", tmp_path / "odd.nerftree", tmp_path / "more.nerftree").code == 4
+    assert not (tmp_path / "more.nerftree").exists()
+
+
 def test_what_a_layout_has_no_place_for_is_refused(enerf: Enerf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """20 million voxels of one value are a valid `compact` file, and no `packed` one, which is nearly nothing; here fewer voxels, and less than 200 MB."""
     monkeypatch.setattr("efficientnerf.asset.file.memory.FIXED_BYTES", 100_000)
@@ -66,6 +125,17 @@ def test_security_and_format_state_the_memory_of_an_asset_alike() -> None:
         text = (ROOT / name).read_text(encoding="utf-8")
         assert re.search(rf"{memory.MAX_RATIO} times.*{memory.MAX_PACKED_RATIO} times", text, re.DOTALL)
         assert f"{memory.FIXED_BYTES // 10**6} MB" in text or f"{memory.FIXED_BYTES:,}" in text
+
+
+def test_inspect_tells_what_a_coded_asset_holds(enerf: Enerf, asset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.nerftree"
+    enerf("convert", asset, out, "--layout", "compact")
+    found = enerf("inspect", out, "--json").object
+    assert (found["layout"], found["bytes_per_voxel"], found["sh_groups"], found["licence"]) == ("compact", 12, [1] * 8, "CC0-1.0")
+    assert sum(found["bytes_per_part"].values()) == out.stat().st_size == found["bytes"]
+    data = out.read_bytes()
+    out.write_bytes(data[: 8 + int.from_bytes(data[:8], "little")] + bytes(len(data) - 8 - int.from_bytes(data[:8], "little")))
+    assert enerf("inspect", out, "--json").object["voxels"] == found["voxels"], "the tensors are not read"
 
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"

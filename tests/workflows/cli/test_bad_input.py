@@ -241,3 +241,15 @@ def test_an_asset_too_small_to_have_a_surface_is_refused_before_the_poses(enerf:
     result = enerf("run", source, "--out", tmp_path / "run", "--set", setting)
     assert (result.code, "at least" in result.err) == (2, True), result.err
     assert not (tmp_path / "run").exists()
+
+
+def test_recovered_cameras_go_on(enerf: Enerf, made: Path, source: Path) -> None:
+    """The cameras of a run, exported and read again, are the same."""
+    assert enerf("export", made / "run", "--to", source / "transforms.json", "--force").code == 0
+    found, again = enerf("inspect", made / "run/poses", "--json").object, enerf("inspect", source, "--json").object
+    assert (again["what"], again["count"]) == ("source", 6)
+    for one, other in zip(*(sorted(each["cameras"], key=lambda camera: camera["name"]) for each in (found, again)), strict=True):
+        assert one["name"] == other["name"]
+        np.testing.assert_allclose(one["capture_from_camera"], other["capture_from_camera"], atol=1e-12)
+        assert (one["width"], one["height"], one["split"]) == (other["width"], other["height"], other["split"])
+    assert enerf("inspect", source.parent / "nowhere").code == 2

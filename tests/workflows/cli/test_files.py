@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import typing
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
@@ -18,11 +19,17 @@ from efficientnerf.asset.cascades import cascade_grids, nested
 from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
-from stages.formats.exporters import SPLAT_EXPORTERS
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
 from stages.formats.exporters.splats.ply import read_splats
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
+from stages.mesh.settings import MeshSettings
+from stages.turntable.settings import TurntableSettings
+from tests.stages.formats.gaussians import scattered
+from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
+from workflows.cli.files import EXR, TEXTURES
+from workflows.cli.main import COMMANDS
 from workflows.exporting import faces_from_text
 
 Enerf = Callable[..., Result]
@@ -77,6 +84,38 @@ def test_a_texture_of_the_asset_in_all_formats(enerf: Enerf, ball: Path, tmp_pat
     assert enerf("inspect", without / "p.ply", "--json").object["vertices"] == 300
     for path in (*(tmp_path / name for name in names[:3]), without / "a.ply"):  # in the frame of the capture
         np.testing.assert_allclose(enerf("inspect", path, "--json").object["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 0.6 / SCALE, atol=0.1)
+
+
+def test_an_obj_replaces_none_of_its_three_files_without_force(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    for name in ("ball.obj", "ball.mtl", "ball.png"):
+        (tmp_path / name).write_text("mine", encoding="utf-8")
+        result = enerf("export", ball, "--to", tmp_path / "ball.obj")
+        assert (result.code, str(tmp_path / name) in result.err) == (2, True)
+        assert [each.name for each in tmp_path.iterdir()] == [name]
+        (tmp_path / name).unlink()
+    for name in ("ball.obj", "ball.mtl", "ball.jpg"):
+        (tmp_path / name).write_text("mine", encoding="utf-8")
+    result = enerf("export", ball, "--to", tmp_path / "ball.obj", "--force", "--jpeg", "--faces", 500, "--texture-size", 256)
+    assert result.code == 0, result.err
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["ball.jpg", "ball.mtl", "ball.obj"]
+    assert (tmp_path / "ball.jpg").read_bytes()[:2] == b"\xff\xd8"
+    assert "map_Kd ball.jpg" in (tmp_path / "ball.mtl").read_text("ascii")
+
+
+def test_the_list_names_every_format(enerf: Enerf) -> None:
+    rows = enerf("export", "--list", "--json").objects[-1]["formats"]
+    others = {".json", ".html", ".png", ".exr", ".mp4", ".nerftree"}
+    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *SPLAT_EXPORTERS, *VOLUME_EXPORTERS, *others}
+    assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
+    assert all(row["command"].split()[1] in COMMANDS for row in rows)
+    listed = enerf("export", "--list").out
+    assert all(row["command"] in listed for row in rows)
+    assert all(listed.count(f"pip install 'efficientnerf[{extra}]'") == 2 for extra in ("usd", "las"))
+
+
+def test_what_can_be_asked_for_is_what_there_is() -> None:
+    assert typing.get_args(typing.get_type_hints(MeshSettings)["texture"]) == TEXTURES
+    assert typing.get_args(typing.get_type_hints(TurntableSettings)["exr"]) == EXR
 
 
 @pytest.mark.parametrize(("text", "expected"), [("20k", 20_000), ("0.5K", 500), ("1m", 1_000_000), ("150000", 150_000)])
@@ -196,6 +235,19 @@ def test_a_camera_path(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     assert np.asarray(Image.open(tmp_path / "frames/frame_0000.png")).shape == (30, 40, 3)
 
 
+def test_describing_gaussians(enerf: Enerf, tmp_path: Path) -> None:
+    """And a file of another kind by that name, and a damaged one."""
+    for extension, kind in SPLAT_EXPORTERS.items():
+        kind(scattered(20), tmp_path / f"a{extension}", Z_UP)
+        found = enerf("inspect", tmp_path / f"a{extension}", "--json").object
+        assert (found["what"], found["gaussians"], found["sh_degree"]) == ("splats", 20, 2)
+    MESH_EXPORTERS[".glb"](block(), tmp_path / "mesh.glb", Z_UP)
+    assert enerf("inspect", tmp_path / "mesh.glb", "--json").object["what"] == "mesh"
+    (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-30])
+    result = enerf("inspect", tmp_path / "a.spz")
+    assert (result.code, "a.spz" in result.err) == (2, True)
+
+
 def test_broken_assets(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     found = enerf("inspect", ball, "--json").object
     assert (found["what"], found["resolution"], found["sh_degree"]) == ("asset", [24, 24, 24], 0)
@@ -227,6 +279,18 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "scene.nerftree"
     format.save(replace(nested(trees, np.tile(np.float32([0, 1, 0]), (8, 16, 1))), region=around, metadata=metadata), path, "sparse")
     return path
+
+
+def test_exports_take_the_foreground_unless_all_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    """The blue ball is at 3.2 along x in the capture's frame, the red one's radius is 1.2."""
+    both = ["--set", "mesh.region=all", "--region", "foreground"]
+    for name, more, reach in (("a", [], 1.3), ("b", ["--region", "all"], 3.9), ("c", both[:2], 3.9), ("d", both, 1.3)):
+        assert enerf("export", scene, "--to", tmp_path / f"{name}.ply", *more, "--set", "mesh.max_faces=3000").code == 0
+        assert enerf("inspect", tmp_path / f"{name}.ply", "--json").object["bounds"][1][0] == pytest.approx(reach, abs=0.25)
+    assert enerf("export", scene, "--points", "--to", tmp_path / "points.ply", "--region", "all", "--set", "points.num_points=500").code == 0
+    assert enerf("inspect", tmp_path / "points.ply", "--json").object["bounds"][1][0] == pytest.approx(3.9, abs=0.45)
+    assert "11 cameras" in enerf("inspect", scene).out
+    assert len(enerf("inspect", scene, "--json").object["captured_path"]["poses"]) == 11
 
 
 def test_a_crop_is_in_the_frame_of_the_capture_and_replaces_the_region(enerf: Enerf, scene: Path, tmp_path: Path) -> None:

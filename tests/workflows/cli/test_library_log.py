@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.workflows.fleet_child import PRESETS
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -22,12 +24,16 @@ def enerf(toys: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
 
 
-def test_a_run_shows_our_warnings_and_no_librarys(toys: Path, tmp_path: Path) -> None:
-    done = enerf(toys, "run", toys, "--out", tmp_path / "run", "--set", "train.fail=noisy", "--quiet")
+@pytest.mark.parametrize("how", ["--quiet", "--json"])
+def test_a_run_shows_our_warnings_and_no_librarys(how: str, toys: Path, tmp_path: Path) -> None:
+    done = enerf(toys, "run", toys, "--out", tmp_path / "run", "--set", "train.fail=noisy", how)
     assert done.returncode == 0, done.stderr
     shown = done.stdout + done.stderr
     assert not any(words in shown for words in ("NOISE", "ZeroDivisionError"))
     assert shown.count("for users: the cache is damaged") == 1
+    if how == "--json":
+        assert not done.stderr
+        return
     log = tmp_path / "run" / ".cache" / "libraries.log"
     assert all(words in log.read_text(encoding="utf-8") for words in SAID)
     assert enerf(toys, "run", "--out", tmp_path / "run", "--set", "train.fail=").returncode == 0

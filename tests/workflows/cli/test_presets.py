@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from pipeline.errors import UsageError
 from pipeline.stage import settings_dict, settings_from
 from stages.settings import describe_settings
 from workflows import asset
@@ -13,6 +16,13 @@ TYPES = {stage.name: stage.settings for stage in asset.STAGES}
 
 
 PAPER = ["paper-n1", "paper-n2", "paper-n3", "paper-n4"]
+
+
+def test_the_stages_are_in_order_and_these_presets_are_there() -> None:
+    names = [stage.name for stage in asset.STAGES]
+    assert names == ["poses", "train", "bake", "mesh", "splats", "evaluate", "turntable", "points"]
+    assert all(set(stage.needs) <= set(names[:place]) for place, stage in enumerate(asset.STAGES))
+    assert preset_names() == ["high", "nerf", "paper", *PAPER, "preview", "standard", "tiny"]
 
 
 def test_the_papers_presets_are_the_papers() -> None:
@@ -31,6 +41,20 @@ def test_the_papers_presets_are_the_papers() -> None:
         assert (train.num_coarse_samples, train.samples_per_pivot) == samples
         assert train.max_pivots >= train.num_coarse_samples  # the paper drops none
         assert (bake.resolution // bake.brick_size, bake.brick_size) == (384, 4)
+
+
+def test_a_preset_inherits_and_changes(tmp_path: Path) -> None:
+    (tmp_path / "base.toml").write_text('description = "Base."\n[train]\niterations = 3\nseed = 1\n[mesh]\nmax_faces = 100\n', encoding="utf-8")
+    (tmp_path / "middle.toml").write_text('description = "Middle."\ninherits = "base"\n[train]\nseed = 2\n', encoding="utf-8")
+    (tmp_path / "heir.toml").write_text('description = "Heir."\ninherits = "middle"\n[train]\niterations = 5\n', encoding="utf-8")
+    heir = read_preset("heir", tmp_path)
+    assert heir.table == {"train": {"iterations": 5, "seed": 2}, "mesh": {"max_faces": 100}}
+    assert (heir.inherits, heir.own) == ("middle", {"train": {"iterations": 5}})
+    for name, parent in (("a", "b"), ("b", "c"), ("c", "b"), ("self", "self"), ("orphan", "nobody")):
+        (tmp_path / f"{name}.toml").write_text(f'description = "."\ninherits = "{parent}"\n', encoding="utf-8")
+    for name, named in (("a", "a -> b -> c -> b"), ("self", "self -> self"), ("orphan", "nobody")):
+        with pytest.raises(UsageError, match=named):
+            read_preset(name, tmp_path)
 
 
 def test_the_settings_of_first_rank_are_few() -> None:

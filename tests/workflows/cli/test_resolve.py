@@ -12,6 +12,8 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
+from pipeline.run import Run
+from pipeline.runner import refuse_what_cannot_work
 from workflows.asset import STAGES
 from workflows.cli.resolve import Settings, metres_of, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
@@ -134,6 +136,15 @@ def test_values_that_no_stage_can_work_with_are_refused_when_they_are_given(text
         settings.put_option(text)
     for value in ("#00ff7F", "transparent"):
         settings.put_option(f"turntable.background={value}")
+
+
+def test_the_preset_whose_field_cannot_be_baked_is_refused_where_it_would_be(tmp_path: Path) -> None:
+    """And a mesh whose normal map has no texture to lie on, before hours of training."""
+    for name, settings, fine in (("run", {"train": {"field": "nerf"}}, 2), ("other", {"mesh": {"normal_map": True, "texture": "off"}}, 3)):
+        run = Run.create(tmp_path / name, tmp_path, settings)
+        with pytest.raises(UsageError, match=next(iter(settings)) if name == "other" else "baked"):
+            refuse_what_cannot_work(STAGES, run)
+        refuse_what_cannot_work(STAGES[:fine], run)
 
 
 @pytest.mark.parametrize(("text", "metres"), [("50mm", 0.05), ("5cm", 0.05), ("0.05m", 0.05), ("2 in", 0.0508)])

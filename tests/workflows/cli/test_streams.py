@@ -18,7 +18,7 @@ from tests.workflows.toys import TOYS
 BAD = ("full", "closed", "gone")
 ONE = [{"stdout": how} for how in BAD] + [{"stderr": how} for how in BAD] + [{"stdin": "closed"}]
 STREAMS = [*ONE, *[{"stdout": how, "stderr": how} for how in BAD], dict.fromkeys(("stdin", "stdout", "stderr"), "closed")]
-FEW = [ONE[0], STREAMS[-1]]  # for commands that differ in little
+FEW = [*ONE[:3], STREAMS[-1]]  # for commands that differ in little
 
 
 def called(toys: Path, cases: list[dict[str, Any]], **environment: str) -> list[dict[str, Any]]:
@@ -90,22 +90,26 @@ def test_what_is_opened_does_not_take_the_place_of_a_closed_stream(toys: Path, t
         "pipeline.files.rename = lambda a, b: (os.write(1, b'stray'), os.write(2, b'stray'), known(a, b))\n"
         "from tests.workflows.fleet_child import run; sys.exit(run(sys.argv[1:]))"
     )
-    streams = ">&- 2>&- --json"
-    run = tmp_path / streams
-    command = f'exec "$0" -c "$1" run "$2" --out "$3" {streams}'
-    done = subprocess.run(["sh", "-c", command, sys.executable, program, str(toys), str(run)], capture_output=True, check=False)
-    assert done.returncode == 3
-    assert len(verify(Run.open(run), TOYS)) == 3
-    others = [path for path in run.rglob("*") if path.is_file() and path.name != "libraries.log"]  # what is said on descriptor 2 is kept there
-    assert b"stray" not in b"".join(path.read_bytes() for path in others)
+    for streams, code in ((">&- 2>&- <&-", 0), (">&- 2>&- --json", 3)):
+        run = tmp_path / streams
+        command = f'exec "$0" -c "$1" run "$2" --out "$3" {streams}'
+        done = subprocess.run(["sh", "-c", command, sys.executable, program, str(toys), str(run)], capture_output=True, check=False)
+        assert done.returncode == code
+        assert len(verify(Run.open(run), TOYS)) == 3
+        others = [path for path in run.rglob("*") if path.is_file() and path.name != "libraries.log"]  # what is said on descriptor 2 is kept there
+        assert b"stray" not in b"".join(path.read_bytes() for path in others)
 
 
-def test_names_show_in_every_locale(toys: Path, tmp_path: Path) -> None:
+LOCALES = ({"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, {"LC_ALL": "C"})
+
+
+@pytest.mark.parametrize("locale", LOCALES)
+def test_names_show_in_every_locale(toys: Path, tmp_path: Path, locale: dict[str, str]) -> None:
     run = tmp_path / "Bäume \udcff\x1b[31m\n木"
     cases: list[dict[str, Any]] = [{"arguments": ["run", str(toys), "--out", str(run)]}]
     cases += [{"arguments": [name, str(run), *more]} for more in ([], ["--json"]) for name in ("status", "verify", "report")]
     cases += [{"arguments": ["status", str(run / "nothing")]}]
-    results = called(toys, cases, LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0", PYTHONIOENCODING="ascii")
+    results = called(toys, cases, **locale)
     assert [result["code"] for result in results] == [0] * 7 + [2]
     for result in results:
         shown = result["out"] + result["err"]

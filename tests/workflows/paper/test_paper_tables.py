@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.paper import document as paper
-from benchmarks.paper import tables
-from benchmarks.paper.document import PAPER, Request
-from benchmarks.paper.runs import Figures, Row, settings_of
 from tests.efficientnerf.balls import cameras, picture
 from tests.stages.captures import write_picture
+from workflows.cli.main import main
+from workflows.paper import document as paper
+from workflows.paper import tables
+from workflows.paper.document import PAPER, Request
+from workflows.paper.runs import Figures, Row, _pace, settings_of
 
 
 def ball(folder: Path) -> Path:
@@ -29,6 +30,34 @@ def ball(folder: Path) -> Path:
         document = {"camera_angle_x": 2 * math.atan(24 / (1.3 * 48)), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(document))
     return folder
+
+
+def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
+    whole, small = (settings_of(Row("n4"), scale) for scale in (1.0, 0.001))
+    assert (whole["train"]["iterations"], whole["train"]["hidden_dim"], whole["poses"]["max_image_size"]) == (1_000_000, 256, 800)
+    smaller = ("iterations", "max_rays_per_batch", "hidden_dim", "coarse_hidden_dim", "num_layers", "occupancy_resolution")
+    assert all(small["train"][name] < whole["train"][name] for name in smaller)
+    assert small["poses"]["max_image_size"] < 800
+    assert small["bake"]["resolution"] < whole["bake"]["resolution"]
+    kept = ("num_coarse_samples", "samples_per_pivot", "near_plane", "far_plane", "sh_degree", "pivotal_threshold", "occupancy_beta", "sampling", "max_pivots")
+    assert all(small["train"][name] == whole["train"][name] for name in kept)
+    light, standard = small["train"], settings_of(Row("nerf", tables.NERF), 0.001)["train"]
+    assert light["coarse_hidden_dim"] < standard["coarse_hidden_dim"] == standard["hidden_dim"]
+    differ = {name for name in light if light[name] != standard[name]}
+    assert differ == {"field", "sampling", "num_coarse_samples", "coarse_hidden_dim", "coarse_num_layers"}  # so the rest is shared
+
+
+def test_the_pace_is_that_of_the_log() -> None:
+    lines = [
+        {"step": step, "step_seconds": 2.0 if step <= 50 else 1.0, "preview_psnr": None if step % 50 else 20.0 + step, "rays": 10, "valid": 30, "fine": 50}
+        for step in range(10, 101, 10)
+    ]
+    pace = _pace(lines)
+    assert pace["step"] == pytest.approx(1.5)
+    assert pace["steady"] == 1.0
+    assert pace["hours"] == pytest.approx(150 / 3600)
+    assert (pace["coarse"], pace["fine"]) == (3.0, 5.0)
+    assert pace["curve"] == ([100.0, 150.0], [70.0, 120.0])
 
 
 def made_up(steady: float, psnr: float) -> Figures:
@@ -56,3 +85,23 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         assert "valid on chair" in " ".join(document["notes"]), "what has not converged does not count"
     if number == "1":
         assert document["rows"][0]["valid %" + PAPER] == 9.58
+
+
+def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, out = ball(tmp_path / "ball"), tmp_path / "out"
+    command = ["paper", "1", "--data", str(data), "--out", str(out), "--scale", "0.00001", "--device", "cpu", "--json"]
+    assert main(command) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert events[-1]["event"] == "summary"
+    assert sum(event["event"] == "stage_done" and event["stage"] == "train" for event in events) == 2
+    assert any(event["event"] == "progress" and event["stage"] == "train" for event in events)  # hours go by without a word otherwise
+    nerf, ours = json.loads((out / "table_1.json").read_text())["rows"]
+    assert 0 < ours["pivotal %"] <= ours["valid %"] < 100
+    assert 0 < nerf["pivotal %"] < 100
+    assert min(nerf["PSNR"], ours["PSNR"]) > 10
+    field = out / "runs/ball/n4/train/field.safetensors"
+    made = field.stat().st_mtime_ns
+    assert main(command) == 0
+    assert field.stat().st_mtime_ns == made
+    (tmp_path / "none").mkdir()
+    assert main([*command, "--data", str(tmp_path / "none")]) == 2

@@ -1,4 +1,4 @@
-"""Request and result of a table of the paper (`benchmarks.paper.document`)."""
+"""Request and result of a table of the paper (`workflows.paper.document`)."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.paper.result import PAPER, Request, Result
-from benchmarks.paper.runs import CONVERGED_PSNR, Figures, Row, measured, scenes, settings_of
+from workflows.paper.result import PAPER, Request, Result
+from workflows.paper.runs import CONVERGED_PSNR, Figures, Row, measured, scenes, settings_of
 
 # Table 1, percent: valid, pivotal.
 SHARES = {

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, next to the paper's figures.
+"""`enerf paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, next to the paper's figures.
 
     OUT/table_N.md     for people
     OUT/table_N.json   {"table", "title", "scale", "columns", "rows", "notes", "hardware", "versions"}
@@ -20,13 +20,13 @@ from typing import Any
 
 import torch
 
-from benchmarks.paper import tables
-from benchmarks.paper.result import PAPER, Request, Result, Table
-from benchmarks.paper.table7 import structures
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.cores import affinity
 from pipeline.files import write_atomically
 from stages.figures.plots import curve, with_palette
+from workflows.paper import tables
+from workflows.paper.result import PAPER, Request, Result, Table
+from workflows.paper.table7 import structures
 
 __all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
 
