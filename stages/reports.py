@@ -13,7 +13,6 @@ from stages.io.scene_schema import T, read_document
 
 class Framing(Struct, frozen=True):
     bounds_from: str = ""
-    up_from: str = ""
 
 
 class Rejected(Struct, frozen=True):
@@ -24,21 +23,21 @@ class Rejected(Struct, frozen=True):
 
 
 class MarkersFound(Struct, frozen=True):
-    """Markers that give the scale: its error as a share (99 %), and whether they give up, too."""
+    """Markers that give the scale: its error as a share (99 %)."""
 
     error: float | None = None
-    up: bool = False
 
 
-class Aligned(Struct, frozen=True):
-    """What of GPS, or of cameras that the source states, is used."""
+class UpFound(Struct, frozen=True):
+    """What up is taken from, and by how many degrees others that say it are off."""
 
-    used: str = ""
+    by: str = ""
+    degrees: dict[str, float] = {}
 
 
 class CaptureFacts(Struct, frozen=True):
     markers: MarkersFound = MarkersFound()
-    gps: Aligned | None = None
+    up: UpFound = UpFound()
 
 
 class PosesReport(Struct, frozen=True):

@@ -12,12 +12,11 @@ import numpy as np
 from pipeline.errors import BadInput, CorruptArtifact, UsageError
 from pipeline.run import Run
 from stages.framing.true_frame import AS_CAPTURED, NAME, TrueFrame, load_frame, save_frame
+from workflows import measuring
 from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
 from workflows.cli.output import closing, listing, write_json
 from workflows.cli.resolve import metres_of
 from workflows.cli.target import open_run
-from workflows.measuring import Measured, frame_by_lengths, ground_of, ground_through, in_words, measured, sides_in_words, sides_of, unit_in_words, up_from
-from workflows.measuring import measure as measure_places
 from workflows.report.page import NAME as REPORT
 from workflows.report.page import write_report
 from workflows.report.signature import VIEWER
@@ -53,7 +52,7 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
     summary: dict[str, Any] = {}
     if known or forget:
         opened = open_run(run)
-        frame = _found(run).with_lengths(1.0, None, ()) if forget else frame_by_lengths(_inside(run), run, lengths)
+        frame = _found(run).with_lengths(1.0, None, ()) if forget else measuring.frame_by_lengths(_inside(run), run, lengths)
         _keep(opened, frame)
         if known:
             summary["known_lengths"] = [{"from": each.begin, "to": each.end, "metres": each.metres, "residual": each.residual} for each in frame.lengths]
@@ -62,17 +61,17 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
             residuals = [f"  {each.metres:g} m: off by {each.residual:+.2%}" for each in frame.lengths] if len(lengths) > 1 else []
             closing(f"{run}: lengths in metres, within {frame.error:.2g} of each (99 %)", *residuals)
     if places:
-        found = measure_places(measured(run), places)
+        found = measuring.measure(measuring.measured(run), places)
         summary = found | summary
         if not as_json:
-            listing(*in_words(found))
+            listing(*measuring.in_words(found))
     elif not (known or forget):
-        sides = sides_of(run)
+        sides = measuring.sides_of(run)
         if sides is None:
             raise BadInput(f"{run}: has no mesh to measure. Give two places to measure between.")
         summary = sides
         if not as_json:
-            listing(sides_in_words(sides), *unit_in_words(sides))
+            listing(measuring.sides_in_words(sides), *measuring.unit_in_words(sides))
     if as_json:
         write_json({"event": "summary", "ok": True, "run": str(run), **summary, "exit_code": 0})
 
@@ -80,37 +79,42 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
 @click.command(context_settings={"ignore_unknown_options": True})  # places may begin with a minus
 @click.argument("run", metavar="RUN", type=folder_type)
 @click.argument("places", metavar="[PLACE PLACE PLACE]", nargs=-1)
-@click.option("--up", metavar="X,Y,Z", help="The direction that is up, in the frame of RUN's exports, instead of places; the ground is not set.")
+@click.option("--up", metavar="X,Y,Z", help="The direction that is up, in the frame of RUN's exports, instead of places. The ground is what is level under it.")
+@click.option("--plane", is_flag=True, help="The floor or table that the sparse points show, instead of places.")
 @click.option("--forget", is_flag=True, help="Go back to the up that RUN found.")
 @json_option
 @quiet_option
 @common_options
-def orient(run: Path, places: tuple[str, ...], up: str | None, forget: bool, as_json: bool, quiet: bool) -> None:
+def orient(run: Path, places: tuple[str, ...], up: str | None, plane: bool, forget: bool, as_json: bool, quiet: bool) -> None:
     """Set which way is up in a finished RUN, and where the ground is, by three PLACEs on it (as of `enerf measure`), far apart and not in a row; the cameras
     are above it.
 
     Nothing is trained again. From then on exports of RUN (meshes, points, Gaussians, volumes, cameras, assets) have z up, or y up where the format has it so,
-    and 0 on the ground; places and sizes of `enerf measure`, the report and the viewer's pages follow. Lengths stay. Turntables of the run and of `enerf
-    render`, and files that the stages made, keep the up that RUN found.
+    and 0 on the ground; places and sizes of `enerf measure`, the report, the viewer's pages and the turntables of `enerf render` follow. Lengths stay. Files
+    that the stages made, the run's own turntable among them, keep the up that RUN found.
     """
-    if (len(places) > 0) + (up is not None) + forget != 1 or len(places) not in (0, 3):
-        raise UsageError("Give three places on the ground, or --up X,Y,Z, or --forget.")
+    if (len(places) > 0) + (up is not None) + plane + forget != 1 or len(places) not in (0, 3):
+        raise UsageError("Give three places on the ground, or --plane, or --up X,Y,Z, or --forget.")
     opened = open_run(run)
     if forget:
         _keep(opened, _found(run).with_ground(None))
         if as_json:
             write_json({"event": "summary", "ok": True, "run": str(run), "exit_code": 0})
         return
-    inside = measured(run)
-    ground, error = (ground_of(inside, up), None) if up is not None else ground_through(inside, places)
-    angle, (words, known) = float(np.degrees(np.arccos(np.clip(inside.own_up @ ground.up, -1, 1)))), up_from(run)
+    inside = measuring.measured(run)
+    error = None
+    if places:
+        ground, error = measuring.ground_through(inside, places)
+    else:
+        ground = measuring.ground_found(inside, run) if up is None else measuring.ground_of(inside, run, up)
+    angle, (words, known) = float(np.degrees(np.arccos(np.clip(inside.own_up @ ground.up, -1, 1)))), measuring.up_from(run)
     _keep(opened, inside.true.with_ground(ground))
     said = f"{angle:.1f} degrees from the up that the run has, which is {words}"
     conflict = known and angle > max(error or 0.0, CONFLICT)
     if conflict:
         print(f"warning: the new up is {said}.", file=sys.stderr)
     if as_json:
-        facts = {"up": list(ground.up), "up_error": error, "ground": ground.height if places else None, "degrees_from_run": angle, "up_of_run": words}
+        facts = {"up": list(ground.up), "up_error": error, "ground": ground.height, "degrees_from_run": angle, "up_of_run": words}
         write_json({"event": "summary", "ok": True, "run": str(run), **facts, "exit_code": 0})
     elif not quiet:
         closing(f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}")
@@ -137,9 +141,9 @@ def _found(run: Path) -> TrueFrame:
         return AS_CAPTURED
 
 
-def _inside(run: Path) -> Measured:
+def _inside(run: Path) -> measuring.Measured:
     """What known lengths are given in: where the frame that was found before no longer fits, the capture's."""
     try:
-        return measured(run)
+        return measuring.measured(run)
     except (BadInput, CorruptArtifact):
-        return measured(run, captured=True)
+        return measuring.measured(run, captured=True)

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from efficientnerf.capture.markers import SURE, common_ratio
+from efficientnerf.capture.supports import level_plane
 from efficientnerf.capture.triangulation import Place, length_between, triangulated
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput, UsageError
@@ -25,6 +26,7 @@ from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.writing import SourceFrame
 from stages.framing.true_frame import AS_CAPTURED, Ground, KnownLength, TrueFrame, load_frame
+from stages.framing.upward import THE_CAMERAS
 from stages.io import scene
 from stages.mesh.files import read_vertices
 from stages.reports import poses_report
@@ -34,6 +36,8 @@ from workflows.loading import describe_asset
 
 LARGEST_ERROR = 0.03  # of a length: what is less sure is no unit, as of markers
 LARGEST_TILT = 5.0  # degrees, of up: what is less sure is none
+LEVEL, FOUND_WITHIN = 5.0, 30.0  # degrees from level of a floor or table: by an up that is given; by the one that the run has
+LOWEST = 0.005  # quantile of the mesh's heights that it stands on where there is no floor or table
 FLATTEST = 0.05  # of its longest side, how high the triangle of three places on the ground is at least
 LARGEST_MISS = 0.01  # of a picture's longest side: beyond it the pixels are not of one point
 LARGEST_PLACE = 1e12
@@ -73,6 +77,11 @@ class Measured:
     @property
     def unit(self) -> str:
         return "metre" if self.metric else "unknown"
+
+    @property
+    def centres(self) -> np.ndarray:
+        """(C, 3) of the cameras, in the capture's frame."""
+        return np.array([camera.centre for camera in self.cameras.values()])
 
     def place(self, text: str) -> Place:
         """The place in the capture's frame. Raises UsageError and BadInput."""
@@ -207,29 +216,51 @@ def ground_through(inside: Measured, places: Sequence[str]) -> tuple[Ground, flo
     error = float(np.degrees(np.arctan(SURE * np.linalg.norm(spreads * sides / area))))
     if error > LARGEST_TILT:
         raise BadInput(f"{listed}: up would be known within {error:.0f} degrees only. Pick places farther apart, or in more photographs.")
-    above = np.median([camera.centre @ up for camera in inside.cameras.values()]) - at.mean(axis=0) @ up
+    above = np.median(inside.centres @ up) - at.mean(axis=0) @ up
     up = up if above >= 0 else -up
     return Ground(tuple(up.tolist()), float(at.mean(axis=0) @ up), list(places)), error
 
 
-def ground_of(inside: Measured, text: str) -> Ground:
-    """The ground of an upward direction `X,Y,Z` in the frame of exports, through the capture's origin. Raises UsageError."""
+def ground_of(inside: Measured, run: Path, text: str) -> Ground:
+    """The ground of an upward direction `X,Y,Z` in the frame of exports: on the floor or table that is level by it, else under the mesh, else through the
+    capture's origin. Raises UsageError."""
     numbers = _POINT.fullmatch(text)
     up = np.array([float(each) for each in numbers.groups()] if numbers else np.zeros(3))
     if not (0 < np.abs(up).max() < LARGEST_PLACE):
         raise UsageError(f"--up {printable(text, SHOWN)}: expected a direction X,Y,Z.")
     up = inside.frame.rotation.T @ (up / np.abs(up).max())
-    return Ground(tuple((up / np.linalg.norm(up)).tolist()), 0.0, [])
+    up /= np.linalg.norm(up)
+    points, mesh = _points_of(run), MeshOutputs.of_run(run)
+    plane = level_plane(points, inside.centres, up, LEVEL)
+    if plane is not None:
+        normal, offset = plane
+        middle = np.median(points, axis=0)
+        height = float((middle - (middle @ normal - offset) * normal) @ up)
+    else:
+        vertices = read_vertices(mesh) if mesh.ply.is_file() else np.zeros((1, 3))
+        height = float(np.quantile(vertices @ up, LOWEST))
+    return Ground(tuple(up.tolist()), height, [])
+
+
+def ground_found(inside: Measured, run: Path) -> Ground:
+    """The floor or table that the sparse points show, near level by the up that the run has. Raises BadInput where there is none."""
+    plane = level_plane(_points_of(run), inside.centres, inside.up, FOUND_WITHIN)
+    if plane is None:
+        raise BadInput(f"{run}: its sparse points show no floor or table within {FOUND_WITHIN:g} degrees of level. Give three places on the ground instead.")
+    return Ground(tuple(plane[0].tolist()), float(plane[1]), [])
+
+
+def _points_of(run: Path) -> np.ndarray:
+    """(N, 3) sparse points, in the capture's frame."""
+    folder = PosesOutputs.of_run(run).folder
+    found = scene.load(folder)
+    return found.world_from_capture.inverse().points(scene.read_observations(folder)[0]) if found.points else np.zeros((0, 3))
 
 
 def up_from(run: Path) -> tuple[str, bool]:
     """What the up of a run comes from, in words, and whether that is more than a guess."""
-    report = poses_report(PosesOutputs.of_run(run).folder)
-    if report.facts.markers.up:
-        return "by markers", True
-    if report.facts.gps is not None and "up" in report.facts.gps.used:
-        return "by GPS", True
-    return report.framing.up_from or "estimated", report.framing.up_from in ("given", "stated by the source")
+    by = poses_report(PosesOutputs.of_run(run).folder).facts.up.by
+    return (f"by {by}", True) if by not in ("", THE_CAMERAS) else ("estimated from the cameras", False)
 
 
 def in_words(found: Mapping[str, Any]) -> list[str]:

@@ -91,8 +91,9 @@ def common_ratio(ratios: np.ndarray, spread: np.ndarray) -> tuple[float, float, 
     return float(np.exp(mean)), SURE * float((spread**-2).sum() ** -0.5) * max(1.0, excess), excess
 
 
-def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> np.ndarray | None:
-    """The unit normal of the plane of three markers or more, towards those who see them; None where they lie in none, or along a line."""
+def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> tuple[np.ndarray, float] | None:
+    """The unit normal of the plane of three markers or more, towards those who see them, and its error (99 %), degrees; None where they lie in none, or along a
+    line."""
     if len(fits) < 3:
         return None
     points = np.concatenate([fit.corners for fit in fits])
@@ -100,7 +101,8 @@ def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> np.ndarray |
     faces = np.array([fit.square.rotation[:, 2] for fit in fits])
     if extent[2] > flat * extent[1] or extent[1] < 0.1 * extent[0]:
         return None
-    return np.asarray(axes[2] * np.sign((faces @ axes[2]).sum()))
+    error = np.degrees(np.arctan(SURE * extent[2] / extent[1] / np.sqrt(len(fits) - 2)))  # corners of one marker miss the plane alike
+    return axes[2] * np.sign((faces @ axes[2]).sum()), float(error)
 
 
 def _offsets(square: Similarity, origin: np.ndarray, along: np.ndarray, across: np.ndarray, focal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,8 @@ ROUND_IT = 1.3  # times the outline: what is round a wall
 MIN_UNDER = 0.5  # of what the middles of the photographs show before a plane, that stands on it
 LEVEL = 0.995  # least height of the normal of a floor or table
 FARTHEST = 1.6  # distance at which rays meet a plane over the usual distance
+FLAT, MIN_ON_LEVEL, MIN_BROAD = 0.01, 0.1, 0.15  # of what is near: how far points of a level plane are off it; their share; their extent across it
+MAX_POINTS = 4000  # that a level plane is looked for in
 MAX_FOOT_HEIGHT = 0.3  # of the subject's size, that a part of it stands above a support at most
 
 Plane = tuple[np.ndarray, float]
@@ -114,6 +116,27 @@ def _supports(plane: Plane, cells: Cells, on: np.ndarray, before: np.ndarray, ra
     return bool((past & goes_on).sum() <= (MAX_PAST_LEVEL if abs(normal[2]) > LEVEL else MAX_PAST) * on_it)
 
 
+def level_plane(points: np.ndarray, cameras: np.ndarray, up: np.ndarray, tilt: float = 30.0) -> Plane | None:
+    """The floor or table of most of points (N, 3), within `tilt` degrees of level, below most cameras (C, 3), its normal upwards; None where there is none.
+
+    Far points do not count: what is near are those that are nearer to the middle one than the usual camera is.
+    """
+    if len(points) < 3:
+        return None
+    middle = np.median(points, axis=0)
+    distance, reach = np.linalg.norm(points - middle, axis=1), float(np.median(np.linalg.norm(cameras - middle, axis=1)))
+    near = points[distance <= reach]
+    size = 2 * float(np.median(np.linalg.norm(near - middle, axis=1))) if len(near) else 0.0
+    found = _plane(near[:: max(1, len(near) // MAX_POINTS)], FLAT * size, up, float(np.cos(np.radians(tilt))))
+    if found is None:
+        return None
+    normal, offset = found if found[0] @ up > 0 else (-found[0], -found[1])
+    on = near[np.abs(along(near, normal) - offset) <= FLAT * size]
+    flat = on @ _axes_across(normal).T
+    broad = len(on) >= MIN_ON_LEVEL * len(near) and np.sqrt(np.linalg.eigvalsh(np.cov(flat.T))[0]) >= MIN_BROAD * size
+    return (normal, offset) if broad and (along(cameras, normal) > offset).mean() >= 0.8 and normal @ up > np.cos(np.radians(tilt)) else None
+
+
 def _axes_across(normal: np.ndarray) -> np.ndarray:
     """(2, 3) two unit vectors at right angles to a unit normal and to each other."""
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
@@ -149,18 +172,21 @@ def along(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.asarray(points[:, 0] * direction[0] + points[:, 1] * direction[1] + points[:, 2] * direction[2])
 
 
-def _plane(points: np.ndarray, tolerance: float) -> Plane | None:
-    """Normal and offset of the plane with most of the points (N, 3) within a tolerance."""
+def _plane(points: np.ndarray, tolerance: float, up: np.ndarray | None = None, least: float = 0.0) -> Plane | None:
+    """Normal and offset of the plane with most of the points (N, 3) within a tolerance; of those alone whose normals have `least` along `up`, up or down."""
     if len(points) < 3:
         return None
     generator = np.random.default_rng(0)
-    triple = points[generator.integers(0, len(points), (TRIES, 3))]
+    triple = points[generator.integers(0, len(points), (TRIES if up is None else 5 * TRIES, 3))]
     normals = np.cross(triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0])
     length = np.linalg.norm(normals, axis=1)
     good = length > 1e-12
+    normals[good] /= length[good, None]
+    if up is not None:
+        good &= np.abs(along(normals, up)) >= least
     if not good.any():
         return None
-    normals = normals[good] / length[good, None]
+    normals = normals[good]
     offsets = (normals * triple[good, 0]).sum(axis=1)
     counts = [(np.abs(along(points, normal) - offset) <= tolerance).sum() for normal, offset in zip(normals, offsets, strict=True)]
     best = int(np.argmax(counts))

@@ -21,7 +21,9 @@ from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.geometry.ndc import Ndc
 from pipeline.errors import BadInput
+from stages.formats.exporters.writing import source_frame
 from stages.framing.captured import captured_of
+from stages.framing.training_frame import rotation_to_z
 from stages.io.scene import Orbit
 
 PATHS = ("auto", "orbit", "sway", "captured")
@@ -73,6 +75,12 @@ def similarity_of(tree: NerfTree) -> Similarity:
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise BadInput(f"asset: its world_from_capture cannot be read ({str(error)[:200]}). Bake it again.") from error
     return similarity
+
+
+def level_of(tree: NerfTree) -> np.ndarray | None:
+    """(3, 3) rotation from the asset's frame to where z is the up that its metadata state, as someone set it; None where they state none."""
+    up = source_frame(tree.metadata).set_up
+    return None if up is None or tree.ndc is not None else rotation_to_z(similarity_of(tree).rotation @ up)
 
 
 def pose_on_sphere(centre: Sequence[float], radius: float, azimuth: float, elevation: float) -> np.ndarray:
@@ -219,8 +227,9 @@ def turntable_cameras(
     if tree.ndc is not None and path == "auto" and elevation is None and radius is None:
         _leave_out(unused, "a spiral among the captured cameras", sway=sway)
         return _spiral_cameras(tree, tree.ndc, frames, width, height, fov)
-    points = occupied_points(tree)
-    orbit, amplitude, rise = _framed_orbit(tree, points, path, sway)
+    level = level_of(tree)
+    points = occupied_points(tree) if level is None else occupied_points(tree) @ level.T
+    orbit, amplitude, rise = _framed_orbit(tree, points, path, sway, level)
     if not orbit.forward_facing:
         _leave_out(unused, "a circle", sway=sway)
     distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
@@ -242,7 +251,8 @@ def turntable_cameras(
     half, drop = (min(widest, FIT_MARGIN * half), drop) if fov is None else (math.tan(math.radians(fov / 2)), 0.0)
     focal = 0.5 * height / half
     lens = (focal, width / 2, height / 2 - focal * drop)
-    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
+    cameras = [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
+    return cameras if level is None else [Similarity(1.0, level.T, np.zeros(3)).camera(camera) for camera in cameras]
 
 
 def _leave_out(unused: Callable[[str, str], object], path: str, **settings: float | None) -> None:
@@ -252,13 +262,19 @@ def _leave_out(unused: Callable[[str, str], object], path: str, **settings: floa
             unused(name, path)
 
 
-def _framed_orbit(tree: NerfTree, points: np.ndarray, path: str, sway: float | None) -> tuple[Orbit, float, float | None]:
-    """The orbit round the subject's points (N, 3), and the amplitudes of its sway.
+def _framed_orbit(
+    tree: NerfTree, points: np.ndarray, path: str, sway: float | None, level: np.ndarray | None
+) -> tuple[Orbit, float, float | None]:
+    """The orbit round the subject's points (N, 3), and the amplitudes of its sway; points and orbit turned by `level`.
 
     A region's middle is the centre; without one it is what the cameras look at.
     """
     orbit, rise = orbit_of(tree), None
     captured = captured_of(tree.metadata)
+    turn = np.eye(3) if level is None else level
+    if level is not None:
+        x, y, z = (level @ orbit.centre).tolist()
+        orbit = replace(orbit, centre=(x, y, z))
     if tree.region is not None:
         low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
         x, y, z = (float(c) for c in (low + high) / 2)
@@ -267,7 +283,7 @@ def _framed_orbit(tree: NerfTree, points: np.ndarray, path: str, sway: float | N
             orbit = replace(orbit, radius=max(orbit.radius, away))
         orbit = replace(orbit, centre=(x, y, z))
     if captured is not None:
-        found = coverage(captured.centres, np.asarray(orbit.centre))
+        found = coverage(captured.centres @ turn.T, np.asarray(orbit.centre))
         if tree.region is not None and found.distance > SMALLEST:
             orbit = replace(orbit, radius=found.distance, elevation=found.elevation)
         if found.arc < 360:

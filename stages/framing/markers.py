@@ -55,10 +55,17 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
         return capture
     if moved:
         warn(f"markers {_listed(moved)} moved, or their number was printed twice; they are not used.")
-    up = _up(capture, [*still.values()])
-    facts = {"used": sorted(still), "moved": moved, "size": size, "error": error, "up": up is not None}
-    job.say(f"{len(still)} markers give the scale, within {error:.2g} of each length (99 %){'' if up is None else ', and the upward axis'}.")
-    scaled = in_metres(capture if up is None else replace(capture, up=up), Similarity(size / length, np.eye(3), np.zeros(3)))
+    normal, tilt = _normal(capture, [*still.values()]) or (None, None)
+    facts = {"used": sorted(still), "moved": moved, "size": size, "error": error, "normal": None, "normal_error": tilt}
+    words, frame = f"{len(still)} markers give the scale, within {error:.2g} of each length (99 %)", Similarity(size / length, np.eye(3), np.zeros(3))
+    if normal is not None:
+        words += f", and the upward axis, within {tilt:.2g} degrees"
+        if capture.up is None and capture.bounds is None:  # nothing else states a frame
+            frame = _on_marker(still[min(still)], normal, frame.scale)
+            words += f"; the origin is the middle of marker {min(still)}"
+        facts["normal"] = (frame.rotation @ normal).tolist()
+    job.say(f"{words}.")
+    scaled = in_metres(capture, frame)
     return replace(scaled, facts=scaled.facts | {"markers": facts})
 
 
@@ -144,9 +151,16 @@ def refined(light: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     return corners
 
 
-def _up(capture: Capture, fits: list[SquareFit]) -> np.ndarray | None:
-    """The normal of the markers' plane where nothing states up, and they lie on the ground."""
-    normal = common_normal(fits)
-    if capture.up is not None or normal is None:
-        return None
-    return normal if normal @ estimated_up([photo.camera for photo in capture.photos]) > np.cos(np.radians(TILT)) else None
+def _normal(capture: Capture, fits: list[SquareFit]) -> tuple[np.ndarray, float] | None:
+    """The normal of the markers' plane and its error, where they lie on the ground."""
+    found = common_normal(fits)
+    near = estimated_up([photo.camera for photo in capture.photos]) if capture.up is None else capture.up
+    return found if found is not None and found[0] @ near > np.cos(np.radians(TILT)) else None
+
+
+def _on_marker(fit: SquareFit, normal: np.ndarray, scale: float) -> Similarity:
+    """To the frame with z along a normal, x along a marker's edges, and its origin in that marker's middle."""
+    x = np.cross(fit.square.rotation[:, 1], normal)
+    x /= np.linalg.norm(x)
+    turn = np.stack([x, np.cross(normal, x), normal])
+    return Similarity(scale, turn, -scale * turn @ fit.square.translation)

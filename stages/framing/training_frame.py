@@ -90,7 +90,6 @@ def find_training_frame(
     orbit = orbit_of(placed, np.clip(world.points(focus), *bounds))
     facts: dict[str, object] = {
         "up": [round(float(c), 6) for c in upward],
-        "up_from": "given" if up != "auto" else "stated by the source" if capture.up is not None else "estimated from the cameras",
         "bounds_from": how,
         "converging": converging,
         "scale": float(scale),

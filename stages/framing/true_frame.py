@@ -47,7 +47,7 @@ class Ground(Struct, frozen=True):
 
     up      unit, in the capture's frame
     height  of the ground along it, in the capture's unit
-    places  on it, as they were given; none where up alone was
+    places  on it, as they were given; none where it was found
     """
 
     up: Vector

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,10 @@ FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm; the "35 mm equivalent" 
 _MAKE, _MODEL, _EXIF = 271, 272, 34665
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X, _LENS = 37386, 41989, 41486, 41488, 40962, 42036
 _GPS = 34853
+_MAKER_NOTE, _APPLE, _ACCELERATION = 37500, b"Apple iOS\0", (8, 10, 3)  # of Apple's entry: tag, signed rationals, three of them
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_ORIENTATION = 274
+_SENSOR_TURNED = {1: np.eye(2), 3: -np.eye(2), 6: np.array([[0, -1], [1, 0]]), 8: np.array([[0, 1], [-1, 0]])}  # EXIF's number -> the picture's axes
 _FISHEYE = ("fisheye", "fish-eye", "fish eye")  # in names of lenses; rectilinear ones of the same focal lengths do not have it
 
 
@@ -164,6 +168,31 @@ def read_gps_position(path: Path) -> tuple[float, float, float] | None:
         return None
     known = latitude is not None and longitude is not None and np.isfinite(altitude) and abs(altitude) < 100_000.0
     return (latitude, longitude, altitude) if known else None  # type: ignore[return-value]
+
+
+def read_gravity(path: Path) -> np.ndarray | None:
+    """(3,) unit vector down, by the accelerometer as Apple's maker note has it, x right, y down, z forward after EXIF rotation; None without. Raises
+    UnreadableImage."""
+    with opened(path) as image:
+        exif = exif_of(image)
+        note = exif.get_ifd(_EXIF).get(_MAKER_NOTE)
+        turned = image.info.get("original_orientation", exif.get(_ORIENTATION, 1))  # libheif turns the pixels itself
+    if not isinstance(note, bytes) or not note.startswith(_APPLE) or turned not in _SENSOR_TURNED:
+        return None
+    try:
+        (count,) = struct.unpack_from(">H", note, 14)
+        for entry in range(min(count, 200)):
+            *what, at = struct.unpack_from(">HHII", note, 16 + 12 * entry)
+            if tuple(what) == _ACCELERATION:
+                above, below = np.array(struct.unpack_from(">6i", note, at), np.float64).reshape(3, 2).T
+                right, up, towards = above / np.where(below == 0, np.nan, below)  # of the phone held upright, in g
+                x, y = _SENSOR_TURNED[turned] @ (-up, -right)
+                force = np.array([x, y, -towards])
+                length = np.linalg.norm(force)
+                return force / length if 0.8 < length < 1.2 else None  # else the phone was shaken
+    except struct.error:
+        pass
+    return None
 
 
 def _degrees(value: Any, side: Any, sides: str, most: float) -> float | None:

@@ -29,6 +29,7 @@ from stages.formats.importers.source import MIN_IMAGES, abbreviated
 from stages.framing import training_frame
 from stages.framing.markers import with_markers
 from stages.framing.mask_use import MaskUse, doubts, find_mask_use, points_of_object, without_silhouette
+from stages.framing.upward import with_up
 from stages.io import working_images
 from stages.io.capture import FOREGROUND, Capture, Photo, without
 from stages.io.pictures import UnreadableImage
@@ -62,6 +63,7 @@ def run(job: Job) -> None:
     refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
     if settings.marker_size != "off":
         capture = with_markers(job, capture, settings.marker_size, warn)
+    capture = with_up(capture, settings.up, job.say, warn)
     capture, use = with_mask_use(job, capture, reader, warn)
     capture, written = _write_images(job, capture, warn)
     judged = capture  # by all sparse points that its cameras were found with

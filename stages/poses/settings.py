@@ -126,7 +126,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="poses",
-    version=15,
+    version=16,
     settings=PosesSettings,
     needs=(),
     run=ByName("stages.poses.run:run"),

@@ -18,7 +18,8 @@ from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
 from stages.framing.true_frame import NAME
-from stages.io.scene import Scene, View, save, similarity_to_json
+from stages.io.capture import SparsePoints
+from stages.io.scene import Scene, View, load, save, save_points, similarity_to_json
 from tests.efficientnerf.capture.rings import cameras_round
 from tests.stages.balls import ORBIT, SIMILARITY
 from tests.stages.io.meshes import Z_UP, block
@@ -270,6 +271,24 @@ def test_up_and_lengths_are_forgotten_each_for_itself(enerf: Enerf, run: Path) -
     assert camera_poses(enerf, run)[0].tolist() == first.tolist()
 
 
+def test_the_floor_that_sparse_points_show_makes_exports_upright(enerf: Enerf, run: Path) -> None:
+    poses, rng = PosesOutputs.of_run(run).folder, np.random.default_rng(0)
+    side = np.cross(UP, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    floor = rng.uniform(-1, 1, (600, 2)) @ np.stack([side, np.cross(UP, side)]) - 0.4 * UP
+    points = np.concatenate([floor, rng.normal(0, 0.2, (400, 3))])
+    sparse = SparsePoints(SIMILARITY.points(points), np.zeros((1000, 3), np.uint8), np.zeros(1000), ((0,),) * 1000)
+    assert "no floor or table" in enerf("orient", run, "--plane").err
+    save(replace(load(poses), points=True), poses)
+    save_points(sparse, poses)
+    found = enerf("orient", run, "--plane", "--json")
+    assert found.code == 0, found.err
+    assert degrees(np.array(found.object["up"]), UP) < 0.5
+    assert found.object["ground"] == pytest.approx(-0.4, abs=0.02)
+    assert enerf("orient", run, "--forget").code == 0
+    assert enerf("orient", run, "--up", by_numbers(UP), "--json").object["ground"] == pytest.approx(-0.4, abs=0.02)
+
+
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, -1, 0], [1, 0, 0], [1e-5, 0, -1], [-0.3, 0.4, -0.5], [0.2, -0.3, 0.93]])
 def test_a_direction_is_turned_up_and_back(enerf: Enerf, run: Path, up: list[float]) -> None:
     before, _ = camera_poses(enerf, run)
@@ -286,10 +305,10 @@ def test_an_up_that_the_run_knows_otherwise_is_told_with_the_angle(enerf: Enerf,
     angle = f"{degrees(UP, SIMILARITY.rotation.T[:, 2]):.1f} degrees"
     found = enerf("orient", run, "--up", by_numbers(UP))
     assert (found.err, angle in found.out) == ("", True)
-    PosesOutputs.of_run(run).report.write_text('{"facts": {"markers": {"error": 0.001, "up": true}}}', encoding="utf-8")
+    PosesOutputs.of_run(run).report.write_text('{"facts": {"up": {"by": "markers"}}}', encoding="utf-8")
     found = enerf("orient", run, "--up", "0,0,1", "--quiet")
     assert (found.code, found.out, found.err) == (0, "", f"warning: the new up is {angle} from the up that the run has, which is by markers.\n")
-    PosesOutputs.of_run(run).report.write_text('{"facts": {"gps": {"used": "scale and up"}}}', encoding="utf-8")
+    PosesOutputs.of_run(run).report.write_text('{"facts": {"up": {"by": "GPS"}}}', encoding="utf-8")
     assert "by GPS" in enerf("orient", run, "--up", "1,0,0", "--quiet").err
 
 

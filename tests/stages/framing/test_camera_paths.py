@@ -43,6 +43,24 @@ def test_pose_is_a_rotation_that_looks_at_the_centre_and_stands_upright(azimuth:
     assert math.degrees(math.asin((pose[2, 3] - centre[2]) / 3.0)) == pytest.approx(elevation, abs=1e-5)
 
 
+class UprightTree(BallTree):
+    @property
+    def metadata(self) -> dict[str, Any]:
+        return {**super().metadata, "up": [0.48, 0.6, 0.64]}
+
+
+@pytest.mark.parametrize("similarity", [Similarity.identity(), SIMILARITY])
+def test_turntables_are_level_by_an_up_that_was_set(similarity: Similarity) -> None:
+    whole = UprightTree(centre=(0.3, 0.2, 0.1), radius=0.3, similarity=similarity)
+    true = similarity.rotation @ [0.48, 0.6, 0.64]
+    cameras = turntable_cameras(whole, frames=8, width=64, height=48)
+    assert max(abs(camera.world_from_camera[:3, 0] @ true) for camera in cameras) < 1e-9
+    heights = [camera.centre @ true for camera in cameras]
+    assert np.ptp(heights) < 1e-9
+    seen = np.stack([project(camera, on_the_ball(whole))[0] for camera in cameras]) / (64, 48)
+    assert (seen.min() > 0, seen.max() < 1) == (True, True)
+
+
 @pytest.mark.parametrize("tree", [BallTree(), BallTree(centre=(0.3, 0.2, 0.1), radius=0.3), BallTree(voxel=1 / 8, radius=3.5)], ids=["ball", "aside", "larger"])
 @pytest.mark.parametrize("size", [(640, 480), (300, 500)])
 def test_turntable_shows_the_whole_asset_without_wasting_the_picture(tree: BallTree, size: tuple[int, int]) -> None:

@@ -78,6 +78,11 @@ def measured(folder: Path, capture: Capture) -> tuple[Capture, list[str]]:
     return with_markers(job, capture, EDGE, said.append), said
 
 
+def grown(before: Capture, after: Capture) -> float:
+    apart = [float(np.linalg.norm(each.photos[0].camera.centre - each.photos[3].camera.centre)) for each in (before, after)]
+    return apart[1] / apart[0]
+
+
 @pytest.mark.parametrize(("dictionary", "blur"), [("APRILTAG_36h11", 0.5), ("APRILTAG_36h11", 2.0), ("4X4_50", 1.2)])
 def test_markers_give_metres_and_up(tmp_path: Path, dictionary: str, blur: float) -> None:
     points = SparsePoints(np.ones((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), ())
@@ -85,7 +90,7 @@ def test_markers_give_metres_and_up(tmp_path: Path, dictionary: str, blur: float
     capture = replace(capture, photos=tuple(replace(photo, near=1.0, far=None) for photo in capture.photos))
     found, said = measured(tmp_path, capture)
     facts: Any = found.facts["markers"]
-    ratio = np.linalg.norm(found.photos[0].camera.centre) / np.linalg.norm(capture.photos[0].camera.centre) / UNIT
+    ratio = grown(capture, found) / UNIT
     assert found.metric
     assert said == []
     assert facts["used"] == [0, 1, 2, 3]
@@ -93,14 +98,24 @@ def test_markers_give_metres_and_up(tmp_path: Path, dictionary: str, blur: float
     assert found.points is not None
     assert found.bounds is not None
     np.testing.assert_allclose([found.points.xyz[0, 0], found.bounds[1, 2], found.photos[0].near], ratio * UNIT, rtol=1e-9)
-    assert found.up is not None
-    assert found.up @ TRUE_UP > np.cos(np.radians(1.0))
+    assert np.array(facts["normal"]) @ TRUE_UP > np.cos(np.radians(min(1.0, facts["normal_error"])))
+
+
+def test_the_origin_is_on_the_first_marker_where_nothing_else_states_a_frame(tmp_path: Path) -> None:
+    capture = capture_of(tmp_path)
+    found, _ = measured(tmp_path, capture)
+    np.testing.assert_allclose(found.facts["markers"]["normal"], [0, 0, 1], atol=1e-12)  # type: ignore[index]
+    side = np.cross(TRUE_UP, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    axes = np.stack([side, np.cross(TRUE_UP, side), TRUE_UP])
+    for before, after in zip(capture.photos, found.photos, strict=True):
+        np.testing.assert_allclose(after.camera.centre, axes @ before.camera.centre * UNIT - [*PLACES[0], 0], atol=0.005)
 
 
 def test_one_that_moves_is_left_out_and_if_most_move_the_source_is_refused(tmp_path: Path) -> None:
     capture = capture_of(tmp_path, moving=(2,))
     found, said = measured(tmp_path, capture)
-    ratio = np.linalg.norm(found.photos[0].camera.centre) / np.linalg.norm(capture.photos[0].camera.centre) / UNIT
+    ratio = grown(capture, found) / UNIT
     assert abs(ratio - 1) < 0.005
     assert "markers 2 moved" in said[0]
     with pytest.raises(BadInput):
