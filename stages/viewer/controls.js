@@ -26,7 +26,7 @@ export class Controls {
     this.canvas = viewer.canvas;
     this.pointers = new Map();
     this.frusta = false;
-    this.measure = new Measure(viewer, page.title);
+    this.measure = new Measure(viewer, page, () => this.region());
     viewer.drawn = (whole, milliseconds) => this.drawn(whole, milliseconds);
     this.pointing();
     this.keys();
@@ -111,11 +111,7 @@ export class Controls {
     on("previous", "click", () => this.step(-1));
     on("next", "click", () => this.step(1));
     on("blend", "input", () => {});
-    element("subject").addEventListener("change", async () => {
-      await viewer.show(element("subject").value === "subject");
-      this.background(element("subject").value === "subject" && element("background").value === "scene" ? "white" : element("background").value);
-      this.changed();
-    });
+    element("subject").addEventListener("change", () => this.region());
     element("about").addEventListener("click", () => this.help());
     element("subject").hidden = !viewer.tree.region;
     Object.assign(element("other"), { hidden: !page.asset, href: page.asset || "" });
@@ -126,6 +122,14 @@ export class Controls {
     element("facts-line").textContent = `${tree.count.toLocaleString("en")} ${tree.splats ? "Gaussians" : "voxels"}, ${megabytes} MB`;
     element("made").textContent = `${element("facts-line").textContent}, harmonics of degree ${tree.degree}. ${madeBy(tree.meta.provenance)}`;
     new MutationObserver(() => this.photograph()).observe(this.canvas, { attributes: true, attributeFilter: ["width", "height"] });
+  }
+
+  // What lies in the box, in the subject's region, or all.
+  async region() {
+    const { viewer } = this, wanted = this.measure.crop || (element("subject").value === "subject" ? viewer.tree.region : null);
+    await viewer.show(wanted);
+    this.background(wanted && element("background").value === "scene" ? "white" : element("background").value);
+    this.changed();
   }
 
   mode(mode) {

@@ -46,7 +46,7 @@ class Viewer {
     this.box = boxOf(tree);
     this.eye = new Eye(tree.meta.orbit || home, cameras, this.box, uprightOf(tree.meta));
     this.options = { mode: 0, background: tree.background || [0, 0, 0], surroundings: tree.environment !== null, rough: false, range: [1, 2] };
-    this.subject = false;
+    this.region = null;
     this.share = 0.5; // of the canvas' sides that is drawn while the eye moves
     this.rows = 64; // drawn at once while it rests
     this.spin = false;
@@ -154,13 +154,14 @@ class Viewer {
     return this.renderer.depth(view, x, y, this.settings(false));
   }
 
-  async show(subject) {
-    if (subject === this.subject) return;
-    this.subject = subject;
-    say(subject ? "The subject …" : "All of the scene …", 0.9);
+  // What lies in a region alone; null: all.
+  async show(region) {
+    if (region === this.region) return;
+    this.region = region;
+    say(region === null ? "All of the scene …" : region === this.tree.region ? "The subject …" : "What lies in the box …", 0.9);
     await breath();
     await breath();
-    this.renderer.load(this.tree, subject);
+    this.renderer.load(this.tree, region);
     element("loading").hidden = true;
     this.touch();
   }
@@ -183,7 +184,7 @@ async function start() {
   const checked = performance.now();
   await step("Textures …", 0.75, 0.75)(1);
   await breath();
-  const graphics = renderer.load(tree, false), viewer = new Viewer(tree, renderer, page.cameras, page.home);
+  const graphics = renderer.load(tree, null), viewer = new Viewer(tree, renderer, page.cameras, page.home);
   const controls = new Controls(viewer, page);
   element("loading").hidden = true;
   document.body.classList.add("ready");

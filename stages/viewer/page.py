@@ -36,6 +36,7 @@ MODULES = (
     "sha256", "asset", "payload", "volume", "shader", "renderer", "camera", "measure", "controls", "splats", "main",
 )  # each after those that it imports  # fmt: skip
 NAME = "viewer.html"
+Box = list[list[float]] | None
 LARGEST_SPZ = 2**29  # bytes, of millions of Gaussians
 PART = 3 * 2**18  # bytes of compressed data in an element of the page; a multiple of 3
 
@@ -56,21 +57,22 @@ def compact_bytes(asset: Path) -> bytes:
 
 
 def viewer_page(
-    asset: bytes, *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene"
+    asset: bytes, *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene", box: Box = None
 ) -> bytes:
     """The page of the bytes of an asset in the layout `compact`, which the page checks.
 
     cameras      captured cameras, training frame, to jump to; none: those of the asset's captured path
     photographs  WebP of the image of a camera, by the camera's name; as a pinhole camera of the same lens takes it
+    box          corners of the subject in the frame of exports; None: what the page takes for the scene
     """
     packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9)
     packed = packer.compress(asset) + packer.flush()
-    return _page(packed, len(asset), _cameras(cameras, photographs) or _captured_path(asset), title)
+    return _page(packed, len(asset), _cameras(cameras, photographs) or _captured_path(asset), title, box=box)
 
 
 def splats_page(
     spz: bytes, metadata: Mapping[str, Any], *, cameras: Sequence[Camera] = (), photographs: Mapping[str, bytes] | None = None, title: str = "scene",
-    asset: str | None = None, true: TrueFrame | None = None,
+    asset: str | None = None, true: TrueFrame | None = None, box: Box = None,
 ) -> bytes:  # fmt: skip
     """The page of Gaussians in the bytes of an SPZ file of ours.
 
@@ -93,7 +95,7 @@ def splats_page(
     changed = {} if true is None else true.metadata(metadata)
     about = {key: value for key, value in metadata.items() if key != "captured_path"} | changed
     facts = {"sha256": hashlib.sha256(content).hexdigest(), "frame": world_from_spz[:3].tolist(), "meta": about}
-    return _page(spz[10:-8], len(content), _cameras(cameras, photographs), title, splats=facts, asset=asset)  # the stream in the gzip
+    return _page(spz[10:-8], len(content), _cameras(cameras, photographs), title, splats=facts, asset=asset, box=box)  # the stream in the gzip
 
 
 def _page(packed: bytes, size: int, cameras: list[dict[str, Any]], title: str, **more: Any) -> bytes:

@@ -19,12 +19,12 @@ export class Renderer {
     this.textures = {};
   }
 
-  // The tree's textures; of its subject alone if `subject`. Those of an earlier call are replaced.
-  load(tree, subject) {
+  // The tree's textures; of what lies in a region alone, if there is one. Those of an earlier call are replaced.
+  load(tree, region) {
     const { gl } = this;
     let volume;
     try {
-      volume = volumeOf(tree, subject, this.most);
+      volume = volumeOf(tree, region, this.most);
     } catch (error) {
       if (error instanceof RangeError) throw new Unsupported(`The scene can't be shown here: ${error.message}.`);
       throw error;

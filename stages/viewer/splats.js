@@ -88,7 +88,7 @@ function planesOf({ turn, shift, size }, [fx, fy, cx, cy], width, height, spare)
 
 // Of a Gaussian at a point of the picture: its alpha, as `projection` and PAINT have it, and the depth at which it is densest along the point's ray. For that its
 // standard deviations have the low-pass of its picture, too: the ray may pass by a Gaussian that is thinner than a pixel.
-function alongRay({ splats: { frame, texels, rows, unit }, region }, number, { turn, shift, lens: [fx, fy, cx, cy], limits }, x, y, subject) {
+function alongRay({ splats: { frame, texels, rows, unit } }, number, { turn, shift, lens: [fx, fy, cx, cy], limits }, x, y, region) {
   const at = 16 * texels * number, view = new DataView(rows.buffer, at), mean = AXES.map((axis) => view.getInt32(4 * axis, true) * unit);
   const p = turn.map((row, axis) => dot(row, mean) + shift[axis]), code = view.getUint32(16, true), which = code >>> 30;
   const three = [20, 10, 0].map((low) => ((((code >>> low) & 511) * Math.SQRT1_2) / 511) * (1 - 2 * ((code >>> (low + 9)) & 1)));
@@ -103,7 +103,7 @@ function alongRay({ splats: { frame, texels, rows, unit }, region }, number, { t
   const [u, v] = [0, 1].map((axis) => root.map((each) => ([fx, fy][axis] / p[2]) * (each[axis] - slope[axis] * each[2])));
   const a = dot(u, u) + LOW_PASS, b = dot(u, v), c = dot(v, v) + LOW_PASS, dx = x - (fx * p[0]) / p[2] - cx, dy = y - (fy * p[1]) / p[2] - cy;
   const across = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]], determinant = dot(across, across) + LOW_PASS * (a + c - LOW_PASS);
-  const share = subject && region ? insideShare(region, ...frame.map((row) => dot(row, mean) + row[3])) : 1;
+  const share = region ? insideShare(region, ...frame.map((row) => dot(row, mean) + row[3])) : 1;
   const alpha = Math.min(0.99, ((share * rows[at + 12]) / 255) * Math.exp((-0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy)) / determinant));
   const ray = [(x - cx) / fx, (y - cy) / fy, 1], sums = [0, 0];
   for (const each of root) {
@@ -114,7 +114,7 @@ function alongRay({ splats: { frame, texels, rows, unit }, region }, number, { t
   return { alpha: alpha < 1 / 255 ? 0 : alpha, depth: sums[0] / sums[1] };
 }
 
-function projection({ degree, splats: { texels, unit }, region }) {
+function projection({ degree, splats: { texels, unit } }) {
   const code = (byte) => `float((w${byte >> 4}.${"xyzw"[(byte >> 2) & 3]} >> ${8 * (byte & 3)}u) & 255u)`;
   const term = ([factor, text], k) => `  colour += ${factor.toFixed(9)} * ${text} / 128.0 * (vec3(${[0, 1, 2].map((c) => code(HARMONICS + 3 * (k - 1) + c))}) - 128.0);`;
   return `#version 300 es
@@ -125,7 +125,10 @@ uniform vec3 shift, eye, origin;        // of the camera; of the eye in the file
 uniform vec4 lens, limits;
 uniform vec2 range;
 uniform int mode;
-uniform bool subject;
+uniform bool inRegion;                  // of which alone is drawn, see insideShare
+uniform mat3 box;
+uniform vec3 boxOrigin, middle, reach;
+uniform vec2 soft;                      // radius of the corners, width of the band
 uniform int count;
 layout(location = 0) out uvec4 place;   // centre in pixels, first column of a root of the covariance
 layout(location = 1) out uvec4 paint;   // the second column, below; colour and opacity
@@ -152,13 +155,13 @@ ${Array.from({ length: texels }, (_, n) => `  uvec4 w${n} = texelFetch(gaussians
   float determinant = dot(across, across) + ${LOW_PASS} * (a + dot(j, j)); // not a difference of products: needles would lose their digits
   place = floatBitsToUint(vec4(lens.xy * p.xy / p.z + lens.zw, sqrt(a), b / sqrt(a)));
   float opacity = ${code(12)} / 255.0;
-${region ? `  if (subject) {
-    vec3 v = abs(world * mean + origin - vec3(${region.low.map((low, axis) => (low + region.high[axis]) / 2)})) - vec3(${region.low.map((low, axis) => (region.high[axis] - low) / 2)});
-    float round = min(float(${region.radius}), float(${Math.min(region.high[0] - region.low[0], region.high[1] - region.low[1]) / 2}));
+  if (inRegion) {
+    vec3 v = abs(box * (world * mean + origin) + boxOrigin - middle) - reach;
+    float round = min(soft.x, min(reach.x, reach.y));
     vec2 plan = v.xy + round;
     float inside = -max(length(max(plan, 0.0)) + min(max(plan.x, plan.y), 0.0) - round, v.z);
-    opacity *= smoothstep(0.0, float(${Math.max(region.fade, 1e-9)}), inside);
-  }` : ""}
+    opacity *= smoothstep(0.0, soft.y, inside);
+  }
   vec3 d = normalize(mean - eye), colour = 0.5 + (vec3(${[13, 14, 15].map(code)}) / 255.0 - 0.5) / 0.15 * ${BASIS[0][0].toFixed(9)};
   if (mode == 0) {
     float xx = d.x * d.x, yy = d.y * d.y, zz = d.z * d.z;
@@ -203,8 +206,8 @@ void main() {
 }`;
 
 export class SplatRenderer extends Renderer {
-  load(tree, subject) {
-    this.subject = subject;
+  load(tree, region) {
+    this.region = region;
     if (this.tree) return 0;
     const { gl } = this, { texels, rows, places, extents } = tree.splats;
     const height = rows.length / (16 * texels * ROW), first = programOf(gl, VERTEX, projection(tree)), program = programOf(gl, SQUARES, PAINT);
@@ -257,7 +260,13 @@ export class SplatRenderer extends Renderer {
     gl.uniform4f(at("limits"), ...camera.limits);
     gl.uniform2f(at("range"), ...options.range);
     gl.uniform1i(at("mode"), options.mode);
-    gl.uniform1i(at("subject"), this.subject ? 1 : 0);
+    const { low, high, radius, fade, rows = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]] } = this.region || { low: [0, 0, 0], high: [0, 0, 0], radius: 0, fade: 0 };
+    gl.uniform1i(at("inRegion"), this.region ? 1 : 0);
+    gl.uniformMatrix3fv(at("box"), false, columns(rows));
+    gl.uniform3f(at("boxOrigin"), ...rows.map((row) => row[3]));
+    gl.uniform3f(at("middle"), ...AXES.map((axis) => (low[axis] + high[axis]) / 2));
+    gl.uniform3f(at("reach"), ...AXES.map((axis) => (high[axis] - low[axis]) / 2));
+    gl.uniform2f(at("soft"), radius, Math.max(fade, 1e-9));
     gl.uniform1i(at("count"), this.order.length);
     const used = Math.ceil(this.order.length / ROW);
     this.numbers.set(this.order);
@@ -277,7 +286,7 @@ export class SplatRenderer extends Renderer {
     const camera = cameraOf(frame, view, width, height), planes = planesOf(camera, [fx, fy, cx - x + 0.5, cy - y + 0.5], 1, 1, SOFT);
     const order = backToFront(places, extents, planes, NEAR, 0);
     for (let n = order.length - 1, light = 1; n >= 0; n--) {
-      const { alpha, depth } = alongRay(tree, order[n], camera, x, y, this.subject);
+      const { alpha, depth } = alongRay(tree, order[n], camera, x, y, this.region);
       light *= 1 - alpha;
       if (light < 0.5) return depth;
     }

@@ -42,9 +42,10 @@ function leaps(cells, [X, Y, Z]) {
   pass(false);
 }
 
-// Share of the opacity of a voxel at a point that belongs to a region's box.
+// Share of the opacity of a voxel at a point that belongs to a region's box; `rows`: from the world to the frame that the box is in.
 export function insideShare(region, x, y, z) {
-  const [a, b, c] = [0, 1, 2].map((axis) => Math.abs([x, y, z][axis] - (region.low[axis] + region.high[axis]) / 2) - (region.high[axis] - region.low[axis]) / 2);
+  const at = region.rows ? region.rows.map((row) => row[0] * x + row[1] * y + row[2] * z + row[3]) : [x, y, z];
+  const [a, b, c] = [0, 1, 2].map((axis) => Math.abs(at[axis] - (region.low[axis] + region.high[axis]) / 2) - (region.high[axis] - region.low[axis]) / 2);
   const radius = Math.min(region.radius, Math.min(region.high[0] - region.low[0], region.high[1] - region.low[1]) / 2), p = a + radius, q = b + radius;
   const across = Math.hypot(Math.max(p, 0), Math.max(q, 0)) + Math.min(Math.max(p, q), 0) - radius, distance = -Math.max(across, c);
   if (region.fade <= 0) return distance > 0 ? 1 : 0;
@@ -59,9 +60,9 @@ function tilesFor(bricks, side, most) {
   return z > limit ? null : [x, y, z];
 }
 
-// The arrays of a tree, or of its subject alone. Raises RangeError where textures of `most` texels a side do not hold it.
-export function volumeOf(tree, subject, most) {
-  const b = tree.brick, cube = b ** 3, pad = b + 2, region = subject ? tree.region : null, tiles = tilesFor(tree.bricks, pad, most);
+// The arrays of a tree, or of what of it lies in a region. Raises RangeError where textures of `most` texels a side do not hold it.
+export function volumeOf(tree, region, most) {
+  const b = tree.brick, cube = b ** 3, pad = b + 2, tiles = tilesFor(tree.bricks, pad, most);
   const height = tree.grids.map(({ shape }) => shape[2]), size = [0, 1].map((axis) => Math.max(...tree.grids.map(({ shape }) => shape[axis])));
   const depth = height.reduce((sum, z) => sum + z, 0);
   if (tiles === null || Math.max(...size, depth) > most) throw new RangeError(`larger than this device's textures of ${most} texels a side`);

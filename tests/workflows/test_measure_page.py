@@ -24,6 +24,8 @@ from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.writing import SourceFrame
+from stages.framing.camera_paths import pose_on_sphere
+from stages.framing.restriction import restricted
 from stages.framing.true_frame import AS_CAPTURED, Ground, save_frame
 from stages.io.scene import Orbit, Scene, View, save, similarity_to_json
 from tests.efficientnerf.capture.rings import cameras_round
@@ -38,6 +40,7 @@ from workflows.report.viewer import write_viewer_of
 pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
 
 HOME: dict[str, Any] = {**ORBIT, "centre": (0.0, 0.0, 0.0)}
+BOX = "-0.1 -0.2 -0.3 0.2 0.2 0.2"
 CORNERS = np.array([[0.35, 0.3], [0.6, 0.45], [0.45, 0.7]])  # shares of the canvas
 
 
@@ -105,6 +108,7 @@ def parts_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     return gaussians.means, gaussians.scales, gaussians.rotations, gaussians.opacities, gaussians.harmonics
 
 
+CAMERA = Camera("eye", 160, 120, "PINHOLE", (120.0, 120.0, 80.0, 60.0), pose_on_sphere((0.0, 0.0, 0.0), 4.0, 30.0, 25.0))
 FRAMES = {"as captured": AS_CAPTURED, "set": AS_CAPTURED.with_lengths(2.0, 0.01, ()).with_ground(Ground((0.48, 0.6, 0.64), 0.3, []))}
 
 
@@ -124,6 +128,12 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
         for x, y in places:
             page.page.locator("#scene").click(position={"x": int(x), "y": int(y)})
         lines = page.page.input_value("#lengths").splitlines()
+        page.page.fill("#box", BOX)
+        page.page.click("#crop")
+        page.shown()
+        page.page.select_option("#units", "100")
+        boxed = page.page.input_value("#lengths").splitlines()
+        page.page.click("#crop")
         page.page.click("#undo")
         assert "in all" not in page.page.input_value("#lengths")
         page.page.click("#copy")
@@ -131,6 +141,8 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
         page.page.keyboard.press("m")
         assert page.page.is_hidden("#measured")
         assert page.console == []
+    assert boxed[-3] == "box: 30 cm × 40 cm × 50 cm"
+    assert boxed[-2] == f"enerf export 'a run' --crop {BOX} --to box.glb"
     program, verb, name, *given = shlex.split(lines[-1])
     assert (program, verb, name) == ("enerf", "measure", "a run")
     found = enerf("measure", run, *given, "--json")
@@ -151,6 +163,8 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
     if frame == "set":  # z is up, in the picture too
         heights = float(lines[3].split(": ")[1].removesuffix(" m")), float(lines[4].rpartition("×")[2].removesuffix(" m"))
         np.testing.assert_allclose(heights, [picked[-1, 2] - picked[0, 2], np.ptp(picked[:, 2])], rtol=1e-3)
+        over_ground = [float(each.split(": ")[1].removesuffix(" m")) for each in lines[5].removeprefix("over the ground: ").split(", ")]
+        np.testing.assert_allclose(over_ground, picked[:, 2], rtol=1e-3, atol=1e-4)
         right = true.rotation @ SIMILARITY.rotation.T @ pose[:3, 0]
         assert abs(right[2]) < 1e-6
 
@@ -166,3 +180,40 @@ def test_where_there_is_no_surface_nothing_is_measured(chromium: Any, run: Path,
         page.page.locator("#scene").click(position={"x": 3, "y": 3})
         assert "no surface" in page.page.input_value("#lengths")
         assert page.console == []
+
+
+@pytest.mark.parametrize("kind", ["asset", "Gaussians"])
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_box_shows_what_its_command_exports(chromium: Any, run: Path, tmp_path: Path, kind: str, frame: str) -> None:
+    file, true = tmp_path / "page.html", FRAMES[frame]
+    if frame == "set":
+        save_frame(true, run)
+    write_viewer_of(run, shown_by(kind, run), file)
+    middle, unit = true.from_capture.points(SIMILARITY.inverse().points(np.zeros((1, 3)))), true.from_capture.scale / SIMILARITY.scale
+    corners = middle + unit * np.array([[-0.25, -0.9, -0.4], [0.6, 0.5, 0.9]])
+    if kind == "asset":
+        tree = format.load(BakeOutputs.of_run(run).asset)
+        tree = tree.with_metadata(**true.metadata(tree.metadata))
+        expected = render(restricted(tree, "all", corners.ravel().tolist()), CAMERA, background=(1, 1, 1)).colour
+    else:
+        up = SourceFrame(SIMILARITY).up
+        captured = moved(read_spz(SplatsOutputs.of_run(run).spz)[1], Similarity(1.0, gltf_from_capture(up).T, np.zeros(3)))
+        at = true.from_capture.points(captured.means.astype(np.float64))
+        inside = ((at >= corners[0]) & (at <= corners[1])).all(axis=1)
+        expected = rendering.render(Gaussians(*(part[inside] for part in parts_of(moved(captured, SIMILARITY)))), CAMERA, background=(1, 1, 1)).colour
+    with browser.opened(chromium, file, **WIDE) as page:
+        page.ready()
+        page.page.click("#measure")
+        page.page.fill("#box", " ".join(f"{x:.9g}" for x in corners.ravel()))
+        page.page.click("#crop")
+        page.page.wait_for_function("enerf.ready.then(({viewer}) => viewer.region !== null)")
+        page.shown()
+        cut = page.rendered(CAMERA, background=[1, 1, 1], surroundings=False)
+        page.page.click("#crop")
+        page.page.wait_for_function("enerf.ready.then(({viewer}) => viewer.region === null)")
+        page.shown()
+        assert page.console == []
+        whole = page.rendered(CAMERA, background=[1, 1, 1], surroundings=False)
+    shown = np.rint(255 * np.clip(expected, 0, 1))
+    assert (np.abs(cut - shown).max(axis=2) > 8).mean() < 0.01
+    assert (np.abs(whole - shown).max(axis=2) > 8).mean() > 0.05

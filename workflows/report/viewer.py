@@ -11,8 +11,9 @@ from efficientnerf.asset.format import FormatError, contents, load, serialize
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import PipelineError
 from pipeline.run import NAME, Run, cannot_write
-from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
 from stages.framing import true_frame
+from stages.mesh.files import read_vertices
 from stages.viewer.captured import captured_views
 from stages.viewer.page import compact_bytes, splats_page, viewer_page
 from workflows.report.signature import ASSET_VIEWER, VIEWER, is_own, viewers, write_page
@@ -54,12 +55,12 @@ def write_viewer_of(run: Path, shown: Path, target: Path, other: str | None = No
     other  the page of the asset, next to that of the Gaussians
     """
     cameras, photographs = captured(run)
-    title = os.path.basename(os.path.abspath(run))
+    title, box = os.path.basename(os.path.abspath(run)), _box_of(run)
     if shown == SplatsOutputs.of_run(run).spz:
         metadata = contents(BakeOutputs.of_run(run).asset)[0]
-        page = splats_page(shown.read_bytes(), metadata, cameras=cameras, photographs=photographs, title=title, asset=other, true=_frame_of(run))
+        page = splats_page(shown.read_bytes(), metadata, cameras=cameras, photographs=photographs, title=title, asset=other, true=_frame_of(run), box=box)
     else:
-        page = viewer_page(page_bytes(run, shown), cameras=cameras, photographs=photographs, title=title)
+        page = viewer_page(page_bytes(run, shown), cameras=cameras, photographs=photographs, title=title, box=box)
     write_page(target, page)
 
 
@@ -79,6 +80,17 @@ def _frame_of(run: Path) -> true_frame.TrueFrame | None:
     return None
 
 
+def _box_of(run: Path) -> list[list[float]] | None:
+    """The corners of the box round the run's mesh, in the frame of exports; None where there is no sound mesh."""
+    with suppress(PipelineError):
+        mesh = MeshOutputs.of_run(run)
+        vertices = read_vertices(mesh) if mesh.ply.is_file() else ()
+        if len(vertices):
+            placed = (_frame_of(run) or true_frame.AS_CAPTURED).from_capture.points(vertices)
+            return [placed.min(0).tolist(), placed.max(0).tolist()]
+    return None
+
+
 def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
     """Cameras and photographs of the run in this folder, as `stages.viewer.page` takes them; none where they are missing or damaged."""
     with suppress(PipelineError):
@@ -90,7 +102,7 @@ def is_newest(run: Run, path: Path) -> bool:
     """Whether the page is our own, and none of the artifacts that it shows was published after it: that is a rename of its folder, which sets ctime."""
     try:
         status = os.stat(path, follow_symlinks=False)
-        stages = (BakeOutputs.stage, SplatsOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)
+        stages = (BakeOutputs.stage, MeshOutputs.stage, SplatsOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)
         shown = [run.path / NAME, run.path / true_frame.NAME, *map(run.folder, stages)]  # run.json says what is to be shown
         changed = [os.stat(each, follow_symlinks=False).st_ctime_ns for each in shown if os.path.lexists(each)]
     except OSError:
