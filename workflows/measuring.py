@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from efficientnerf.capture.markers import SURE, common_ratio
 from efficientnerf.capture.supports import level_plane
@@ -37,6 +38,7 @@ from workflows.loading import describe_asset
 LARGEST_ERROR = 0.03  # of a length: what is less sure is no unit, as of markers
 LARGEST_TILT = 5.0  # degrees, of up: what is less sure is none
 LEVEL, FOUND_WITHIN = 5.0, 30.0  # degrees from level of a floor or table: by an up that is given; by the one that the run has
+FEW_POINTS = 30  # near the surface, from which they say how noisy it is
 LOWEST = 0.005  # quantile of the mesh's heights that it stands on where there is no floor or table
 FLATTEST = 0.05  # of its longest side, how high the triangle of three places on the ground is at least
 LARGEST_MISS = 0.01  # of a picture's longest side: beyond it the pixels are not of one point
@@ -143,25 +145,60 @@ def measured(run: Path, *, captured: bool = False) -> Measured:
 
 
 def sides_of(run: Path) -> dict[str, Any] | None:
-    """The upright box of least area round the run's mesh: its longer side, its shorter one and its height, and their errors; None without a mesh."""
+    """The upright box of least area round the run's mesh: its longer side, its shorter one and its height, and their errors, of which all is in the units of
+    exports: how far sparse points are from the surface, or half a voxel, and how far cameras see them off; and a photograph's pixel on it. None without a mesh.
+    """
     outputs = MeshOutputs.of_run(run)
-    vertices = read_vertices(outputs) if outputs.ply.is_file() else np.zeros((0, 3))
+    vertices, normals = read_vertices(outputs) if outputs.ply.is_file() else (np.zeros((0, 3)),) * 2
     if not len(vertices):
         return None
     inside = measured(run)
     turned = vertices @ gltf_from_capture(inside.up).T  # y up
     longer, shorter = sorted(cv2.minAreaRect((turned[:, [0, 2]] - turned[0, [0, 2]]).astype(np.float32))[1], reverse=True)
-    sides = inside.frame.scale * np.array([longer, shorter, np.ptp(turned[:, 1])])
-    errors = np.hypot(SURE * np.sqrt(2) * inside.grain * inside.frame.scale, (inside.error or 0.0) * sides)
-    return {"unit": inside.unit, "scale_error": inside.error, "sides": sides.tolist(), "errors": errors.tolist()}
+    scale = inside.frame.scale
+    sides = scale * np.array([longer, shorter, np.ptp(turned[:, 1])])
+    pixel = scale * _pixel(inside, vertices)
+    surface, cameras = scale * _surface_noise(inside, vertices, normals, _points_of(run)), pixel * _reprojection_error(inside, run)
+    errors = np.hypot(SURE * np.sqrt(2) * np.hypot(surface, cameras), (inside.error or 0.0) * sides)
+    facts = {"surface_noise": surface, "camera_noise": cameras, "ground_sample_distance": pixel}
+    return {"unit": inside.unit, "scale_error": inside.error, "sides": sides.tolist(), "errors": errors.tolist(), **facts}
+
+
+def _pixel(inside: Measured, vertices: np.ndarray) -> float:
+    """The size of a photograph's pixel on the surface, at full size, in the median over photographs; capture's unit."""
+    some, sizes = vertices[:: max(1, len(vertices) // 1000)], []
+    for camera in inside.cameras.values():
+        depth = (some - camera.centre) @ camera.forward
+        if (depth > 0).any():
+            sizes.append(float(np.median(depth[depth > 0])) / camera.intrinsics["fx"])
+    return float(np.median(sizes)) if sizes else 0.0
+
+
+def _reprojection_error(inside: Measured, run: Path) -> float:
+    """Mean, in pixels of the photographs at full size: that of photographs is stated at the size at which features are found."""
+    poses, longest = open_run(run).settings.get("poses", {}), max((max(each.width, each.height) for each in inside.cameras.values()), default=1)
+    return (poses_report(PosesOutputs.of_run(run).folder).reprojection_error or 0.0) * max(1.0, longest / poses.get("feature_image_size", longest))
+
+
+def _surface_noise(inside: Measured, vertices: np.ndarray, normals: np.ndarray, points: np.ndarray) -> float:
+    """The standard deviation of the surface's places: by how far sparse points are from it, those that are within a few voxels; at least half a voxel."""
+    if not len(points):
+        return inside.grain
+    apart, nearest = cKDTree(vertices).query(points, distance_upper_bound=max(6 * inside.grain, 1e-12))
+    near, at = np.isfinite(apart), nearest[np.isfinite(apart)]
+    if near.sum() < FEW_POINTS:
+        return inside.grain
+    off = np.abs(((points[near] - vertices[at]) * normals[at]).sum(axis=1))
+    return max(inside.grain, 1.4826 * float(np.median(off)))
 
 
 def sides_in_words(found: Mapping[str, Any]) -> str:
-    """`0.42 m by 0.31 m, 0.60 m high, within 0.004 m (99 %)`."""
+    """`0.42 m by 0.31 m, 0.60 m high, within 0.004 m (99 %); a pixel of the photographs is 0.0003 m on it`."""
     error, unit = max(found["errors"]), " m" if found["unit"] == "metre" else ""
     longer, shorter, height = (with_error(side, error, unit).partition(",")[0] for side in found["sides"])
     within = with_error(0.0, error, unit).partition(",")[2]
-    return f"{longer} by {shorter}, {height} high" + (f",{within}" if within else "")
+    pixel = f"; a pixel of the photographs is {found['ground_sample_distance']:.2g}{unit} on it"
+    return f"{longer} by {shorter}, {height} high" + (f",{within}" if within else "") + pixel
 
 
 def measure(inside: Measured, places: Sequence[str]) -> dict[str, Any]:
@@ -237,7 +274,7 @@ def ground_of(inside: Measured, run: Path, text: str) -> Ground:
         middle = np.median(points, axis=0)
         height = float((middle - (middle @ normal - offset) * normal) @ up)
     else:
-        vertices = read_vertices(mesh) if mesh.ply.is_file() else np.zeros((1, 3))
+        vertices = read_vertices(mesh)[0] if mesh.ply.is_file() else np.zeros((1, 3))
         height = float(np.quantile(vertices @ up, LOWEST))
     return Ground(tuple(up.tolist()), height, [])
 

@@ -33,10 +33,11 @@ def read_mesh(outputs: MeshOutputs) -> Mesh:
     return Mesh(positions, faces, normals, colours, texture=_read_texture(outputs, faces, positions) if len(faces) else None)
 
 
-def read_vertices(outputs: MeshOutputs) -> np.ndarray:
-    """(N, 3) in the capture's frame. Raises CorruptArtifact."""
+def read_vertices(outputs: MeshOutputs) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) in the capture's frame, and their normals. Raises CorruptArtifact."""
     vertices, _ = _read_ply(outputs.ply)
-    return np.stack([vertices[name] for name in ("x", "y", "z")], 1).astype(np.float64)
+    places, normals = (np.stack([vertices[name] for name in names], 1).astype(np.float64) for names in (("x", "y", "z"), ("nx", "ny", "nz")))
+    return places, normals
 
 
 def write_empty_meshes(outputs: MeshOutputs, frame: SourceFrame) -> None:

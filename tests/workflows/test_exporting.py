@@ -83,7 +83,7 @@ def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(ru
     PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
     save_frame(TrueFrame(Similarity(3.0, np.eye(3), np.zeros(3)), 0.01, ()), run)
     export(run, "mesh.obj", "mesh.ply", "mesh.glb")
-    before, after = (read_vertices(SimpleNamespace(ply=path)) for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
+    before, after = (read_vertices(SimpleNamespace(ply=path))[0] for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
     np.testing.assert_allclose(after, 3 * before, rtol=1e-6)
     assert b"unit metre" in (run.parent / "mesh.obj").read_bytes()[:200]
 
@@ -94,7 +94,7 @@ def test_what_the_stage_has_made_is_written_upright_where_up_was_set(run: Path) 
     up = np.array([0.48, -0.6, -0.64])
     save_frame(AS_CAPTURED.with_ground(Ground(tuple(up.tolist()), 0.5, [])), run)
     export(run, "mesh.ply", "mesh.glb")
-    before, after = (read_vertices(SimpleNamespace(ply=path)) for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
+    before, after = (read_vertices(SimpleNamespace(ply=path))[0] for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
     np.testing.assert_allclose(after[:, 2], before @ up - 0.5, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(after - after[0], axis=1), np.linalg.norm(before - before[0], axis=1), rtol=1e-5)
     assert b"up 0 0 1; unit metre" in (run.parent / "mesh.ply").read_bytes()[:200]

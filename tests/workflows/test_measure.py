@@ -110,6 +110,8 @@ def test_the_size_of_the_mesh_is_told_with_its_error_and_in_the_report(enerf: En
     found = enerf("measure", run, "--json")
     np.testing.assert_allclose(found.object["sides"], [2.0, 0.5, 1.5], rtol=1e-5)
     assert found.object["unit"] == "unknown"
+    depth = float(np.median([(flat * [2.0, 0.5, 1.5] @ turn.T - camera.centre) @ camera.forward for camera in cameras()]))
+    assert found.object["ground_sample_distance"] == pytest.approx(depth / 1500, rel=0.1)
     assert enerf("report", run).code == 0
     unsized = (run / "report.html").read_text(encoding="utf-8")
     assert "2.0000 by 0.5000, 1.5000 high" in unsized
@@ -119,6 +121,25 @@ def test_the_size_of_the_mesh_is_told_with_its_error_and_in_the_report(enerf: En
     sized = (run / "report.html").read_text(encoding="utf-8")  # written again by the command
     assert re.search(r"6\.0+ m by 1\.50+ m, 4\.50+ m high, within 0\.\d+ m \(99 %\)", sized)
     assert "For metres" not in sized
+
+
+def test_how_far_sparse_points_are_from_the_mesh_is_in_its_error(enerf: Enerf, run: Path) -> None:
+    outputs, poses, rng = MeshOutputs.of_run(run), PosesOutputs.of_run(run).folder, np.random.default_rng(0)
+    outputs.folder.mkdir()
+    MESH_EXPORTERS[".ply"](block(), outputs.ply, Z_UP)
+    exact = enerf("measure", run, "--json").object
+    corners = np.repeat(block().vertices, 20, axis=0)
+    points = SIMILARITY.points(corners + rng.normal(0, 0.3 * exact["surface_noise"], corners.shape))
+    save(replace(load(poses), points=True), poses)
+    sparse = SparsePoints(points, np.zeros(points.shape, np.uint8), np.zeros(len(points)), ((0,),) * len(points))
+    save_points(sparse, poses)
+    assert enerf("measure", run, "--json").object == exact  # less than half a voxel says nothing
+    save_points(replace(sparse, xyz=SIMILARITY.points(corners + 2 * exact["surface_noise"] * rng.normal(0, 1, corners.shape))), poses)
+    PosesOutputs.of_run(run).report.write_text('{"reprojection_error": 0.5}', encoding="utf-8")
+    noisy = enerf("measure", run, "--json").object
+    assert noisy["surface_noise"] > exact["surface_noise"]
+    assert noisy["camera_noise"] == pytest.approx(0.5 * noisy["ground_sample_distance"])
+    assert noisy["errors"][0] == pytest.approx(2.58 * 2**0.5 * np.hypot(noisy["surface_noise"], noisy["camera_noise"]))
 
 
 def test_lengths_that_do_not_agree_or_are_not_sure_are_refused(enerf: Enerf, run: Path) -> None:

@@ -26,7 +26,7 @@ from pipeline.text import printable
 from stages.reports import CameraVerdict, PosesReport
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
-from workflows.measuring import sides_in_words, sides_of, unit_in_words
+from workflows.measuring import measured, sides_in_words, sides_of, unit_in_words
 from workflows.report import documents
 from workflows.report.documents import Damaged, Metrics, Quality, ResultVerdict
 from workflows.report.signature import write_page
@@ -201,9 +201,9 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
 def _sides(folder: Path) -> list[str]:
     """How large the mesh is and in which unit, or how to get one."""
     with suppress(PipelineError):
-        found = sides_of(folder)
-        if found is not None:
-            return [f"{sides_in_words(found)}.", *unit_in_words(found)]
+        found, inside = sides_of(folder), measured(folder)
+        known = [f"Lengths are in metres, within {inside.error:.2g} of each (99 %)."] if inside.metric and inside.error is not None else []
+        return [*([] if found is None else [f"The mesh: {sides_in_words(found)}."]), *known, *unit_in_words({"unit": inside.unit, "scale_error": inside.error})]
     return []
 
 

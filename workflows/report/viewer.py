@@ -84,8 +84,7 @@ def _box_of(run: Path) -> list[list[float]] | None:
     """The corners of the box round the run's mesh, in the frame of exports; None where there is no sound mesh."""
     with suppress(PipelineError):
         mesh = MeshOutputs.of_run(run)
-        vertices = read_vertices(mesh) if mesh.ply.is_file() else ()
-        if len(vertices):
+        if mesh.ply.is_file() and len(vertices := read_vertices(mesh)[0]):
             placed = (_frame_of(run) or true_frame.AS_CAPTURED).from_capture.points(vertices)
             return [placed.min(0).tolist(), placed.max(0).tolist()]
     return None
