@@ -154,7 +154,7 @@ def outcome(capture: Capture, work: Path) -> dict[str, Any]:
     try:
         found = with_markers(job, capture, EDGE, said.append)
     except BadInput as error:
-        return {"refused": str(error)[:100]}
+        return {"refused": str(error).removeprefix(f"{work}: ")[:100]}
     if not found.metric:
         return {"refused": said[-1][:100]}
     facts: Any = found.facts["markers"]

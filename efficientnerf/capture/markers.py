@@ -30,13 +30,13 @@ class SquareFit:
     square   takes SQUARE to its corners; its scale is the length of an edge
     spread   standard deviation of the logarithm of that length
     agrees   (V,) the views that agree
-    cameras  by how much those turn what they agree on, standard deviation in radians: by how far they miss it
+    shift    standard deviation of its place that the cameras cause, by how far they miss it; they shift other markers, too
     """
 
     square: Similarity
     spread: float
     agrees: np.ndarray
-    cameras: float = 0.0
+    shift: float = 0.0
 
     @property
     def still(self) -> bool:
@@ -76,8 +76,9 @@ def fit_square(cameras: Sequence[Camera], corners: np.ndarray) -> SquareFit:
         return SquareFit(square, np.inf, agrees)
     noise = float((miss[agrees] ** 2).sum() * 4 / max(8 * agrees.sum() - 7, 1))  # px^2 of a coordinate
     bias = CORNER_BIAS / float(np.median(edge[agrees]))
-    turned = np.sqrt(noise / agrees.sum()) / float(np.median(focal[agrees]))
-    return SquareFit(square, float(np.sqrt(noise * inverse[6, 6] + bias**2)), agrees, float(turned))
+    distance = np.linalg.norm(origin[:, 0] - square.translation, axis=1)
+    shift = np.sqrt(noise / agrees.sum()) * float(np.median((distance / focal)[agrees]))
+    return SquareFit(square, float(np.sqrt(noise * inverse[6, 6] + bias**2)), agrees, float(shift))
 
 
 def common_length(fits: Sequence[SquareFit]) -> tuple[float, float, float]:
@@ -104,8 +105,9 @@ def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> tuple[np.nda
     faces = np.array([fit.square.rotation[:, 2] for fit in fits])
     if extent[2] > flat * extent[1] or extent[1] < 0.1 * extent[0]:
         return None
-    uneven = extent[2] / extent[1] / np.sqrt(len(fits) - 2)  # corners of one marker miss the plane alike
-    error = np.degrees(np.arctan(SURE * np.hypot(uneven, np.median([fit.cameras for fit in fits]))))  # and all markers where cameras are off
+    uneven = extent[2] / np.sqrt(len(fits) - 2)  # corners of one marker miss the plane alike
+    shift = 2 * float(np.median([fit.shift for fit in fits]))  # `extent` counts each of the places four times
+    error = np.degrees(np.arctan(SURE * np.hypot(uneven, shift) / extent[1]))
     return axes[2] * np.sign((faces @ axes[2]).sum()), float(error)
 
 

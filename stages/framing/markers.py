@@ -39,7 +39,8 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     """The capture in metres, by markers with edges of `size` metres; as it is, with a warning, where none are found. Raises BadInput where they disagree."""
     views = _by_marker(job, capture)
     if not views:
-        warn(f"no marker is seen by {MIN_VIEWS} photographs: lengths stay as they are. Dictionaries tried: {', '.join(DICTIONARIES)}.")
+        tried = f"Dictionaries tried: {', '.join(DICTIONARIES)}; circular targets are not read."
+        warn(f"no marker is seen by {MIN_VIEWS} photographs: lengths stay as they are. {tried}")
         return capture
     fits = {number: fit_square([photo.camera for photo, _ in seen], np.stack([corners for _, corners in seen])) for number, seen in views.items()}
     still = {number: fit for number, fit in fits.items() if fit.still}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from efficientnerf.capture.markers import SQUARE, common_length, common_normal, fit_square
 from efficientnerf.geometry.cameras import Camera, Similarity, project
@@ -75,3 +76,18 @@ def test_markers_in_a_plane_have_its_normal() -> None:
     assert common_normal(fits[:2]) is None
     raised = fit_square(cameras, seen(cameras, square_at((0.3, 0.4, 0.3)), rng, 0.2))
     assert common_normal([*fits, raised]) is None
+
+
+def test_up_lies_within_the_stated_error_where_cameras_are_off() -> None:
+    outside, known = 0, 0
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        cameras = cameras_round(int(rng.integers(4, 9)), rng)
+        off = [Similarity(1.0, Rotation.from_rotvec(rng.normal(0, 2e-4, 3)).as_matrix(), rng.normal(0, 1.5e-3, 3)).camera(camera) for camera in cameras]
+        squares = [square_at((*rng.uniform(-0.4, 0.4, 2), 0.0), turn=rng.uniform(0, 6)) for _ in range(int(rng.integers(3, 7)))]
+        normal = common_normal([fit_square(off, seen(cameras, square, rng, 0.2)) for square in squares])
+        if normal is not None:
+            known += 1
+            outside += np.degrees(np.arccos(min(1.0, normal[0][2]))) > normal[1]
+    assert known > 12
+    assert outside <= 0.05 * known, (outside, known)
