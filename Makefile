@@ -10,6 +10,7 @@
 # make viewer-page   write docs/still_life_viewer.html, which the README links: ten minutes on two cores
 # make docs      rewrite the pages under docs/ that are made from the code
 # make lint      ruff and mypy
+# make release   build sdist and wheel, and try the wheel in empty environments; RELEASE_OPTIONS go to .ci/release.py (--quick only builds)
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -18,7 +19,7 @@ INSTALLED := $(VENV)/.installed
 # In the order of tests/conftest.py: by itself xdist begins with the files that have most tests, and a worker ends alone with a long one.
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-all torture faults gpu gpu-packages viewer-page docs lint install clean
+.PHONY: demo test test-slow test-all torture faults gpu gpu-packages viewer-page docs lint release install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
@@ -75,6 +76,11 @@ docs: $(INSTALLED)
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+release:
+	$(PYTHON) -m venv build/release/tools
+	build/release/tools/bin/python -m pip install --quiet build twine uv pipx
+	build/release/tools/bin/python .ci/release.py $(RELEASE_OPTIONS)
 
 install: $(INSTALLED)
 
