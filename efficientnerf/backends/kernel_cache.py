@@ -62,7 +62,7 @@ def key() -> str:
 @functools.cache
 def folder() -> Path:
     """The folder for kernels of this key, made if need be. A RuntimeWarning says so where the preferred one cannot be used."""
-    place, refusals = first_private(_roots(), key())
+    place, refusals = first_private(roots(), key())
     if place is None:
         place = Path(tempfile.mkdtemp(prefix="efficientnerf-kernels-"))
         atexit.register(shutil.rmtree, place, ignore_errors=True)
@@ -92,7 +92,7 @@ def key_of_kernels() -> str:
 
 def are_compiled() -> bool:
     """Whether kernels of these sources are kept, about as many as a run uses. Writes nothing."""
-    for root in _roots():
+    for root in roots():
         if (root / key()).is_dir():
             places = (root / key() / module / SOURCES.key([module]) for module in SOURCES.modules_below(KERNELS))
             return sum(1 for place in places for _ in place.glob("*.nbi")) >= USUAL
@@ -121,7 +121,8 @@ def cache_folder() -> Path:
     return Path(os.environ.get("ENERF_CACHE_DIR") or platformdirs.user_cache_dir("efficientnerf", appauthor=False)).absolute()
 
 
-def _roots() -> Iterator[Path]:
+def roots() -> Iterator[Path]:
+    """Folders that kernels may be kept in, the preferred first."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     if chosen and not os.environ.get("ENERF_CACHE_DIR"):
         yield Path(chosen).absolute() / "efficientnerf"

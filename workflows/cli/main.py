@@ -28,6 +28,8 @@ COMMANDS = {  # name -> its module, and what `enerf --help` says of it
     "measure": ("workflows.measure", "Measure lengths in a run, or give it metres by lengths that you know."),
     "orient": ("workflows.measure", "Set which way is up in a run, by places on the ground."),
     "check": ("workflows.inspection.command", "Check photographs before a run."),
+    "doctor": ("workflows.inspection.doctor", "Show what is installed and what works, for a bug report."),
+    "cache": ("workflows.inspection.doctor", "Show or remove compiled kernels and features."),
     "status": ("workflows.cli.status", "Show which stages are up to date, and why not."),
     "verify": ("workflows.cli.verify", "Check every file against its recorded hash."),
     "report": ("workflows.report.command", "Write a page about a run: renders, metrics, settings."),

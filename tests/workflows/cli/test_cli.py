@@ -212,7 +212,8 @@ HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib", "skimage", "scipy", 
 def test_what_has_nothing_to_do_imports_nothing_heavy(tmp_path: Path) -> None:
     """In a process of its own, with the real stages and a run of which nothing has been made (--dry-run keeps it from beginning)."""
     run = str(Run.create(tmp_path / "run", tmp_path).path)
-    calls = [["--help"], ["run", "--help"], ["presets"], ["status", run], ["run", "--out", run, "--dry-run"], ["verify", run]]
+    calls = [["--help"], ["run", "--help"], ["presets"], ["status", run], ["run", "--out", run, "--dry-run"], ["verify", run], ["cache"]]
+    calls.append(["doctor", "--seconds", "0"])
     program = (
         "import sys; from workflows.cli.main import main\n"
         f"for arguments in {calls!r}:\n"
