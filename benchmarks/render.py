@@ -64,7 +64,7 @@ def _seconds(what: Any) -> float:
 
 def cameras(tree: Any, width: int, height: int, count: int, fov: float) -> list[Any]:
     """`count` cameras on the asset's orbit."""
-    from stages.framing.camera_paths import turntable_cameras
+    from efficientnerf.asset.camera_paths import turntable_cameras
 
     return list(turntable_cameras(tree, frames=count, width=width, height=height, fov=fov))
 

@@ -188,10 +188,10 @@ def truth_from_capture(run: Path, cameras: dict[str, Camera]) -> tuple[Similarit
 
 def region_of(run: Path, truth_from_capture: Similarity) -> Any:
     """Points of the true frame -> whether they lie in the foreground region of a run's asset, without its fading band; in its box where it has no region."""
+    from efficientnerf.asset.camera_paths import similarity_of
     from efficientnerf.asset.format import load
     from efficientnerf.asset.region import inside_distance
     from stages.artifacts import BakeOutputs
-    from stages.framing.camera_paths import similarity_of
 
     tree = load(BakeOutputs.of_run(run).asset)
     low, high = np.asarray(tree.bounds_min), np.asarray(tree.bounds_max)

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import processor
+from efficientnerf.asset.camera_paths import turntable_cameras
+from efficientnerf.asset.captured import captured_of
 from efficientnerf.asset.format import describe, load
 from efficientnerf.asset.rendering import render
 from efficientnerf.geometry.cameras import Camera
-from stages.framing.camera_paths import turntable_cameras
-from stages.framing.captured import captured_of
 from stages.viewer.page import compact_bytes, viewer_page
 from tests.stages.viewer import browser
 from workflows.cli.target import asset_of, is_run

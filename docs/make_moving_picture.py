@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.asset.format import load
 from efficientnerf.asset.rendering import render
 from stages.artifacts import BakeOutputs
-from stages.framing.camera_paths import turntable_cameras
 from stages.framing.restriction import restricted
 from stages.io.pictures import opened, rgb_and_alpha
 

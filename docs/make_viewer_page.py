@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.asset.captured import captured_of
 from efficientnerf.asset.cascades import subset
 from efficientnerf.asset.format import load, serialize
 from efficientnerf.asset.region import voxel_centres
@@ -22,7 +23,6 @@ from efficientnerf.rendering.harmonics import C0, basis_numpy
 from efficientnerf.splats.merging import greatest_weights
 from pipeline.files import write_atomically
 from stages.artifacts import BakeOutputs
-from stages.framing.captured import captured_of
 from stages.framing.restriction import restricted
 from stages.viewer.page import viewer_page
 

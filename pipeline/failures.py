@@ -49,11 +49,18 @@ def translated(error: BaseException, stage: str, run: Path) -> PipelineError:
         return disk_full(full, stage)
     if isinstance(error, PipelineError):
         return error
+    if is_bad_input(error):
+        return BadInput(str(error))
     if any(isinstance(cause, MemoryError) for cause in history(error)):
         return StageFailed(f"{stage}: out of memory. Close other programs, or use a smaller preset or smaller images.")
     first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
     text = f"{type(error).__name__}: {first}" if first else type(error).__name__
     return StageFailed(f"{stage}: {text[:500]}")
+
+
+def is_bad_input(error: BaseException) -> bool:
+    """Whether the error's class says so by an attribute `bad_input`: packages that do not know the engine have such errors."""
+    return getattr(error, "bad_input", False) is True
 
 
 def _full_folder(error: BaseException, run: Path) -> Path | None:

@@ -6,13 +6,13 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from efficientnerf.asset.captured import captured_metadata
 from efficientnerf.capture.forward_facing import ForwardFacing
 from efficientnerf.model import Model
 from pipeline.hashes import sha256_of
 from pipeline.stage import Job
 from stages.artifacts import BakeInputs, inputs_of
 from stages.bake.settings import BakeSettings
-from stages.framing.captured import captured_metadata
 from stages.io.scene import Scene, similarity_to_json
 
 

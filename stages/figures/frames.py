@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.asset.camera_paths import similarity_of
 from efficientnerf.asset.rendering import Rendering, render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, Similarity
 from stages.formats.exporters.exr import write_exr
 from stages.formats.exporters.frames import NAMED, frame_background, frame_from_rendering, over_background
 from stages.formats.exporters.video import write_mp4
-from stages.framing.camera_paths import similarity_of
 from stages.io.png import USUAL, read_png, write_png
 from stages.scratch import Warn, note, noted, once
 

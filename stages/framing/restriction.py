@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from efficientnerf.asset.camera_paths import similarity_of
 from efficientnerf.asset.region import cropped, foreground, voxel_centres
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Similarity
 from pipeline.errors import UsageError
-from stages.framing.camera_paths import similarity_of
 
 
 def restricted(tree: NerfTree, region: str, crop: Sequence[float] | None = None) -> NerfTree:

@@ -14,12 +14,12 @@ import numpy as np
 from efficientnerf.capture.coverage import meeting_point
 from efficientnerf.capture.forward_facing import ForwardFacing, detect_forward_facing
 from efficientnerf.geometry.cameras import Camera, Similarity, project
+from efficientnerf.geometry.orbit import Orbit, rotation_to_z
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
 from stages.framing.near_planes import content_depths, near_far_planes
 from stages.io.capture import Capture
 from stages.io.reader import PhotoReader
-from stages.io.scene import Orbit
 
 UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
 FRONT_AZIMUTH = -90.0  # degrees, of the mean camera in captures whose frame means nothing: it looks along +y, as front views do
@@ -143,17 +143,6 @@ def estimated_up(cameras: Sequence[Camera]) -> np.ndarray:
         up = np.linalg.eigh(scatter)[1][:, 0]
         weight = 1.0 / (1.0 + ((right @ up) / 0.1) ** 2)
     return up if (above @ up).sum() >= 0 else -up
-
-
-def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """(3, 3) the smallest rotation that turns the unit vector `up` to +z; exact for the axes."""
-    if abs(up[2] - 1) < 1e-12:
-        return np.eye(3)
-    if abs(up[2] + 1) < 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    x, y, z = up
-    k = 1.0 / (1.0 + z)
-    return np.array([[1 - x * x * k, -x * y * k, -x], [-x * y * k, 1 - y * y * k, -y], [x, y, z]])
 
 
 def focus_point(capture: Capture) -> tuple[np.ndarray, bool]:

@@ -17,13 +17,13 @@ import numpy as np
 from msgspec import Meta, Struct, to_builtins
 
 from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.geometry.orbit import rotation_to_z
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.files import write_json
 from pipeline.hashes import sha256_of
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.formats.exporters.writing import SourceFrame, source_frame
-from stages.framing.training_frame import rotation_to_z
 from stages.io.scene import Scene, similarity_to_json
 from stages.io.scene_schema import Number, Positive, SimilarityDocument, Vector, decoded, json_of_run
 

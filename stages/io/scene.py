@@ -26,13 +26,14 @@ from safetensors.numpy import save as tensor_bytes
 from efficientnerf.capture.forward_facing import SPACES, ForwardFacing
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.geometry.orbit import Orbit
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.files import is_safe_name, write_json
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import SparsePoints
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha
-from stages.io.scene_schema import CameraDocument, Orbit, SceneDocument, ViewDocument, decoded, json_of_run
+from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded, json_of_run
 from stages.reports import poses_report
 
 FORMAT = 2

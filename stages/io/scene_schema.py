@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 
+from efficientnerf.geometry.orbit import LARGEST, Number, Orbit, Vector
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.text import printable
 from stages.io.json_file import read_json
 
-LARGEST = 1e15  # of any number: beyond it squares lose all that they are compared with
-
-Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 Side = Annotated[int, Meta(ge=1, le=65536)]
 Row = tuple[Number, Number, Number, Number]
-Vector = tuple[Number, Number, Number]
 Matrix = tuple[Row, Row, Row, Row]
 Rotation = tuple[Vector, Vector, Vector]
 Box = tuple[Vector, Vector]
@@ -48,24 +44,6 @@ class SimilarityDocument(Struct):
     scale: Positive
     rotation: Rotation
     translation: Vector
-
-
-@dataclass(frozen=True)
-class Orbit:
-    """The orbit of the capture's cameras round the subject, for turntables; in the training frame.
-
-    centre          point that the cameras look at
-    radius          median distance of the cameras from it, world units
-    elevation       median angle above the horizon, degrees
-    forward_facing  whether the cameras are on one side of the subject
-    heading         azimuth of the mean camera seen from the centre, degrees, anticlockwise from +x
-    """
-
-    centre: Vector
-    radius: Number
-    elevation: Number
-    forward_facing: bool
-    heading: Number
 
 
 class ForwardDocument(Struct):

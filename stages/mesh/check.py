@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.camera_paths import turntable_cameras
+from efficientnerf.asset.captured import captured_of
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.surface.agreement import AssetView, agreement, asset_view, differences, shown_pixels
@@ -17,8 +19,6 @@ from efficientnerf.surface.mesh import Mesh
 from efficientnerf.surface.rasteriser import mesh_image
 from efficientnerf.surface.volume import volume_of
 from stages.figures.shading import difference_row
-from stages.framing.camera_paths import turntable_cameras
-from stages.framing.captured import captured_of
 
 CAPTURED, ORBIT = 12, 12  # cameras
 FUSED = 24  # further cameras, whose depths are fused too

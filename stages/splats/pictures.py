@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.asset.camera_paths import turntable_cameras
+from efficientnerf.asset.captured import captured_of
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.build import View
 from stages.formats.exporters.frames import frame_from_rendering
-from stages.framing.camera_paths import turntable_cameras
-from stages.framing.captured import captured_of
 from stages.io.scene import Scene, views_of
 from stages.train.averaged import averaged_views
 

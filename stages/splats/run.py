@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.asset.format import load
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
@@ -29,7 +30,6 @@ from stages.figures.plots import to_uint8
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.splats.frames import in_capture
 from stages.formats.exporters.writing import source_frame
-from stages.framing.camera_paths import turntable_cameras
 from stages.framing.restriction import restricted
 from stages.io.png import write_png
 from stages.io.refined_cameras import load_scene

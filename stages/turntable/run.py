@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from efficientnerf.asset import format
+from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import resolved
@@ -14,7 +15,6 @@ from pipeline.stage import Job
 from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of
 from stages.compiling import compiling_kernels
 from stages.figures.frames import RenderOptions, encode_frames, render_frames
-from stages.framing.camera_paths import turntable_cameras
 from stages.framing.restriction import restricted
 from stages.memory.need import refuse_what_does_not_fit
 from stages.scratch import Warn

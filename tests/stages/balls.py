@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.geometry.orbit import Orbit
 from pipeline.stage import Job
 from stages.io.png import write_png
-from stages.io.scene import Orbit, Scene, View, save
+from stages.io.scene import Scene, View, save
 from tests.efficientnerf import balls
 
 SIMILARITY = Similarity(0.5, np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.array([0.1, 0.2, 0.3]))

@@ -16,6 +16,7 @@ from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
+from efficientnerf.geometry.orbit import Orbit
 from efficientnerf.splats import rendering
 from efficientnerf.splats.gaussians import Gaussians
 from pipeline.run import Run
@@ -27,7 +28,7 @@ from stages.formats.exporters.writing import SourceFrame
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.restriction import restricted
 from stages.framing.true_frame import AS_CAPTURED, Ground, save_frame
-from stages.io.scene import Orbit, Scene, View, save, similarity_to_json
+from stages.io.scene import Scene, View, save, similarity_to_json
 from tests.efficientnerf.capture.rings import cameras_round
 from tests.stages.balls import SIMILARITY
 from tests.stages.formats.gaussians import read_spz, scattered

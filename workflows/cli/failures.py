@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
-from pipeline.errors import PipelineError
-from pipeline.failures import is_disk_full, is_of_the_path
+from pipeline.errors import BadInput, PipelineError
+from pipeline.failures import is_bad_input, is_disk_full, is_of_the_path
 from pipeline.text import printable
 from workflows.cli.output import write_json
 
@@ -89,6 +89,8 @@ def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
     facts: dict[str, Any] = {}
     if isinstance(error, Reported):
         facts, error = error.facts, error.error
+    if is_bad_input(error):
+        error = BadInput(str(error)).with_traceback(error.__traceback__)
     if isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError):
         error = error.__cause__  # click takes the end of any file for that of the terminal; only a prompt's is an interrupt, and there are none
     if isinstance(error, SystemExit):

@@ -10,13 +10,13 @@ from typing import Any
 
 import click
 
+from efficientnerf.asset.camera_paths import PATHS, similarity_of
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from pipeline.run import Run
 from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.formats.exporters.frames import frame_background
-from stages.framing.camera_paths import PATHS, similarity_of
 from stages.framing.restriction import restricted, with_region
 from stages.io.camera_path import read_camera_path
 from stages.memory.need import refuse_more_than

@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.asset.format import contents
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.evaluation.metrics import psnr
-from stages.framing.camera_paths import turntable_cameras
 from workflows.cli.target import asset_of
 from workflows.loading import load_asset
 

@@ -23,7 +23,7 @@ from efficientnerf.backends.numba.entropy import walks
 from efficientnerf.backends.pieces import pieces
 
 MINOR = 5  # the version that brought it
-STREAMS = ("packed.occupancy", "packed.mask", "packed.density", "packed.base", "packed.sh")
+STREAMS: tuple[str, ...] = ("packed.occupancy", "packed.mask", "packed.density", "packed.base", "packed.sh")
 TABLES = ("density.table", "base.table", "sh.palette")
 MOST = 2**31 - 1  # bricks or voxels, which are counted in 32 bits
 SLICE_VOXELS = 2**17  # about; docs/experiments/packed.md

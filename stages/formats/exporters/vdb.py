@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.asset.captured import captured_of
 from efficientnerf.asset.cascades import cascade_tree, cascades_of, voxel_coordinates
 from efficientnerf.asset.queries import normal_at
 from efficientnerf.asset.region import voxel_centres
@@ -30,7 +31,6 @@ from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.surface.colours import outside_directions
 from pipeline.errors import BadInput, UsageError
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, write_parts
-from stages.framing.captured import captured_of
 
 MAGIC, VERSION, LIBRARY = 0x56444220, 224, (12, 0)
 ACTIVE_VALUES = 2  # compression: of nodes the values of their active voxels alone

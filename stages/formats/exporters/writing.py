@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.geometry.orbit import stated_up
 from efficientnerf.surface.mesh import Mesh, PointCloud
 from pipeline.errors import BadInput
 from pipeline.files import atomic, atomic_together
 
 MOST_TEXELS = 16384  # along a side of a texture: what graphics cards show
-UNIT = 1e-3  # how far from 1 the length of a unit vector may be
 _ROWS = 50_000  # lines of text made at a time
 
 
@@ -55,16 +55,7 @@ def source_frame(metadata: Mapping[str, Any]) -> SourceFrame:
     recorded, similarity = metadata.get("world_from_capture"), Similarity.identity()
     if recorded is not None:
         similarity = Similarity(float(recorded["scale"]), np.asarray(recorded["rotation"], np.float64), np.asarray(recorded["translation"], np.float64))
-    return SourceFrame(similarity, bool(metadata.get("metric", False)), _set_up(metadata.get("up")))
-
-
-def _set_up(given: object) -> np.ndarray | None:
-    """The `up` in an asset's metadata; None for what is no unit vector: other writers may mean something else by it."""
-    if not (isinstance(given, (list, tuple)) and len(given) == 3 and all(isinstance(each, (int, float)) for each in given)):
-        return None
-    up = np.clip(np.asarray(given, np.float64), -2, 2)
-    length = np.linalg.norm(up)
-    return up / length if abs(length - 1) < UNIT else None
+    return SourceFrame(similarity, bool(metadata.get("metric", False)), stated_up(metadata.get("up")))
 
 
 def check_mesh(mesh: Mesh, path: Path) -> None:

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
+from efficientnerf.asset.camera_paths import pose_on_sphere
 from efficientnerf.capture.captured_path import captured_path
-from stages.framing.camera_paths import pose_on_sphere
 
 ARC = [pose_on_sphere((0.0, 0.0, 0.0), 3.0, azimuth, 15.0) for azimuth in range(0, 150, 10)]
 ROUND = [pose_on_sphere((0.1, 0.0, 0.0), 3.0, azimuth, 15.0) for azimuth in range(0, 360, 15)]

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from efficientnerf.asset.camera_paths import spiral_poses
 from efficientnerf.capture.forward_facing import detect_forward_facing, mean_pose
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
 from stages.formats import importers
-from stages.framing.camera_paths import spiral_poses
 from stages.framing.near_planes import content_depths
 from stages.framing.training_frame import find_training_frame
 from stages.io.capture import Capture, Photo, SparsePoints

@@ -11,7 +11,9 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from efficientnerf.asset.camera_paths import pose_on_sphere
 from efficientnerf.geometry.cameras import Camera, Similarity
+from efficientnerf.geometry.orbit import Orbit
 from efficientnerf.surface.mesh import Mesh
 from pipeline.stage import Job
 from stages.evaluate.mesh import evaluated_mesh
@@ -20,9 +22,8 @@ from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.splats import EvaluatedSplats
 from stages.figures.plots import to_uint8
 from stages.formats.exporters.frames import frame_from_rendering
-from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
-from stages.io.scene import Orbit, Scene, View, save
+from stages.io.scene import Scene, View, save
 from tests.fakes import WHITE, BallField, BallTree
 
 TREE = BallTree()

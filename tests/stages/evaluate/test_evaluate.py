@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from efficientnerf.asset.camera_paths import pose_on_sphere
 from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import Interrupted
 from stages.evaluate.views import bounded_stride, stride_for
 from stages.figures.plots import to_uint8
-from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
 from stages.io.scene import View
 from tests.fakes import WHITE, BallField

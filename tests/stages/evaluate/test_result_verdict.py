@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from efficientnerf.asset.camera_paths import pose_on_sphere
 from stages.artifacts import EvaluateOutputs, MeshOutputs, PosesOutputs, SplatsOutputs
 from stages.evaluate.sparse_points import COLOURS, FARTHER, NEARER
-from stages.framing.camera_paths import pose_on_sphere
 from stages.io.capture import SparsePoints
 from stages.io.scene import load, save, save_points
 from stages.reports import CameraProblem, CameraVerdict

@@ -11,19 +11,20 @@ import numpy as np
 import pytest
 import torch
 
+from efficientnerf.asset.camera_paths import pose_on_sphere
 from efficientnerf.asset.cascades import cascade_tree, cascades_of, subset, voxel_cascades
 from efficientnerf.asset.rendering import Rendering, render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.evaluation.surfaces import opacity_nearer
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
+from efficientnerf.geometry.orbit import Orbit
 from efficientnerf.geometry.spaces import Box
 from efficientnerf.rendering.field_renderer import FieldRendering, SampleCounts
 from stages.evaluate.asset import EvaluatedAsset, evaluated
 from stages.evaluate.run import evaluate
 from stages.figures.plots import to_uint8
-from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
-from stages.io.scene import Orbit, Scene, View, save
+from stages.io.scene import Scene, View, save
 from tests.efficientnerf.trees import random_cascades
 from tests.stages.evaluate.balls import BALL_MESH, TREE, figures_of, job_in, settings
 

@@ -113,7 +113,7 @@ def test_density_and_colour_lie_where_the_asset_has_them() -> None:
 
 def test_colours_are_those_that_the_captured_cameras_see() -> None:
     """Two cameras above: yellow from there, blue from below."""
-    from stages.framing.captured import captured_metadata
+    from efficientnerf.asset.captured import captured_metadata
 
     poses = [np.array([[1.0, 0, 0, x], [0, -1, 0, 0], [0, 0, -1, 5], [0, 0, 0, 1]]) for x in (-0.5, 0.5)]
     path = captured_metadata([Camera("", 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), pose) for pose in poses])

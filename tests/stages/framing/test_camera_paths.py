@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from efficientnerf.asset.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
+from efficientnerf.asset.captured import MetadataError, captured_metadata, captured_of
 from efficientnerf.asset.rendering import MOST_PIXELS
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput
-from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
-from stages.framing.captured import captured_metadata, captured_of
 from stages.io.camera_path import read_camera_path
 from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
@@ -82,10 +82,10 @@ def test_an_asset_without_an_orbit_gets_one_and_a_broken_one_is_refused() -> Non
     assert orbit_of(Bare()).radius > 3.0
     assert similarity_of(Bare()).scale == 1.0
     Bare.metadata = {"orbit": {"centre": [0, 0], "radius": 1}}
-    with pytest.raises(BadInput):
+    with pytest.raises(MetadataError):
         orbit_of(Bare())
     Bare.metadata = {"world_from_capture": {"scale": -1, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0]}}
-    with pytest.raises(BadInput):
+    with pytest.raises(MetadataError):
         similarity_of(Bare())
 
 
@@ -160,7 +160,7 @@ def test_an_odd_spiral_gives_cameras_or_is_refused(name: str) -> None:
     for spiral in spirals:
         try:
             cameras = turntable_cameras(tree.with_metadata(spiral=spiral), frames=8, width=32, height=24)
-        except BadInput:
+        except MetadataError:
             continue
         for camera in cameras:
             assert np.isfinite(camera.world_from_camera).all()
@@ -174,7 +174,7 @@ def test_an_odd_orbit_gives_cameras_or_is_refused(name: str) -> None:
         tree = random_tree(1).with_metadata(orbit={**good, name: [odd, 0.0, 0.0] if name == "centre" else odd})
         try:
             cameras = turntable_cameras(tree, frames=3, width=32, height=24)
-        except BadInput:
+        except MetadataError:
             continue
         assert np.isfinite([camera.world_from_camera for camera in cameras]).all()
 
@@ -233,9 +233,9 @@ def test_captured_cameras_that_cannot_be_are_refused() -> None:
     wrong: list[Any] = [[], [[0.0] * 12], [[1.0] * 11], [[*upright[:11], math.nan]], [[*upright[:10], -1, 0]], [[1, 0, 0, 1e300, *upright[4:]]], "x"]
     stated = captured_metadata(arc(90.0))
     for change in [{"poses": poses} for poses in [*wrong, [upright] * 65]] + [{"focal": 0}, {"width": -3}, {"height": None}, {"focal": math.inf}]:
-        with pytest.raises(BadInput, match="captured_path"):
+        with pytest.raises(MetadataError, match="captured_path"):
             captured_of({"captured_path": stated | change})
-    with pytest.raises(BadInput, match="captured_path"):
+    with pytest.raises(MetadataError, match="captured_path"):
         captured_of({"captured_path": 7})
     found = captured_of({"captured_path": json.loads(json.dumps(captured_metadata(arc(360.0, count=150))))})
     assert len(found.poses) == 64

@@ -9,9 +9,10 @@ import pytest
 from PIL import Image
 
 from efficientnerf.geometry.cameras import Camera, Similarity, project, rays
+from efficientnerf.geometry.orbit import rotation_to_z
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
-from stages.framing.training_frame import TrainingFrame, estimated_up, find_training_frame, rotation_to_z
+from stages.framing.training_frame import TrainingFrame, estimated_up, find_training_frame
 from stages.io.capture import Capture, Photo, SparsePoints
 from tests.stages.forward_facing import looking, some_rotation
 

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Similarity, rays, resized
+from efficientnerf.geometry.orbit import Orbit
 from pipeline.errors import CorruptArtifact
 from stages.formats import importers
 from stages.formats.exporters import cameras
 from stages.io import scene
 from stages.io.capture import SparsePoints
-from stages.io.scene import Orbit, Scene, View
+from stages.io.scene import Scene, View
 from tests.stages import captures
 from tests.stages.captures import LENSES, assert_same_rays
 

@@ -13,13 +13,14 @@ import trimesh
 
 from efficientnerf.asset import format
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.orbit import Orbit
 from efficientnerf.surface.mesh import Mesh
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.stage import Job
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
 from stages.evaluate.mesh import load_mesh
 from stages.io.png import write_png
-from stages.io.scene import Orbit, Scene, View, load, save
+from stages.io.scene import Scene, View, load, save
 from stages.mesh import run as stage
 from stages.mesh.files import read_mesh
 from stages.mesh.settings import STAGE, MeshSettings

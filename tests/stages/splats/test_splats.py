@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from efficientnerf.asset.captured import captured_metadata
 from efficientnerf.asset.format import load, save
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
@@ -20,7 +21,6 @@ from stages.artifacts import SplatsOutputs
 from stages.evaluate.splats import load_splats
 from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import source_frame
-from stages.framing.captured import captured_metadata
 from stages.io.png import read_png
 from stages.io.scene import load as load_scene
 from stages.splats import run as splats

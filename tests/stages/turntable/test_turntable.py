@@ -13,10 +13,10 @@ import OpenEXR
 import pytest
 
 from efficientnerf.asset import format
+from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.evaluation.metrics import psnr
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
-from stages.framing.camera_paths import turntable_cameras
 from stages.io.png import read_png
 from stages.turntable.run import render_turntable
 from stages.turntable.settings import STAGE, TurntableSettings

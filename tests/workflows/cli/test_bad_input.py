@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from efficientnerf.asset.captured import MetadataError
 from pipeline.run import Run
 from tests.workflows.command import Result
+from workflows.cli.failures import report_failure
 from workflows.cli.main import main
 
 Enerf = Callable[..., Result]
@@ -253,3 +255,8 @@ def test_recovered_cameras_go_on(enerf: Enerf, made: Path, source: Path) -> None
         np.testing.assert_allclose(one["capture_from_camera"], other["capture_from_camera"], atol=1e-12)
         assert (one["width"], one["height"], one["split"]) == (other["width"], other["height"], other["split"])
     assert enerf("inspect", source.parent / "nowhere").code == 2
+
+
+def test_an_asset_with_odd_metadata_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    assert report_failure(MetadataError("asset: its orbit is odd. Bake it again."), as_json=False, debug=False) == 2
+    assert capsys.readouterr().err == "enerf: asset: its orbit is odd. Bake it again.\n"

@@ -15,14 +15,14 @@ import pytest
 from PIL import Image
 
 from efficientnerf.asset import format
+from efficientnerf.asset.camera_paths import pose_on_sphere
+from efficientnerf.asset.captured import captured_metadata
 from efficientnerf.asset.cascades import cascade_grids, nested
 from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
 from stages.formats.exporters.splats.ply import read_splats
-from stages.framing.camera_paths import pose_on_sphere
-from stages.framing.captured import captured_metadata
 from stages.mesh.settings import MeshSettings
 from stages.turntable.settings import TurntableSettings
 from tests.stages.formats.gaussians import scattered

@@ -9,11 +9,16 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
-from pipeline.errors import BadInput
 
 MAX_POSES = 64  # that an asset keeps, evenly spaced over the capture
 DIGITS = 6
 LARGEST = 1e30
+
+
+class MetadataError(ValueError):
+    """Metadata of an asset that make no sense, or lack what was asked for."""
+
+    bad_input = True  # to the engine and the command line
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +52,7 @@ def captured_metadata(cameras: Sequence[Camera]) -> dict[str, Any]:
 
 
 def captured_of(metadata: Mapping[str, Any]) -> CapturedPath | None:
-    """The captured cameras in an asset's metadata; None where it keeps none. Raises BadInput."""
+    """The captured cameras in an asset's metadata; None where it keeps none. Raises MetadataError."""
     given = metadata.get("captured_path")
     if given is None:
         return None
@@ -62,7 +67,7 @@ def captured_of(metadata: Mapping[str, Any]) -> CapturedPath | None:
         poses[:, :3] = rows.reshape(-1, 3, 4)
         poses[:, :3, :3] = [_rotation(matrix) for matrix in poses[:, :3, :3]]
     except (KeyError, OverflowError, TypeError, ValueError, np.linalg.LinAlgError) as error:
-        raise BadInput(f"asset: its captured_path cannot be read ({str(error)[:200]}). Bake it again.") from error
+        raise MetadataError(f"asset: its captured_path cannot be read ({str(error)[:200]}). Bake it again.") from error
     return CapturedPath(poses, width, height, focal)
 
 
