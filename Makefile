@@ -10,7 +10,10 @@
 # make viewer-page   write docs/still_life_viewer.html, which the README links: ten minutes on two cores
 # make docs      rewrite the pages under docs/ that are made from the code
 # make lint      ruff and mypy
+# make site      build the documentation as a site into build/site; links that lead nowhere are errors
+# make container build the image for a CPU, and run the sample in it; make container FOR=cuda: that for CUDA
 # make release   build sdist and wheel, and try the wheel in empty environments; RELEASE_OPTIONS go to .ci/release.py (--quick only builds)
+# make publish   upload what `make release` built
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -19,7 +22,7 @@ INSTALLED := $(VENV)/.installed
 # In the order of tests/conftest.py: by itself xdist begins with the files that have most tests, and a worker ends alone with a long one.
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-all torture faults gpu gpu-packages viewer-page docs lint release install clean
+.PHONY: demo test test-slow test-all torture faults gpu gpu-packages viewer-page docs lint site container release publish install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
@@ -77,10 +80,30 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# The tree of the documents and of all that they link, as it is in the repository.
+SITE_FILES := README.md CHANGELOG.md SECURITY.md docs examples benchmarks/results tests/stages/hostile.py tests/efficientnerf/hostile.py efficientnerf/asset/FORMAT.md
+site:
+	rm -rf build/site-source && mkdir -p build/site-source
+	tar -cf - --exclude '*.jpg' --exclude __pycache__ $(SITE_FILES) | tar -xf - -C build/site-source
+	$(PYTHON) -m venv build/site-tools
+	build/site-tools/bin/python -m pip install --quiet "mkdocs-material>=9.5,<10"
+	build/site-tools/bin/python -m mkdocs build
+
+# CONTAINER builds and runs images: podman, docker, or one that takes their options. CONTAINER_OPTIONS go to the build, such as --build-arg BASE=...
+CONTAINER ?= podman
+FOR ?= cpu
+container:
+	$(CONTAINER) build --file Containerfile --build-arg FOR=$(FOR) $(CONTAINER_OPTIONS) --tag enerf:$(FOR) .
+	$(CONTAINER) run --rm $(RUN_OPTIONS) enerf:$(FOR) --version
+	$(CONTAINER) run --rm $(RUN_OPTIONS) -v $(CURDIR)/examples/still_life:/photos:ro enerf:$(FOR) run /photos --preset tiny --out /runs/sample
+
 release:
 	$(PYTHON) -m venv build/release/tools
 	build/release/tools/bin/python -m pip install --quiet build twine uv pipx
 	build/release/tools/bin/python .ci/release.py $(RELEASE_OPTIONS)
+
+publish:
+	build/release/tools/bin/python .ci/release.py --publish
 
 install: $(INSTALLED)
 

@@ -1,10 +1,11 @@
-"""Build a release and try it as strangers install it; `make release`. Nothing is uploaded: the last line says how.
+"""Build a release and try it as strangers install it; `make release`. Nothing is uploaded before `make publish`.
 
-    python .ci/release.py [--pythons 3.11,3.12,3.13,3.14] [--quick]
+    python .ci/release.py [--pythons 3.11,3.12,3.13,3.14] [--quick | --publish]
 
 In dist/: the sdist, the wheel, `contents.txt` (each file of both) and `licences.txt` (what a plain install brings: version, licence, size).
 Then, in an empty environment for each Python that this machine has, and with `uv tool install` and `pipx`: the wheel is installed, `enerf --version`
-answers, and the sample becomes an asset with the preset `tiny`. --quick leaves out all that installs. Needs build, twine, uv and pipx.
+answers, and the sample becomes an asset with the preset `tiny`. --quick leaves out all that installs. --publish uploads what is in
+dist/. Needs build, twine, uv and pipx.
 """
 
 from __future__ import annotations
@@ -56,9 +57,28 @@ def megabytes(folder: Path) -> float:
     return sum(path.lstat().st_size for path in folder.rglob("*") if not path.is_dir()) / 1e6
 
 
-def build() -> tuple[Path, str]:
-    """The wheel, and the version; both files checked and listed."""
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+def stated_version() -> str:
+    version: str = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    return version
+
+
+def is_dated(version: str) -> bool:
+    """Whether CHANGELOG.md has a section of this version with a date, and none of what is unreleased above it."""
+    heading = next(line for line in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines() if line.startswith("## "))
+    return re.fullmatch(rf"## \[{re.escape(version)}\] - \d{{4}}-\d\d-\d\d", heading) is not None
+
+
+def publish() -> None:
+    """Upload; asks for a token unless TWINE_PASSWORD has it."""
+    version = stated_version()
+    files = [*DIST.glob(f"efficientnerf-{version}*.whl"), *DIST.glob(f"efficientnerf-{version}.tar.gz")]
+    if not is_dated(version) or len(files) != 2:
+        sys.exit(f"release: {version} has no dated section on top of CHANGELOG.md, or is not built. Run make release.")
+    subprocess.run([sys.executable, "-m", "twine", "upload", *files], check=True)
+
+
+def build() -> Path:
+    """The wheel; it and the sdist files checked and listed."""
     shutil.rmtree(DIST, ignore_errors=True)
     shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # files that are gone since an earlier build would be packed
     call(sys.executable, "-m", "build", "--outdir", DIST, ROOT)
@@ -69,7 +89,7 @@ def build() -> tuple[Path, str]:
     held += [(member.file_size, f"{wheel.name}/{member.filename}") for member in zipfile.ZipFile(wheel).infolist()]
     (DIST / "contents.txt").write_text("".join(f"{size:9d}  {name}\n" for size, name in held), encoding="utf-8")
     print(f"{wheel.name} {wheel.stat().st_size / 1e6:.2f} MB, {sdist.name} {sdist.stat().st_size / 1e6:.2f} MB, {len(held)} files")
-    return wheel, version
+    return wheel
 
 
 def tiny(enerf: Path, out: Path) -> None:
@@ -115,11 +135,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pythons", default=PYTHONS)
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--publish", action="store_true")
     chosen = parser.parse_args()
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     WORK.mkdir(parents=True, exist_ok=True)
     (WORK / "constraints.txt").write_text(f"{TORCH}\n")
-    wheel, version = build()
+    if chosen.publish:
+        publish()
+        return
+    wheel, version = build(), stated_version()
     if not chosen.quick:
         wanted = chosen.pythons.split(",")
         there = [each for each in wanted if subprocess.run(["uv", "python", "find", each], capture_output=True, check=False).returncode == 0]
@@ -128,10 +152,10 @@ def main() -> None:
         if absent := sorted({*wanted} - {*there}):
             print(f"not tried: Python {', '.join(absent)}, which this machine does not have")
         as_tool(wheel)
-    if re.search(rf"^## \[{re.escape(version)}\] - \d{{4}}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE):
-        print(f"publish: git tag v{version} && git push origin v{version} && twine upload dist/*.whl dist/*.tar.gz")
+    if is_dated(version):
+        print(f"ready: git tag v{version} && git push origin v{version} && make publish")
     else:
-        print(f"not to be published: CHANGELOG.md has no dated section [{version}]. The version stands in pyproject.toml alone.")
+        print(f"not ready to be published: CHANGELOG.md has no dated section [{version}]. The version stands in pyproject.toml alone.")
 
 
 if __name__ == "__main__":

@@ -54,3 +54,10 @@ def test_commands_of_the_readme_exist() -> None:
         command = command.commands["run"] if isinstance(command, click.Group) else command  # that of `enerf fleet SCENES`
         options = {option for parameter in command.params for option in parameter.opts}
         assert set(re.findall(r"(?<= )--[a-z-]+", arguments.partition("#")[0])) <= options
+
+
+def test_steps_of_the_forge_are_targets_of_the_makefile() -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    steps = [step for path in (ROOT / ".github/workflows").iterdir() for step in re.findall(r"- run: (.*)", path.read_text(encoding="utf-8"))]
+    assert len(steps) >= 7
+    assert {name for step in steps for name in [re.match(r"make ([\w-]+)", step)[1]]} <= targets  # type: ignore[index]
