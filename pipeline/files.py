@@ -275,7 +275,7 @@ def link_or_copy(source: Path, target: Path) -> None:
         os.link(source, target, follow_symlinks=False)
     except FileNotFoundError:
         raise
-    except OSError:  # of another file system, of one that has no links, of a file with too many
+    except (OSError, NotImplementedError):  # of another file system, of one or a system that has no links, of a file with too many
         shutil.copyfile(source, target, follow_symlinks=False)
 
 
