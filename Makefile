@@ -7,6 +7,7 @@
 # make fuzz      100,000 damaged inputs to each reader; FUZZ_OPTIONS go to benchmarks/fuzz; `pip install -e '.[fuzz]'` guides it by coverage
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
 # make gpu-packages   wheels that `make gpu` needs besides torch, Triton and numba, into build/gpu-packages: for a machine without a package index
+# make processors   the kernels' tests as on x86-64 processors without AVX-512, and without AVX: numba compiles for those
 # make viewer-page   write docs/still_life_viewer.html, which the README links: ten minutes on two cores
 # make docs      rewrite the pages under docs/ that are made from the code
 # make lint      ruff and mypy
@@ -22,7 +23,7 @@ INSTALLED := $(VENV)/.installed
 # In the order of tests/conftest.py: by itself xdist begins with the files that have most tests, and a worker ends alone with a long one.
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-all torture faults gpu gpu-packages viewer-page docs lint site container release publish install clean
+.PHONY: demo test test-slow test-all torture faults processors gpu gpu-packages viewer-page docs lint site container release publish install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
@@ -68,6 +69,13 @@ gpu-packages:
 	rm -rf $(GPU_PACKAGES)
 	$(PYTHON) -m pip download --quiet --dest $(GPU_PACKAGES) --no-deps --only-binary=:all: --python-version $(GPU_PYTHON) --implementation cp \
 		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt filelock msgspec platformdirs trimesh OpenEXR av fast_simplification
+
+PROCESSORS := haswell:+avx,+avx2,+fma,+f16c,+bmi,+bmi2,+lzcnt,+popcnt,+movbe,+sse4.2,+cx16 x86-64:+sse2
+KERNEL_TESTS ?= tests/efficientnerf/backends tests/efficientnerf/asset/test_format.py
+processors: $(INSTALLED)
+	for each in $(PROCESSORS); do \
+		NUMBA_CPU_NAME=$${each%%:*} NUMBA_CPU_FEATURES=$${each#*:} ENERF_CACHE_DIR=$(CURDIR)/build/processors $(BIN)/python -m pytest -q $(KERNEL_TESTS) || exit 1; \
+	done
 
 viewer-page: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/page --set bake.resolution=112 --until bake

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib.util
 import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import StageFailed
+from pipeline.errors import BadInput, StageFailed
 from pipeline.files import open_plain, remove
 from pipeline.text import printable
 
@@ -25,9 +26,11 @@ def import_pycolmap() -> Any:
 
     zlib, numpy and Pillow come first: the libraries inside of pycolmap 4 hide those of the same names that are loaded later, and zlib then frees what
     it never had. Signal handlers are restored afterwards, by sigaction(2): Python's signal module knows nothing of handlers that faulthandler or
-    another library has set, and works in the main thread only.
+    another library has set, and works in the main thread only. Raises BadInput where it is not installed.
     """
     if "pycolmap" not in sys.modules:
+        if importlib.util.find_spec("pycolmap") is None:
+            raise BadInput("cameras of photographs need pycolmap, which has no wheels for this system. Build it, or give cameras of another program.")
         import zlib  # noqa: F401 (see above)
 
         import numpy  # noqa: F401 (see above)

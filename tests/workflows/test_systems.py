@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.errors import BadInput
 from pipeline.executors import cores, memory
 from pipeline.files import link_or_copy
+from stages.sfm.colmap import import_pycolmap
 from workflows.inspection import doctor
 
 
@@ -41,6 +43,14 @@ def test_where_there_are_no_links_files_are_copied(monkeypatch: pytest.MonkeyPat
     (tmp_path / "a").write_bytes(b"12")
     link_or_copy(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "b").read_bytes() == b"12"
+
+
+def test_where_pycolmap_has_no_wheel_photographs_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on Linux on arm64."""
+    monkeypatch.delitem(sys.modules, "pycolmap", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(BadInput, match="cameras of another program"):
+        import_pycolmap()
 
 
 def test_the_doctor_needs_no_proc(monkeypatch: pytest.MonkeyPatch) -> None:
