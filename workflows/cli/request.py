@@ -18,7 +18,7 @@ from stages.video import KNOWN, SUFFIXES
 from workflows.budget import share_budget, train_share
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, Table, metres_of, read_config, read_preset, seconds_of, table_of
-from workflows.cli.target import open_run, resume_command
+from workflows.cli.target import recorded_run, resume_command
 from workflows.workflow import Workflow
 
 # Bytes of a process besides the needs of its stages: docs/experiments/memory.md
@@ -86,7 +86,7 @@ class Plan:
             facts = {name: getattr(self.run, name) for name in ("preset", "seed", "device", "memory", "viewer", "also")}
             facts["resume_text"] = resume_command
             Run.create(self.run.path, self.run.source, self.run.settings, **facts)
-        run = open_run(self.run.path)
+        run = recorded_run(self.run.path)
         with run.locked():
             now = self.again().run
             run.update(**{name: getattr(now, name) for name in ("source", "also", "settings", "preset", "seed", "device", "memory", "viewer")})
@@ -208,7 +208,7 @@ def _beyond(limit: Limit | None, stages: Sequence[Stage]) -> list[str]:
 
 
 def _standing(path: Path) -> Run | None:
-    return open_run(path) if os.path.lexists(path / NAME) else None
+    return recorded_run(path) if os.path.lexists(path / NAME) else None
 
 
 def _sources(given: Sequence[Path], standing: Run | None) -> tuple[Path, ...]:

@@ -173,6 +173,9 @@ def metres_of(text: str, option: str = "--marker-size") -> float:
     return float(found[1]) * {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}[found[2]]
 
 
+FORMER = {("train", "near_plane"): 0.0}  # defaults of 0.1.0 that are no settings of their own any more
+
+
 class Settings:
     """Builder of the settings of all stages; every value is checked when it is put.
 
@@ -223,7 +226,7 @@ class Settings:
         dropped = []
         for stage, entries in table.items():
             for name, value in entries.items():
-                if name not in self.about.get(stage, {}):
+                if name not in self.about.get(stage, {}) or FORMER.get((stage, name)) == value:
                     dropped.append(f"{stage}.{name}")  # without a search for the nearest: there may be any number
                     continue
                 try:

@@ -10,6 +10,7 @@ from pipeline.links import refuse_links
 from pipeline.run import NAME, Run
 from stages.artifacts import BakeOutputs
 from workflows.cli.options import workflow
+from workflows.cli.resolve import Settings, table_of
 
 ASSET = BakeOutputs.asset  # the file's name
 
@@ -25,9 +26,18 @@ def resume_command(
     return f"enerf run{' SOURCE' if with_source else ''} --out {folder}{options}"
 
 
-def open_run(path: Path) -> Run:
+def recorded_run(path: Path) -> Run:
     """The run of a folder, whose messages name commands. Raises BadInput and CorruptArtifact."""
     return Run.open(path, resume_command, _stage_names())
+
+
+def open_run(path: Path) -> Run:
+    """The same without settings that this version does not have."""
+    run = recorded_run(path)
+    settings = Settings({stage.name: stage.settings for stage in workflow().stages})
+    if settings.put_recorded(run.settings):
+        run.settings = table_of(settings.resolved())
+    return run
 
 
 def _stage_names() -> frozenset[str]:

@@ -269,3 +269,17 @@ def test_a_bad_result_is_an_exit_code_where_it_is_asked_for(
     found = enerf("run", toys, "--out", tmp_path / "run", "--json", *([] if fail_on is None else ["--fail-on", fail_on]))
     assert (found.code, found.objects[-1]["exit_code"], found.objects[-1]["ok"]) == (code, code, code == 0)
     assert (tmp_path / "run/points/points.ply").is_file()
+
+
+def test_a_run_of_an_earlier_version_is_shown_and_goes_on(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+    """Its run.json has settings that this version lacks."""
+    assert enerf("run", toys, "--out", tmp_path / "run").code == 0
+    document = json.loads((tmp_path / "run/run.json").read_text())
+    document["settings"]["train"]["gone"] = 1
+    (tmp_path / "run/run.json").write_text(json.dumps(document))
+    shown = enerf("status", tmp_path / "run", "--json")
+    assert shown.code == 0
+    assert {stage["state"] for stage in shown.object["stages"]} == {"fresh"}
+    again = enerf("run", "--out", tmp_path / "run")
+    assert again.code == 0
+    assert "train.gone" in again.err

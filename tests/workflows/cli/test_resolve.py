@@ -11,6 +11,7 @@ import pytest
 from msgspec import Meta
 
 from efficientnerf.settings import Auto, NonNegative, setting
+from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from pipeline.run import Run
 from pipeline.runner import refuse_what_cannot_work
@@ -153,3 +154,9 @@ def test_lengths_have_a_unit(text: str, metres: float) -> None:
     for other in ("50", "mm", "-5cm", "5 ft", ""):
         with pytest.raises(UsageError, match="expected a length with its unit"):
             metres_of(other)
+
+
+def test_defaults_of_0_1_that_mean_nothing_now_are_left_out() -> None:
+    settings = Settings({"train": TrainSettings})
+    assert settings.put_recorded({"train": {"near_plane": 0.0, "far_plane": "auto"}}) == ["train.near_plane"]
+    assert settings.resolved()["train"] == TrainSettings()
