@@ -33,7 +33,7 @@ TESTS = ["tests/efficientnerf", "--ignore=tests/efficientnerf/backends/test_cuda
 METHOD = ["torch", "triton", "numba", "scipy", "safetensors", "msgspec", "platformdirs"]
 PIPELINE = [
     "msgspec", "platformdirs", "jinja2",
-    "click", "rich", "filelock", "safetensors", "PIL", "cv2", "scipy", "skimage", "OpenEXR", "av", "trimesh", "fast_simplification",
+    "click", "rich", "filelock", "safetensors", "PIL", "cv2", "scipy", "skimage", "matplotlib", "OpenEXR", "av", "trimesh", "fast_simplification",
 ]  # fmt: skip
 
 

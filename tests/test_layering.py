@@ -50,6 +50,7 @@ LATE = {
     "pipeline/executors/dask.py": 2,
     "pipeline/locks/lock.py": 1,
     "stages/cores.py": 1,
+    "stages/figures/drawing.py": 3,
     "stages/formats/exporters/las.py": 1,
     "stages/formats/exporters/usd.py": 3,
     "stages/formats/importers/depth.py": 1,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, project
-from stages.figures.axes import VIRIDIS, heat
+from stages.figures.drawing import matplotlib
 from stages.figures.plots import to_uint8
 from stages.framing.near_planes import reliable_points
 from stages.io.scene import Scene, read_points
@@ -123,6 +123,6 @@ def picture(photograph: np.ndarray, depth: np.ndarray, pixels: np.ndarray, kinds
     hit = np.isfinite(depth)
     low, high = np.quantile(depth[hit], [0.02, 0.98]) if hit.any() else (0.0, 1.0)
     shown = 1.0 - np.clip((np.where(hit, depth, high) - low) / max(high - low, 1e-9), 0.0, 1.0)
-    colours = heat(shown, VIRIDIS)
+    colours = to_uint8(matplotlib().colormaps["viridis"](shown)[:, :, :3])
     colours[~hit] = 255
     return np.concatenate([paper, colours], axis=1)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pipeline.files import atomic
-from stages.figures.axes import COLOURS, Series, plot
+from stages.figures.drawing import new_figure
 
 Point = tuple[float, float, str]  # cost, quality, label
 
-_NAMES = 8  # in a legend of one line
+_MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 _LABELS = 12  # at most on one front: more hide one another
 
 
@@ -32,15 +33,26 @@ def pareto_plot(path: Path, series: Mapping[str, Sequence[Point]], *, x_label: s
 
     The same points are the same bytes.
     """
+    figure, canvas = new_figure(8.0, 5.0, 110)
+    axes = figure.add_subplot()
     costs = [x for points in series.values() for x, _, _ in points]
-    drawn, notes = [], []
-    for number, (name, points) in enumerate(series.items()):
-        colour = COLOURS[number % len(COLOURS)]
-        front = [points[place] for place in pareto_front([(x, y) for x, y, _ in points])]
-        drawn.append(Series("", [x for x, _, _ in points], [y for _, y, _ in points], colour, line=False, dots=True))
-        drawn.append(Series(name if 1 < len(series) <= _NAMES else "", [x for x, _, _ in front], [y for _, y, _ in front], colour))
-        notes += front if len(front) <= _LABELS and len(series) <= 3 else []
     logarithmic = bool(costs) and min(costs) > 0 and max(costs) > 10 * min(costs)
-    image = plot((880, 550), drawn, x_label=x_label, y_label=y_label, logarithmic=logarithmic, notes=notes)
+    for number, (name, points) in enumerate(series.items()):
+        colour = f"C{number % 10}"
+        axes.scatter([x for x, _, _ in points], [y for _, y, _ in points], color=colour, alpha=0.55, marker=_MARKS[number // 10 % len(_MARKS)], s=30)
+        front = [points[place] for place in pareto_front([(x, y) for x, y, _ in points])]
+        axes.plot([x for x, _, _ in front], [y for _, y, _ in front], color=colour, label=name, linewidth=1.4)
+        for x, y, label in front if len(front) <= _LABELS and len(series) <= 3 else []:
+            # A label to the right of a point there would leave the axes; it stands above, for the line rises.
+            right = x * x > min(costs) * max(costs) if logarithmic else 2 * x > min(costs) + max(costs)
+            place: dict[str, Any] = {"xytext": (-5, 7) if right else (5, -11), "horizontalalignment": "right" if right else "left"}
+            axes.annotate(label, (x, y), textcoords="offset points", fontsize=7.5, color="0.25", parse_math=False, **place)
+    if logarithmic:
+        axes.set_xscale("log")
+    axes.margins(x=0.12, y=0.1)
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.grid(alpha=0.3)
+    if 1 < len(series) <= 20:
+        axes.legend(frameon=False, fontsize=8)
     with atomic(path, durable=False) as temporary:
-        image.save(temporary, "PNG")
+        canvas.print_png(temporary, metadata={"Software": None})  # without the program's version, for the same bytes

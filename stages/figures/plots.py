@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.files import atomic
-from stages.figures.axes import COLOURS, INFERNO, Series, heat, plot
+from stages.figures.drawing import matplotlib, new_figure
 from stages.io.png import read_png, write_png
 
 MARGIN = 8
@@ -90,7 +90,7 @@ def error_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     returns       (H, W, 3) uint8
     """
     error = np.abs(image - truth).mean(axis=2)
-    return heat(np.clip(error / 0.25, 0.0, 1.0), INFERNO)
+    return np.asarray(to_uint8(matplotlib().colormaps["inferno"](np.clip(error / 0.25, 0.0, 1.0))[:, :, :3]))
 
 
 def curve(path: Path, series: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, x_label: str, y_label: str, title: str = "") -> None:
@@ -98,8 +98,18 @@ def curve(path: Path, series: Mapping[str, tuple[Sequence[float], Sequence[float
 
     series  name -> (x, y) of equal length; values that are not finite are left out
     """
-    lines = [Series(name, x, y, COLOURS[n % len(COLOURS)], dots=np.isfinite(y).sum() < 20) for n, (name, (x, y)) in enumerate(series.items())]
-    write_png(np.asarray(plot((800, 450), lines, x_label=x_label, y_label=y_label, title=title)), path)
+    figure, canvas = new_figure(8.0, 4.5, 100)
+    axes = figure.add_subplot()
+    for name, (x, y) in series.items():
+        xs, ys = np.asarray(x, float), np.asarray(y, float)
+        finite = np.isfinite(xs) & np.isfinite(ys)
+        axes.plot(xs[finite], ys[finite], label=name, linewidth=1.2, marker="." if finite.sum() < 20 else None)
+    axes.set(xlabel=x_label, ylabel=y_label, title=title)
+    axes.grid(alpha=0.3)
+    if series:
+        axes.legend(frameon=False)
+    # without the program's name and version, for the same bytes
+    canvas.print_png(path, metadata={"Software": None})
 
 
 def with_palette(path: Path) -> None:

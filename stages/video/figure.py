@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.capture.frame_choice import BLUR, CHOSEN
-from stages.figures.axes import COLOURS, GREY, Series, plot
+from stages.figures.drawing import new_figure
 from stages.figures.plots import contact_sheet
-from stages.io.png import read_png, write_png
+from stages.io.png import read_png
 
 SHOWN = 24  # thumbnails of a video
 COLUMNS = 8
@@ -38,13 +38,18 @@ def write_frames_sheet(record: Sequence[Mapping[str, Any]], paths: Mapping[str, 
 
 def write_frames_plot(record: Sequence[Mapping[str, Any]], target: Path) -> None:
     """Write a PNG: sharpness of all frames over time, of the chosen and of the blurred as dots; motion below."""
-    panels = []
-    for video in record:
+    figure, canvas = new_figure(10.0, 3.2 * len(record), 100)
+    for place, video in enumerate(record):
+        axes = figure.add_subplot(len(record), 1, place + 1)
         time, sharp, verdict = np.array(video["time"]), np.array(video["sharpness"]), np.array(video["verdict"])
-        series = [Series("all frames", time, sharp, GREY)]
-        for which, colour in ((CHOSEN, COLOURS[0]), (BLUR, COLOURS[3])):
-            series.append(Series(f"{which}: {int((verdict == which).sum())}", time[verdict == which], sharp[verdict == which], colour, line=False, dots=True))
-        motion = Series("motion / diagonals", time, np.array(video["motion"], float), COLOURS[1])
-        title = f"{video['video']}: {video['chosen']} of {len(time)} frames"
-        panels.append(np.asarray(plot((1000, 320), series, x_label="time / s", y_label="sharpness", title=title, from_zero=True, right=motion)))
-    write_png(np.concatenate(panels), target)
+        axes.plot(time, sharp, color="0.75", linewidth=1.0, label="all frames")
+        for which, colour in ((CHOSEN, "tab:blue"), (BLUR, "tab:red")):
+            axes.plot(time[verdict == which], sharp[verdict == which], ".", color=colour, label=f"{which}: {int((verdict == which).sum())}")
+        axes.set(ylabel="sharpness", title=f"{video['video']}: {video['chosen']} of {len(time)} frames", ylim=(0.0, None))
+        axes.set_xlabel("time / s")
+        axes.legend(frameon=False, loc="lower left")
+        other = axes.twinx()
+        other.plot(time, np.array(video["motion"]), color="tab:orange", linewidth=1.0)
+        other.set_ylabel("motion / diagonals", color="tab:orange")
+    # without the program's name and version, for the same bytes
+    canvas.print_png(target, metadata={"Software": None})
