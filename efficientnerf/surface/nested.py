@@ -35,8 +35,8 @@ def scene_surface(
     """The surface of all cascades as one mesh; of a tree with one grid the same as `surface`. Arguments as there.
 
     threshold  density per world unit of the inmost cascade; each one after it has half of that, for its voxels are twice as large
-    views      of the tree by cameras with images of one size, whose depths are fused; none, of a forward-facing tree and of outer cascades: the densities
-               alone decide
+    views      of the tree by cameras with images of one size, whose depths are fused; none, of a forward-facing tree and of cascades beyond the
+               region: the densities alone decide
     region     that the surface is clipped to
     faces      budget of all together, shared by the numbers of voxels; a cascade whose share is under MIN_FACES is left out, but for the greatest
 
@@ -45,9 +45,9 @@ def scene_surface(
     if not tree.outer:
         return surface(
             volume_of(tree, region), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-            fusion=_fusion(0, tree, views, progress), silhouettes=views[::SKIPPED], dense=dense, progress=progress,
+            fusion=_fusion(0, tree, views, 1, progress), silhouettes=views[::SKIPPED], dense=dense, progress=progress,
         )  # fmt: skip
-    found = []
+    found, fused = [], _cascades_of_region(tree, region)
     sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
     for number, part in _parts(tree):
         share = faces * len(part.density_values) // len(tree.density_values)
@@ -56,7 +56,7 @@ def scene_surface(
         try:
             mesh = surface(
                 volume_of(part, region), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints,
-                shown=shown, fusion=_fusion(number, part, views, progress), silhouettes=views[::SKIPPED] if number == 0 else (), dense=dense,
+                shown=shown, fusion=_fusion(number, part, views, fused, progress), silhouettes=views[::SKIPPED] if number == 0 else (), dense=dense,
                 progress=progress,
             )  # fmt: skip
         except NoSurface:
@@ -78,12 +78,12 @@ def scene_points(
     if not tree.outer:
         return points(
             volume_of(tree, region), count, threshold, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-            fusion=_fusion(0, tree, views, progress), seed=seed, progress=progress,
+            fusion=_fusion(0, tree, views, 1, progress), seed=seed, progress=progress,
         )  # fmt: skip
-    found = []
+    found, fused = [], _cascades_of_region(tree, region)
     for number, part in _parts(tree):
         try:
-            fusion, volume = _fusion(number, part, views, progress), volume_of(part, region)
+            fusion, volume = _fusion(number, part, views, fused, progress), volume_of(part, region)
             vertices, triangles, _ = cleaned_surface(volume, _level(threshold, number), min_component, rounds, viewpoints, progress, shown, fusion)
         except NoSurface:
             continue
@@ -106,9 +106,19 @@ def _parts(tree: NerfTree) -> Iterator[tuple[int, NerfTree]]:
             yield number, part
 
 
-def _fusion(number: int, tree: NerfTree, views: Sequence[AssetView], progress: Progress) -> Fusion | None:
-    """Of a cascade. The outer ones may hold parts of a few voxels, and fused distances are smoothed over more than one."""
-    return fusion_of(tree, views, lambda: progress(0, 1, "marching cubes")) if views and tree.ndc is None and number == 0 else None
+def _fusion(number: int, tree: NerfTree, views: Sequence[AssetView], fused: int, progress: Progress) -> Fusion | None:
+    """Of one of the first `fused` cascades. Those after them may hold parts of a few voxels, and fused distances are smoothed over more than one."""
+    return fusion_of(tree, views, lambda: progress(0, 1, "marching cubes")) if views and tree.ndc is None and number < fused else None
+
+
+def _cascades_of_region(tree: NerfTree, region: Region | None) -> int:
+    """How many cascades hold the foreground region, but for a voxel of the last; 1 without a region."""
+    cascades = cascades_of(tree)
+    for count, cascade in enumerate(cascades, 1):
+        low, high = cascade.bounds(tree.brick)
+        if region is None or ((region.bounds[0] >= low - cascade.voxel) & (region.bounds[1] <= high + cascade.voxel)).all():
+            return count
+    return len(cascades)
 
 
 def _level(threshold: float | None, number: int) -> float | None:

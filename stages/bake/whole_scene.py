@@ -43,6 +43,7 @@ from stages.train.priors import filled_points
 # Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned
 # in those that are partly as close, such as a wall behind the cameras, is baked. docs/experiments/near-cameras.md
 BAKED_CLEARANCE = 0.5
+MUCH_SMALLER = 0.6  # scene bounds, of the foreground region's longest side. docs/experiments/whole-scene.md
 FOREGROUND_RAYS = 2**18  # that the foreground region is found from
 CENTRES_PER_BLOCK = 2**20
 KINDS = {
@@ -84,7 +85,7 @@ class Cascades:
         )  # fmt: skip
         job.safe_point()
         self.region = region_of(self.samples, pixels, s, job.inputs["poses"])
-        self.bounds = np.asarray(self.region.bounds, np.float64) if plan.box is None else plan.box
+        self.bounds = innermost_box(self.region, s.bounds) if plan.box is None else plan.box
         self.count = cascades_needed(self.samples, self.bounds, *plan.cascades)
         self.finest = plan.resolution if plan.fixed else finest_of_cascades(s, self.bounds, self.count, plan.brick_size, plan.max_resolution)
 
@@ -118,6 +119,18 @@ class Cascades:
         environment = environment_beyond(samples, boxes_of(grids, brick), self.plan.environment_size, mean)
         weights = [seen_weights(one, part, shape, brick) for one, part, (shape, _, _) in zip(seen, indices, grids, strict=True)]
         return Surroundings(samples, self.region, weights, environment)
+
+
+def innermost_box(region: Region, scene_bounds: np.ndarray) -> np.ndarray:
+    """The box (2, 3) in which voxels are finest: the foreground region's; the scene bounds, what most photographs have in view, where these are far smaller.
+
+    A region that takes in a table and the floor round it would have voxels many pixels wide on the subject. Nothing is removed: the region goes on into the
+    next cascades.
+    """
+    bounds, wide = np.asarray(scene_bounds, np.float64), np.asarray(region.bounds, np.float64)
+    inside = np.stack([np.maximum(bounds[0], wide[0]), np.minimum(bounds[1], wide[1])])
+    sides, most = inside[1] - inside[0], float((wide[1] - wide[0]).max())
+    return inside if sides.min() > 0 and sides.max() < MUCH_SMALLER * most else wide
 
 
 def cascades_needed(samples: FieldSamples, bounds: np.ndarray, least: int, most: int) -> int:
