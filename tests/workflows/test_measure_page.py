@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from efficientnerf.asset import format
+from efficientnerf.asset.camera_paths import pose_on_sphere
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
@@ -25,7 +26,6 @@ from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.writing import SourceFrame
-from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.restriction import restricted
 from stages.framing.true_frame import AS_CAPTURED, Ground, save_frame
 from stages.io.scene import Scene, View, save, similarity_to_json
