@@ -1,7 +1,5 @@
 """The model: coarse field, fine field, density voxels and the space they live in; how it renders rays (EfficientNeRF, figure 2)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from importlib import import_module

@@ -7,8 +7,6 @@ partial  work on the present request was cut short; the published artifact, if a
 corrupt  the files are not those that were written
 """
 
-from __future__ import annotations
-
 import difflib
 import os
 from collections.abc import Collection, Sequence

@@ -13,8 +13,6 @@ PipelineError
 └── Interrupted        130 by Ctrl-C, 143 by SIGTERM
 """
 
-from __future__ import annotations
-
 import signal
 
 

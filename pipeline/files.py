@@ -4,8 +4,6 @@ What must survive a kill or a power cut goes through these functions and no othe
 one writer of files that appear whole or not at all. Nothing is written or deleted through a link, and nothing but plain files is opened.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

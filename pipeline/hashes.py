@@ -1,7 +1,5 @@
 """SHA-256 of files, remembered by size, times and inode so that an unchanged run is recognised without reading it."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import time

@@ -6,8 +6,6 @@ While a command runs, standard error's descriptor, 2, leads into the log, so tha
 and `.cache/libraries.log` of a run while its stages run; `--debug` shows it in the end.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

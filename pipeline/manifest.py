@@ -7,8 +7,6 @@ the rest  seconds, processor time, peak memory, tool versions: for people, outsi
 checksum  of all of the above, so that a damaged manifest is known as such
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import importlib.metadata

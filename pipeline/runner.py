@@ -1,7 +1,5 @@
 """Runs the stages that `decide` finds not fresh, and verifies a run."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading

@@ -5,8 +5,6 @@ counts only where the note and all of its files are as they were written, and th
 removed, and the piece is made again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

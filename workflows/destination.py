@@ -4,8 +4,6 @@ Every file is written aside and renamed, so that it is complete or not there at 
 neither followed nor replaced, a pipe or a device (/dev/stdout) cannot be written so.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,6 @@
 """`enerf export`: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras. 3D Gaussians:
 `workflows.exporting_splats`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A workflow of a command line: stages in order, presets, and forecasts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -9,8 +9,6 @@
 B coarse cells, N voxels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

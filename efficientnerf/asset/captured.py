@@ -1,7 +1,5 @@
 """The captured cameras as an asset keeps them (metadata `captured_path`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 N voxels, K harmonics, M samples along each side of a new voxel.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

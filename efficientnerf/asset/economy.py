@@ -7,8 +7,6 @@ same tree gives the same codes.
 N voxels, K harmonics, P entries of a palette.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

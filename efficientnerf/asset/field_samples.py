@@ -4,8 +4,6 @@ beyond all grids, and which rays should be opaque. The field is rendered once; t
 P rays, M samples, C views, L cascades.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

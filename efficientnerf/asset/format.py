@@ -4,8 +4,6 @@ A safetensors container (`container.py`) of a few tensors (`layouts.py`) and one
 file states is checked against the file's size and against the other tensors before memory for it is allocated.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -3,8 +3,6 @@
 N points.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.asset.tree import NerfTree

@@ -5,8 +5,6 @@
 R rays, N stored voxels, K harmonics.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

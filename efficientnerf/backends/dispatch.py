@@ -9,8 +9,6 @@ of colour and opacity alone, is `efficientnerf.asset.rendering.render_reference`
 backend, a line of OPERATIONS, a function here, and a case in tests/efficientnerf/backends/test_operations.py.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import warnings

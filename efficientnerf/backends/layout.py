@@ -3,8 +3,6 @@
 A field that says Any is an array on the CPU, a tensor on a device.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 EARLY_STOP = 1e-3  # transmittance at which a ray may end

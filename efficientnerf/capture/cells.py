@@ -3,8 +3,6 @@
 P points, M cells.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How a capture's cameras stand: where their axes meet, and the part of the sphere round a subject that they cover."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ planes are clipped around it. Without such a subject (a street, a facade) the re
 P points, M cells, C cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ in front of all content. Its intrinsics are a scale alone, chosen so that equal 
 with n the near plane and B the extent of the camera centres, so that cubic voxels fit. The constants are ratios of measured lengths.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

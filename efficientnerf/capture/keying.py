@@ -4,8 +4,6 @@ The screen's colour is followed across the photograph by a polynomial, for no la
 pixel is object. Shadows on a coloured screen change its lightness more than its hue, so lightness counts little there. (h, w) of a photograph.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

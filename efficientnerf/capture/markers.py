@@ -4,8 +4,6 @@ Letters: V views, M markers, s the length of an edge, u = log s. A marker is a p
 corners: offsets from the rays, in pixels of the middle of each picture, as in bundle adjustment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ rays pass between and past them, and the head lies next to the plane of the ches
 M cells, R rays, C cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

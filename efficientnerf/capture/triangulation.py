@@ -3,8 +3,6 @@
 Letters: V views, N points. Offsets from rays are in pixels of the middle of each picture, as in bundle adjustment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

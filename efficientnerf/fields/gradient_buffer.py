@@ -1,7 +1,5 @@
 """A gradient that backward passes add to in place."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The orbit of a capture's cameras, as scenes and assets keep it, and up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -12,8 +12,6 @@ has more samples than fit its last rays lose theirs (`Samples.complete`).
 R rays, N samples.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from torch import Tensor

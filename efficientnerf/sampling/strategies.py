@@ -8,8 +8,6 @@
 R rays, N coarse samples.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """From a tree and pictures to 3D Gaussians: its voxels merged, then fitted to the pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

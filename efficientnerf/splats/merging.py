@@ -11,8 +11,6 @@ a Gaussian's the sum itself.
 N voxels, C cells or Gaussians, K harmonics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

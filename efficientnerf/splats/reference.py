@@ -1,7 +1,5 @@
 """The rasteriser as plain torch, one Gaussian after the other over all pixels: the kernels' reference. Pinhole cameras."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

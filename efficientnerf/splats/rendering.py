@@ -1,7 +1,5 @@
 """Images of Gaussians, for any camera of the project."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 H x W pixels, V vertices, F faces, C components.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

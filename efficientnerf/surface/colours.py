@@ -3,8 +3,6 @@
 K directions, S samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -3,8 +3,6 @@
 These are the bricks of a tree; all of any other `Volume`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

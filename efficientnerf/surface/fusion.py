@@ -7,8 +7,6 @@ method for building complex models from range images", SIGGRAPH 1996; Newcombe e
 C cameras, H x W pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

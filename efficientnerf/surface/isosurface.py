@@ -4,8 +4,6 @@ Letters: sigma density per world unit, tau the level of the surface, s the voxel
 Everything is in the frame of the volume (`efficientnerf.surface.volume`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -3,8 +3,6 @@
 V vertices, F faces (counter-clockwise seen from outside), C connected components.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import fast_simplification

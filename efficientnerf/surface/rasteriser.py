@@ -3,8 +3,6 @@
 H x W pixels, V vertices, F faces.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 H x W pixels, s x s samples in each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 V vertices, F faces, C components.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -5,8 +5,6 @@ world. There a voxel is about a pixel wide at any depth, so that marching cubes,
 beyond the far limit is left out, for it reaches to infinity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The rays of a step, and the colours that they are to have. R rays."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -10,8 +10,6 @@ processor supports it, so that another machine's result differs, at the same qua
 R rays, A rays to sparse points, C views.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Adam over the parameters of a model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -3,8 +3,6 @@
 R rays, C views, P pixels of all views.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Protocol

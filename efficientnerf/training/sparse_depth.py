@@ -1,7 +1,5 @@
 """Supervision by the sparse points of structure from motion (Deng et al. 2022, "Depth-supervised NeRF", DS-NeRF). A rays to points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -10,8 +10,6 @@ Parent and child speak lines of JSON:
 Each child leads a group of processes. It ends with its parent, and whatever it has started ends with it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import itertools

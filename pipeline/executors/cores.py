@@ -1,7 +1,5 @@
 """How many cores this process may use, and the number of threads of libraries that do not look at all of its limits."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import MutableMapping

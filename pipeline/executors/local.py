@@ -4,8 +4,6 @@ An executor is a function (Stage, Job) -> Usage. It returns when job.out is comp
 (requests, publishing, locks, signals). An executor that sends stages elsewhere needs only the job's paths and its two callables.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

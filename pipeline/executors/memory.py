@@ -7,8 +7,6 @@ Only `available_now` depends on the memory that other programs take: the same li
     rlimit    RLIMIT_AS and RLIMIT_DATA, less the addresses that libraries and threads reserve and never use
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

@@ -5,8 +5,6 @@
     what fits nowhere           gets the largest worker alone; the caller lowers its demand to that
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ the disk is full, its run stayed locked       failed: by circumstances; the flee
 anything else, or the same once more          quarantined: by itself; only `retry` tries it again
 """
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A scene of a fleet while it is run: the stages that are left, and what is known of what they take."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any

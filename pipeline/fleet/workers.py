@@ -1,7 +1,5 @@
 """The scheduler's view of its executor: workers with their capacity, tasks, and results."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol

@@ -10,8 +10,6 @@ that finds a higher number than its own, or could not renew its own for EXPIRY s
 Within one machine an operating system's lock decides (`pipeline.locks.lock`): its holder may take over at once from a process of the same machine.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """matplotlib as all figures import it: it writes into our cache folder alone, and its settings are its own defaults."""
 
-from __future__ import annotations
-
 import atexit
 import functools
 import os

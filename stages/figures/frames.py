@@ -1,7 +1,5 @@
 """Rendering a camera path: PNG and EXR frames, and the video of them."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

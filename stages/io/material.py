@@ -1,7 +1,5 @@
 """Contents of sources without cameras: photographs and their masks by name, and frames of videos, which become photographs here."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Networks that the user has: ONNX files, run by onnxruntime on the CPU. Nothing is downloaded."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Reading photographs: after EXIF rotation, 8 bits sRGB, at a working size."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from pathlib import Path

@@ -13,8 +13,6 @@ raises becomes UnreadableImage, so that one bad picture is left out and ends not
 What is not sRGB by the picture's ICC profile is converted to it then (`decoders/colour_profile.py`); a profile that is damaged is left aside.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

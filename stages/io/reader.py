@@ -1,7 +1,5 @@
 """What a stage reads of photographs, each decoded once for a size: the photographs at working sizes, their alpha channels and masks at a small one."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from dataclasses import dataclass, field, fields, replace

@@ -9,8 +9,6 @@ Format 2 adds the space of the field and the forward-facing scene; format 1 is r
 Training frame: right-handed, z up, origin at the centre of the box, the largest half extent of the box 1.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """The images that later stages read: after EXIF rotation, 8 bits sRGB, at working size, with masks."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ than a few of them lie in the white, there is something, and nothing is masked. 
 of a turntable, is not in that hull, and left out too. docs/experiments/silhouettes.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

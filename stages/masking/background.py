@@ -4,8 +4,6 @@ Where the camera goes round an object, its surroundings give features, and the o
 the background shows no motion. docs/experiments/silhouettes.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 

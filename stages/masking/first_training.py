@@ -3,8 +3,6 @@
 It is small and always on the CPU: a scene has the same bytes whatever its later stages compute on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Masks as files, for photographs that have none."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path

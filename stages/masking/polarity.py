@@ -4,8 +4,6 @@ Masks that are white but for one compact thing in nearly all photographs either 
 black shapes are views of one thing: these fit its visual hull, and shapes of moving things do not. docs/experiments/silhouettes.md
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -6,8 +6,6 @@ to them.
 N points, M cells, R rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

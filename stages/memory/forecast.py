@@ -8,8 +8,6 @@
 docs/experiments/memory.md, fleet.md
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Memory decides where data lie and in how large pieces they are worked on, and ne
 setting that would make it smaller. So an artifact has the same bytes whatever memory it was made in, and memory is no part of its request.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Attempts that match again work in scratch folders of their own, made anew: lefto
 docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cameras of photographs: structure from motion in a process of its own (`stages.sfm.process`), and what passes to it and back."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import fcntl

@@ -5,8 +5,6 @@ COLMAP writes without syncing, and the folder may come from someone else: a run 
 old one are copied that are as a note says they were written (`stages.scratch`), and that COLMAP can read without reaching beyond them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import sqlite3

@@ -5,8 +5,6 @@ rest, and the rows of COLMAP's database without the image's number, as MessagePa
 without; 0 keeps none. Features are detected where there can be no such folder, or a file of it is damaged.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

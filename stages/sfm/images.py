@@ -1,7 +1,5 @@
 """Copies of the photographs that COLMAP reads: after EXIF rotation, at working size, with their masks; decoded once for all searches of a stage."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -3,8 +3,6 @@
 See docs/experiments/sfm.md.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A worker is a child as that of structure from motion (`stages.sfm.process`), sta
 into its database, matches, and reports; one process copies the rows into the database of all.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 from collections.abc import Callable, Mapping, Sequence

@@ -9,8 +9,6 @@ photographs' own SIFT features, over words that are found in them by k-means: no
 whole numbers are exact, so that the pairs are the same on any machine. docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ On the CPU, bit-exact from run to run. The capture's frame is COLMAP's: its scal
 own; docs/experiments/sfm.md says why the steps are these.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -6,8 +6,6 @@
 Memory does not grow with the length of a video but for three numbers a frame.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass

@@ -4,8 +4,6 @@ The views of all pictures of one size have one lens, whose focal length is exact
 panorama shows who carries the camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The demuxer is chosen by the file's first bytes and is handed the open file alon
 several threads, which changes no bit of an intact stream; where one is damaged, what its concealment gives may, and it is read on one thread again.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator

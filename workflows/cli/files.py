@@ -1,7 +1,5 @@
 """`enerf export`, `enerf render` and `enerf inspect`: commands on a run or an asset file."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

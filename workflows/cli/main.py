@@ -3,8 +3,6 @@
 The module of a command is imported when the command is used, so that `--help` answers at once.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ command's output proper (a listing, anything with --json) fails, a command that 
 plain listing (`| head`) has had enough, which is no failure.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -4,8 +4,6 @@ The order is: the defaults of the dataclasses, the preset, the configuration fil
 mapping `{stage: {setting: value}}`.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Lines of keys in a TOML file: tomllib has none."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterator
 from typing import Any

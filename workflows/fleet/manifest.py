@@ -14,8 +14,6 @@ A manifest may be untrusted. It is small, its names name folders, and its source
 All mistakes are reported at once, before anything runs.
 """
 
-from __future__ import annotations
-
 import csv
 import glob
 import io

@@ -1,7 +1,5 @@
 """A fleet from its scenes to its end: the folder and its lock, the workers, the scheduler, and what is written next to fleet.json."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """`enerf check`: the verdict on photographs before a run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory

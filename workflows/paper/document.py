@@ -8,8 +8,6 @@ A row is a mapping from column to value; a column that ends in PAPER holds what 
 from a Request to a Result, and TABLES says which; what trains keeps its runs under OUT/runs, so that a table that was interrupted goes on where it was.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

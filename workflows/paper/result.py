@@ -1,7 +1,5 @@
 """Request and result of a table of the paper (`workflows.paper.document`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

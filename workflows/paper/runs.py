@@ -3,8 +3,6 @@
 A row's run is an ordinary run folder, OUT/runs/<scene>/<row>: it resumes after an interruption, and `enerf status` and the rest work on it.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import statistics

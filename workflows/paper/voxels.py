@@ -9,8 +9,6 @@ are occupied until the share is reached. Scattered: independent random voxels.
 N voxels, M points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

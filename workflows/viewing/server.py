@@ -5,8 +5,6 @@ otherwise; requests must name it by that (a name that was made to point here, DN
 part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; slow clients delay no others.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re

@@ -8,8 +8,6 @@
 B bricks, N stored voxels, K harmonics, G groups of them, T entries of a table, P of a palette.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

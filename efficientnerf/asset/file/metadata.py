@@ -1,7 +1,5 @@
 """The metadata of an asset, checked: the rules of FORMAT.md, sections 2, 8 and 9; those of unbounded scenes are in `whole_scene.py`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -10,8 +10,6 @@ Numbers are LEB128; T and tables are bytes.
 M symbols, n contexts, T tables, S slices, L lanes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 

@@ -10,8 +10,6 @@ number of threads and whether or not they were interrupted. On CUDA sums do not 
 PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2022) optimise trees and grids this way. N voxels, R rays.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 

@@ -6,8 +6,6 @@ their gradients, as if gradients were summed by entries (VQRF, Li et al. 2023, s
 N voxels, P entries of a palette.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -10,8 +10,6 @@ Inside, numbers are float32, or bfloat16 with float32 accumulators; weights, inp
 vectors: I inputs, L hidden layers of H, and O outputs become K, W and V columns. N samples.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A multiresolution hash grid and its network in plain torch (Mueller et al. 2022, "Instant neural graphics primitives"). N points, L levels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ visibility-consistent dense multiview stereo", TPAMI 2012; Goesele et al., "Mult
 C photographs, V vertices, F faces, K places for photographs of each vertex, S offsets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Each is the projection of neighbouring faces along the mean of their normals. xa
 40 s for the 100 k faces of a mesh from an asset, where this takes one. docs/experiments/textures.md
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Vertices that are split where a texture has its seams: as many as files with one texture coordinate each have."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

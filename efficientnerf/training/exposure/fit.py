@@ -4,8 +4,6 @@ vignetting of its camera, by robust least squares. Much better evidence than the
 O observations, P points, C photographs, K cameras.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

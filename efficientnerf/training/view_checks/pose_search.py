@@ -5,8 +5,6 @@ shift of each start is found by correlation and taken as a rotation. The best ar
 in ever smaller cells.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

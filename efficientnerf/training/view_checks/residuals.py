@@ -4,8 +4,6 @@ Photographs and renders are compared in cells that average many pixels, so that 
 photograph's variance once the render's colours are fitted to it by channel: exposure and white balance do not matter. C views, H x W cells of a view.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ of meshes whose format keeps textures take `picture`, "png" or "jpeg", too; thos
 for what would make a broken file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """MP4 with H.264, 4:2:0, Rec. 709, index in front: what every browser plays. The same frames are the same bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shared by all exporters: the frame that a file's numbers are in, the checks before, and writing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 Nothing heavy is imported until something is read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ A phone's depth is upsampled, smooth across edges and a guess beyond five metres
 other maps confirm it. Their number is bounded, whatever the number of maps. C photos, N points.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

@@ -4,8 +4,6 @@ Missing images are looked for, one listed folder at a time: where nothing of a l
 stands in for it (images/ listed, rgb/ there). A tie between two folders is not decided.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath

@@ -1,7 +1,5 @@
 """Formats that list frames: how one is recognised and read, with what all of them have in common."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

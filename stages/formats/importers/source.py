@@ -10,8 +10,6 @@ What lies outside the source folder is not read unless the user allows it. `Sour
 that it returns is the one that is opened, whatever becomes of the links later.
 """
 
-from __future__ import annotations
-
 import os
 import unicodedata
 from collections.abc import Sequence

@@ -9,8 +9,6 @@ which photographs nearly all have, give the same with either. docs/experiments/c
 A profile is known as sRGB by what it does to colours, not by its name: there are dozens of them under many names, and pictures with one keep their pixels.
 """
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass, replace
 from functools import lru_cache

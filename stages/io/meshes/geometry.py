@@ -3,8 +3,6 @@
 N vertices, F triangles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO

@@ -3,8 +3,6 @@
 glTF 2.0, sections 3.6 (buffers and accessors), 3.5 (nodes), 4.4 (GLB).
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from typing import Any, BinaryIO

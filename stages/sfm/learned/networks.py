@@ -7,8 +7,6 @@ of 1; key points are in pixels, or from -1 at the middle of the first pixel to 1
 picture that of the second or -1, and `mscores0`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Seconds are those that a scene takes by itself: a stage that another scene made for it counts as if it had made it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pages of a running fleet: each written atomically, now and then, and at the end."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

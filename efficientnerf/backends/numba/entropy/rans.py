@@ -6,8 +6,6 @@ turn (Giesen 2014): while one waits for its table the next ones go on. Nothing b
 M symbols, T tables, n contexts, S slices, L lanes.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -7,8 +7,6 @@ Gaussian's size. 3DGS carries them along.
 Squares of gradients are averaged over a Gaussian's mean, scales, rotation, opacity, base colour and other harmonics, one number each.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

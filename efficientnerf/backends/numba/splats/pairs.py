@@ -6,8 +6,6 @@ touch: those that its ellipse meets, by rows of blocks. The pairs of a tile foll
 P pairs, N Gaussians, T tiles.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -7,8 +7,6 @@ knows pinholes alone, the derivative here includes the lens: distorted pictures 
 Values lie in groups of sixteen Gaussians: (G, rows, 16) float32, rows as named below, 3 K of them harmonics, coefficient by coefficient.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -10,8 +10,6 @@ to the last. The sums of a Gaussian over a tile's pixels are its pair's own: no 
 P pairs, N Gaussians, H x W pixels.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

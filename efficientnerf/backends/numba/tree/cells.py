@@ -3,8 +3,6 @@
 N stored voxels, L cascades, C coarse cells of all cascades.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

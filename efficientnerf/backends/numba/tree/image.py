@@ -1,7 +1,5 @@
 """Images from packed trees (numba): rays of a camera, or given rays, in tiles of neighbours."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

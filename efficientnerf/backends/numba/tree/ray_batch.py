@@ -6,8 +6,6 @@ The rays of a tile lie in a cone. As long as the ball in which the cone widens m
 first may, and a tile that never may is done. That skips samples of density zero and changes no value.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

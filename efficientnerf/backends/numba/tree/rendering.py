@@ -4,8 +4,6 @@ Images and rays are rendered from the tree's packed form by `tree.image` and `tr
 `efficientnerf.asset.rendering.render_reference`.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 from typing import NamedTuple

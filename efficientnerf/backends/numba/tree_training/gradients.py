@@ -13,8 +13,6 @@ The torch reference is `efficientnerf.asset.rendering.render_reference` and its 
 R rays, P packets, N voxels, K harmonics, M records, U chunks.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Voxels beside voxels (numba), for total variation. B bricks."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

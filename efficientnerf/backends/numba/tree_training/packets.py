@@ -10,8 +10,6 @@ coarse cell in which samples have the lowest of their eight voxels, with the blo
 Coordinates of rays are in voxels of cascade 0. N stored voxels, B bricks, L cascades, C coarse cells of all cascades, S samples, K harmonics.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -8,8 +8,6 @@ voxel that rays met, n over the voxels beyond its faces that are stored and tau_
 the moments as the weight decay of AdamW (Loshchilov and Hutter 2019) is.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any, NamedTuple
 

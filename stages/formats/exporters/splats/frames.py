@@ -3,8 +3,6 @@
 N Gaussians, K harmonics.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -11,8 +11,6 @@
 https://github.com/nianticlabs/spz
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

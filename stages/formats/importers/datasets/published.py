@@ -12,8 +12,6 @@
 x right, y down, z forward in all but the first.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Pixels of a packet of rays (numba): what its rays met, written into the images."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
