@@ -31,21 +31,14 @@ POLL = 0.1  # seconds between two looks for a signal while stages run at the sam
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one stage.
-
-    action   "ran", "skipped" (it was fresh), "would run" or, of a dry run, "may run" (if those before it give something new)
-    reason   why it ran; None if it was fresh
-    seconds  that it took, also when it was fresh
-    size     bytes of its artifact
-    digest   of its artifact
-    """
+    """What became of one stage."""
 
     stage: str
-    action: str
-    reason: str | None = None
-    seconds: float = 0.0
-    size: int = 0
-    digest: str | None = None
+    action: str  # "ran", "skipped" (it was fresh), "would run" or, of a dry run, "may run" (if those before it give something new)
+    reason: str | None = None  # why it ran; None if it was fresh
+    seconds: float = 0.0  # that it took, also when it was fresh
+    size: int = 0  # bytes of its artifact
+    digest: str | None = None  # of its artifact
 
 
 def run_stages(

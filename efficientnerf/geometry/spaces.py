@@ -96,19 +96,13 @@ class BoundedSpace(Box):
 
     Defaults, of settings left to be chosen: num_coarse_samples (N_c), occupancy_resolution, occupancy_alpha_threshold, distortion_loss_weight;
     voxel_depth, depth over width of a baked voxel.
-
-    contracted              whether space beyond the box is contracted into a shell
-    unbounded               whether the space has no end, so that densities spread along rays and the distortion loss is needed
-    reaches_infinity        whether the box itself reaches to infinity, so that nothing can lie behind it
-    scales_near_gradients   whether rays crowd together before the cameras, so that gradients there are scaled by the distance
-    reach                   the largest contracted coordinate
     """
 
-    contracted: ClassVar[bool] = False
-    unbounded: ClassVar[bool] = False
-    reaches_infinity: ClassVar[bool] = False
-    scales_near_gradients: ClassVar[bool] = False
-    reach: ClassVar[float] = 1.0
+    contracted: ClassVar[bool] = False  # whether space beyond the box is contracted into a shell
+    unbounded: ClassVar[bool] = False  # whether the space has no end, so that densities spread along rays and the distortion loss is needed
+    reaches_infinity: ClassVar[bool] = False  # whether the box itself reaches to infinity, so that nothing can lie behind it
+    scales_near_gradients: ClassVar[bool] = False  # whether rays crowd together before the cameras, so that gradients there are scaled by the distance
+    reach: ClassVar[float] = 1.0  # the largest contracted coordinate
     num_coarse_samples: ClassVar[int] = 128
     occupancy_resolution: ClassVar[int] = 128
     occupancy_alpha_threshold: ClassVar[float] = 0.01

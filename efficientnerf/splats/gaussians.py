@@ -19,20 +19,14 @@ MAX_DEGREE = 3  # the most in formats and programs of 3DGS
 class Gaussians:
     """3D Gaussians.
 
-    means      (N, 3) float32  in the asset's scene frame
-    scales     (N, 3) float32  standard deviations along the own axes, above 0
-    rotations  (N, 4) float32  unit quaternions w x y z: own axes to the scene's
-    opacities  (N,)   float32  between 0 and 1, both excluded
-    harmonics  (N, K, 3) float32
-
     Raises ValueError for arrays of other shapes or types, and for values outside of these ranges.
     """
 
-    means: np.ndarray
-    scales: np.ndarray
-    rotations: np.ndarray
-    opacities: np.ndarray
-    harmonics: np.ndarray
+    means: np.ndarray  # (N, 3) float32  in the asset's scene frame
+    scales: np.ndarray  # (N, 3) float32  standard deviations along the own axes, above 0
+    rotations: np.ndarray  # (N, 4) float32  unit quaternions w x y z: own axes to the scene's
+    opacities: np.ndarray  # (N,)   float32  between 0 and 1, both excluded
+    harmonics: np.ndarray  # (N, K, 3) float32
 
     def __post_init__(self) -> None:
         count = len(self.means)

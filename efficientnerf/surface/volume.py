@@ -47,13 +47,10 @@ class Volume(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class WorldVolume:
-    """A tree, its points in its own frame; see `Volume`.
-
-    region  that surfaces are clipped to, half way into the band in which opacity fades; None: not at all
-    """
+    """A tree, its points in its own frame; see `Volume`."""
 
     tree: NerfTree
-    region: Region | None = field(default=None, kw_only=True)
+    region: Region | None = field(default=None, kw_only=True)  # that surfaces are clipped to, half way into the band in which opacity fades; None: not at all
 
     @property
     def shape(self) -> tuple[int, int, int]:

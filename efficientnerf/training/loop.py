@@ -68,23 +68,16 @@ class Progress:
 
 @dataclass
 class Trainer:
-    """The state of a training run.
-
-    schedule         the one that the next step follows; another may take its place between steps
-    samples_per_ray  the running average that sets the number of rays
-    exposure         of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
-    cameras          corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
-    checks           of the training views (`efficientnerf.training.view_checks.checks`), or None
-    """
+    """The state of a training run."""
 
     model: Model
     adam: Adam
-    schedule: Schedule
+    schedule: Schedule  # the one that the next step follows; another may take its place between steps
     step: int = 0
-    samples_per_ray: float = 0.0
-    exposure: Exposure | None = None
-    cameras: CameraCorrections | None = None
-    checks: ViewChecks | None = None
+    samples_per_ray: float = 0.0  # the running average that sets the number of rays
+    exposure: Exposure | None = None  # of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
+    cameras: CameraCorrections | None = None  # corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
+    checks: ViewChecks | None = None  # of the training views (`efficientnerf.training.view_checks.checks`), or None
 
 
 def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | None = None, cameras: Sequence[Camera] = ()) -> Trainer:

@@ -28,16 +28,11 @@ DECODERS = 16  # threads at most: each holds frames
 
 @dataclass
 class Material:
-    """Files by the name that they have from here on.
+    """Files by the name that they have from here on."""
 
-    paths   photographs
-    masks   by the name of the photograph
-    videos  videos whose frames are to be chosen
-    """
-
-    paths: dict[str, Path] = field(default_factory=dict)
-    masks: dict[str, Path] = field(default_factory=dict)
-    videos: dict[str, Path] = field(default_factory=dict)
+    paths: dict[str, Path] = field(default_factory=dict)  # photographs
+    masks: dict[str, Path] = field(default_factory=dict)  # by the name of the photograph
+    videos: dict[str, Path] = field(default_factory=dict)  # videos whose frames are to be chosen
 
 
 def photographs_of(job: Job, warn: Warn) -> Material:

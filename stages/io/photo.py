@@ -45,14 +45,10 @@ class PhotoDetails:
 
 @dataclass(frozen=True)
 class DecodedPhoto(PhotoDetails):
-    """A photograph after EXIF rotation.
+    """A photograph after EXIF rotation."""
 
-    rgb     (h, w, 3) uint8 sRGB at working size
-    opaque  (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
-    """
-
-    rgb: np.ndarray
-    opaque: np.ndarray | None
+    rgb: np.ndarray  # (h, w, 3) uint8 sRGB at working size
+    opaque: np.ndarray | None  # (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
 
 
 def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:

@@ -28,20 +28,13 @@ NEITHER = Silhouettes()
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A source image after EXIF rotation.
+    """A source image after EXIF rotation."""
 
-    pixels       (H, W, 3 or 4) uint8 sRGB, straight alpha
-    verbatim     whether the file itself holds exactly these pixels in a form that later stages read
-    orientation  EXIF's number, 1-8
-    lossy        whether the format keeps pixels only about as they were
-    fault        why the file's colour profile is not used, if it has one and it is not
-    """
-
-    pixels: np.ndarray
-    verbatim: bool
-    orientation: int
-    lossy: bool
-    fault: str | None = None
+    pixels: np.ndarray  # (H, W, 3 or 4) uint8 sRGB, straight alpha
+    verbatim: bool  # whether the file itself holds exactly these pixels in a form that later stages read
+    orientation: int  # EXIF's number, 1-8
+    lossy: bool  # whether the format keeps pixels only about as they were
+    fault: str | None = None  # why the file's colour profile is not used, if it has one and it is not
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,10 @@ INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white reverses this"
 
 @dataclass(frozen=True)
 class Kept:
-    """Masks by name of the photograph.
+    """Masks by name of the photograph."""
 
-    masks      that keep what is white, as far as is known
-    inverted   the same with black and white exchanged, where cameras have yet to show whether that is right; else none
-    """
-
-    masks: dict[str, Path]
+    masks: dict[str, Path]  # that keep what is white, as far as is known
+    # the same with black and white exchanged, where cameras have yet to show whether that is right; else none
     inverted: dict[str, Path] = field(default_factory=dict)
 
 

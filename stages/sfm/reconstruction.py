@@ -54,23 +54,18 @@ ATTEMPTS = (
 @dataclass(frozen=True)
 class Request:
     """
-    folder    of the photographs, for errors
-    paths     the file of each photograph, by name
-    work      scratch folder; what a killed call left in it is used again
-    masks     of some or all names; None: the photograph as a whole, whatever its alpha channel says
-
     The others are those of `stages.sfm.cameras.find_cameras`.
     """
 
-    folder: Path
-    paths: dict[str, Path]
-    work: Path
+    folder: Path  # of the photographs, for errors
+    paths: dict[str, Path]  # the file of each photograph, by name
+    work: Path  # scratch folder; what a killed call left in it is used again
     max_side: int
     features: int
     matching: str = "auto"
     seed: int = 0
     threads: int | None = None
-    masks: dict[str, Path | None] = field(default_factory=dict)
+    masks: dict[str, Path | None] = field(default_factory=dict)  # of some or all names; None: the photograph as a whole, whatever its alpha channel says
     lens: str = "auto"
     networks: tuple[Path, Path] | None = None
     copies: Path | None = None

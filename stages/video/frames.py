@@ -49,28 +49,19 @@ class Looked:
 
 @dataclass(frozen=True)
 class Chosen:
-    """The frames of the videos.
+    """The frames of the videos."""
 
-    paths   name -> PNG, in order of time within each video; a name is that of the video, /, the frame's number
-    camera  name -> the camera that took it, in words; frames of one video have one
-    record  for frames.json
-    """
-
-    paths: dict[str, Path]
-    camera: dict[str, str]
-    record: list[dict[str, object]]
+    paths: dict[str, Path]  # name -> PNG, in order of time within each video; a name is that of the video, /, the frame's number
+    camera: dict[str, str]  # name -> the camera that took it, in words; frames of one video have one
+    record: list[dict[str, object]]  # for frames.json
 
 
 @dataclass(frozen=True)
 class Reader:
-    """What readers need of the stage.
+    """What readers need of the stage."""
 
-    threads  that decode
-    work     scratch folder
-    """
-
-    threads: int
-    work: Path
+    threads: int  # that decode
+    work: Path  # scratch folder
     progress: Progress
     safe_point: Callable[[], None]
     warn: Callable[[str], object]

@@ -39,14 +39,10 @@ class UnreadableVideo(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame as it was decoded.
+    """A frame as it was decoded."""
 
-    index  of the frame in the file, from 0
-    time   seconds, as the file states it
-    """
-
-    index: int
-    time: float
+    index: int  # of the frame in the file, from 0
+    time: float  # seconds, as the file states it
     _decoded: Any
     _size: tuple[int, int]
     _matrix: tuple[int, int, int, int]

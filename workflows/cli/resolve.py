@@ -31,18 +31,13 @@ _LARGEST = 2**63
 
 @dataclass(frozen=True)
 class Preset:
-    """A preset, read.
-
-    inherits  the preset that it changes, or None
-    own       the table of its file
-    table     `own` over the table of the preset that it inherits from
-    """
+    """A preset, read."""
 
     name: str
     description: str
-    inherits: str | None
-    own: Table
-    table: Table
+    inherits: str | None  # the preset that it changes, or None
+    own: Table  # the table of its file
+    table: Table  # `own` over the table of the preset that it inherits from
 
 
 @dataclass(frozen=True)

@@ -43,16 +43,13 @@ NAME_RULE = "letters, digits, '.', '_' and '-', a letter or digit first, at most
 
 @dataclass
 class Entry:
-    """A scene as it was written.
-
-    where  key -> line
-    """
+    """A scene as it was written."""
 
     name: str
     sources: list[Any]
     values: Mapping[str, Any] = field(default_factory=dict)
     line: int | None = None
-    where: Mapping[str, int | None] = field(default_factory=dict)
+    where: Mapping[str, int | None] = field(default_factory=dict)  # key -> line
 
 
 def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over: Choice | None = None, roots: Sequence[Path] = ()) -> list[Scene]:
@@ -208,15 +205,11 @@ def _check_names(entries: Sequence[Entry], checker: Checker) -> None:
 
 @dataclass
 class _Reader:
-    """Makes scenes of entries.
-
-    base    what relative sources are relative to
-    inside  folders that sources may lie in; None: anywhere, the operator gave each
-    """
+    """Makes scenes of entries."""
 
     checker: Checker
-    base: Path
-    inside: list[Path] | None
+    base: Path  # what relative sources are relative to
+    inside: list[Path] | None  # folders that sources may lie in; None: anywhere, the operator gave each
     fleet: Path
     common: Choice
     over: Choice

@@ -41,16 +41,11 @@ SCENES_OF = {"transforms_train.json", "transforms.json", "poses_bounds.npy"}
 
 @dataclass(frozen=True)
 class Row:
-    """One training to be measured.
+    """One training to be measured."""
 
-    name     of its run folder
-    changes  to the train settings of PRESET, as they are in the paper; `scaled` shrinks them like the rest
-    bakes    whether its tree is baked and measured too
-    """
-
-    name: str
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    bakes: bool = False
+    name: str  # of its run folder
+    changes: Mapping[str, Any] = field(default_factory=dict)  # to the train settings of PRESET, as they are in the paper; `scaled` shrinks them like the rest
+    bakes: bool = False  # whether its tree is baked and measured too
 
 
 @dataclass(frozen=True)

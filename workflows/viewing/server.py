@@ -43,16 +43,12 @@ NOTHING = "default-src 'none'; frame-ancestors 'none'"
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer: bytes, or an open file, which the sender closes.
+    """An answer: bytes, or an open file, which the sender closes."""
 
-    kind    content type
-    policy  content security policy
-    """
-
-    kind: str
+    kind: str  # content type
     data: bytes = b""
     file: int | None = None
-    policy: str = NOTHING
+    policy: str = NOTHING  # content security policy
 
 
 @dataclass

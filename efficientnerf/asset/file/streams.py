@@ -28,15 +28,11 @@ Coder = object  # of `efficientnerf.backends.numba.entropy.rans`, whose import i
 
 
 class Family(NamedTuple):
-    """Contexts of a stream up to `end`, from where the family before ends; they share tables among themselves alone.
-
-    lane     which state codes them
-    symbols  how many a table may have
-    """
+    """Contexts of a stream up to `end`, from where the family before ends; they share tables among themselves alone."""
 
     end: int
-    lane: int = 0
-    symbols: int = 256
+    lane: int = 0  # which state codes them
+    symbols: int = 256  # how many a table may have
 
 
 def _ranges(families: Sequence[Family]) -> Iterator[tuple[slice, Family]]:

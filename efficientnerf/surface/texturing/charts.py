@@ -23,14 +23,10 @@ SMALL = 40  # faces under which a chart joins one next to it, where it fits
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Faces laid flat.
+    """Faces laid flat."""
 
-    chart    (F,) int64 number of each face's chart, 0..C-1; faces of one chart are connected
-    corners  (F, 3, 2) float64 in the plane of the chart, the mesh's units; each chart begins at the origin
-    """
-
-    chart: np.ndarray
-    corners: np.ndarray
+    chart: np.ndarray  # (F,) int64 number of each face's chart, 0..C-1; faces of one chart are connected
+    corners: np.ndarray  # (F, 3, 2) float64 in the plane of the chart, the mesh's units; each chart begins at the origin
 
     @property
     def count(self) -> int:

@@ -74,16 +74,11 @@ def halved(photo: Photograph) -> Photograph:
 
 @dataclass(frozen=True)
 class Survey:
-    """Statistics of a photograph on the mesh, before any texel sees it.
+    """Statistics of a photograph on the mesh, before any texel sees it."""
 
-    density    (F,) float32 pixels on the side of the square that a face is half of, where one of its vertices shows; zero elsewhere
-    sharpness  of its pixels of the mesh: how much of their detail is fine
-    gains      (3,) factors that bring its colours to those of the vertices; nan where it shows too few
-    """
-
-    density: np.ndarray
-    sharpness: float
-    gains: np.ndarray
+    density: np.ndarray  # (F,) float32 pixels on the side of the square that a face is half of, where one of its vertices shows; zero elsewhere
+    sharpness: float  # of its pixels of the mesh: how much of their detail is fine
+    gains: np.ndarray  # (3,) factors that bring its colours to those of the vertices; nan where it shows too few
 
 
 def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours: np.ndarray, photo: Photograph, tick: Callable[[], None] = _untold) -> Survey:

@@ -52,20 +52,13 @@ def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
 
 @dataclass
 class Listing:
-    """Frames with the images that they led to.
+    """Frames with the images that they led to."""
 
-    found       (frame, its image)
-    missing     names, as they may be shown
-    repeated    (name, reason) of those that name an image again
-    places      (listed, found) of those found at another place
-    extensions  (listed, found) of those with another extension
-    """
-
-    found: list[tuple[Frame, Path]] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    repeated: list[tuple[str, str]] = field(default_factory=list)
-    places: list[tuple[str, str]] = field(default_factory=list)
-    extensions: list[tuple[str, str]] = field(default_factory=list)
+    found: list[tuple[Frame, Path]] = field(default_factory=list)  # (frame, its image)
+    missing: list[str] = field(default_factory=list)  # names, as they may be shown
+    repeated: list[tuple[str, str]] = field(default_factory=list)  # (name, reason) of those that name an image again
+    places: list[tuple[str, str]] = field(default_factory=list)  # (listed, found) of those found at another place
+    extensions: list[tuple[str, str]] = field(default_factory=list)  # (listed, found) of those with another extension
 
 
 def check_count(count: int, where: str) -> None:

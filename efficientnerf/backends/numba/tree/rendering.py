@@ -38,14 +38,11 @@ def _allocate(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np
 
 
 class ViewColours(NamedTuple):
-    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`.
-
-    view  all that the colours depend on beside the tree; empty for none
-    """
+    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`."""
 
     views: Views
     colours: np.ndarray
-    view: bytes
+    view: bytes  # all that the colours depend on beside the tree; empty for none
 
 
 def _cone(camera: Camera) -> np.ndarray:

@@ -42,18 +42,12 @@ BIN_BITS = 15  # voxels of a bin, power of two
 
 
 class Records(NamedTuple):
-    """What voxels got from packets.
+    """What voxels got from packets."""
 
-    numbers   (M, 2) int32 of the voxel, and of the packet
-    gradient  (M, 4) of the loss by the arguments of the sigmoids, and by density
-    begin     (U, bins + 1) int64: where the records of a chunk and bin begin, those of chunk u from u * capacity on
-    basis     (P, K) harmonics of the packets
-    """
-
-    numbers: np.ndarray
-    gradient: np.ndarray
-    begin: np.ndarray
-    basis: np.ndarray
+    numbers: np.ndarray  # (M, 2) int32 of the voxel, and of the packet
+    gradient: np.ndarray  # (M, 4) of the loss by the arguments of the sigmoids, and by density
+    begin: np.ndarray  # (U, bins + 1) int64: where the records of a chunk and bin begin, those of chunk u from u * capacity on
+    basis: np.ndarray  # (P, K) harmonics of the packets
 
 
 class Packets(NamedTuple):
