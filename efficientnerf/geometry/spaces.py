@@ -33,17 +33,14 @@ FARTHEST = 1.0 / 64  # 1 / |u|_inf at which a ray in contracted space ends
 
 
 class RayBundle(NamedTuple):
-    """Rays in a space's frame.
+    """Rays in a space's frame."""
 
-    origins, directions, near, far  (R, 3), (R, 3) unit, (R,), (R,) in units of the frame
-    warp                            begin, ds_dt, dlogz_dt of `efficientnerf.geometry.ndc`, (R,) each; None where the frame is the world
-    """
-
+    # origins, directions, near, far: (R, 3), (R, 3) unit, (R,), (R,) in units of the frame
     origins: Tensor
     directions: Tensor
     near: Tensor
     far: Tensor
-    warp: tuple[Tensor, Tensor, Tensor] | None
+    warp: tuple[Tensor, Tensor, Tensor] | None  # begin, ds_dt, dlogz_dt of `efficientnerf.geometry.ndc`, (R,) each; None where the frame is the world
 
     def last(self, count: int) -> RayBundle:
         """The last of the rays."""

@@ -42,24 +42,17 @@ MAX_STEPS = 2**40  # of a run: beyond any practical one
 
 @dataclass
 class Progress:
-    """Statistics of one step.
+    """Statistics of one step."""
 
-    step        from 1
-    loss        mean squared error of the fine colours; this and the counts are those of some steps before on CUDA (`efficientnerf.training.readback`)
-    rays        in the step
-    tried       coarse intervals, valid or not
-    valid, pivotal, fine   how many samples of each kind
-    left_out    rays whose samples did not fit, and that the loss leaves out; on CUDA alone
-    """
-
-    step: int
-    loss: float
-    rays: int
-    tried: int
+    step: int  # from 1
+    loss: float  # mean squared error of the fine colours; this and the counts are those of some steps before on CUDA (`efficientnerf.training.readback`)
+    rays: int  # in the step
+    tried: int  # coarse intervals, valid or not
+    # valid, pivotal, fine: how many samples of each kind
     valid: int
     pivotal: int
     fine: int
-    left_out: int = 0
+    left_out: int = 0  # rays whose samples did not fit, and that the loss leaves out; on CUDA alone
 
     @property
     def psnr(self) -> float:

@@ -144,22 +144,16 @@ class Totals:
 
 @dataclass
 class FleetState:
-    """A fleet.
-
-    started, updated  ISO 8601, UTC
-    forecast_seconds  until its end, None where nothing is known yet
-    executor          "local" or "dask"
-    slots             stages that may run at a time
-    note              what it waits for, or why it ended with scenes that wait
-    """
+    """A fleet."""
 
     state: FleetWord = "running"
+    # started, updated: ISO 8601, UTC
     started: _Name = ""
     updated: _Name = ""
-    forecast_seconds: _Seconds | None = None
-    executor: _Name = "local"
-    slots: _Count = 1
-    note: _Text | None = None
+    forecast_seconds: _Seconds | None = None  # until its end, None where nothing is known yet
+    executor: _Name = "local"  # "local" or "dask"
+    slots: _Count = 1  # stages that may run at a time
+    note: _Text | None = None  # what it waits for, or why it ended with scenes that wait
     totals: Totals = field(default_factory=Totals)
     scenes: Annotated[list[SceneState], msgspec.Meta(max_length=MOST_SCENES)] = field(default_factory=list)
 

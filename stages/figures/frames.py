@@ -24,24 +24,17 @@ AHEAD = 2  # frames that are rendered and not written yet
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a camera path is rendered.
+    """How a camera path is rendered."""
 
-    background      white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white; auto: the asset's environment, white where it has
-                    none
-    supersample     rays along each side of a pixel
-    exr             "off", "first" or "all": which frames are written as EXR too
-    video           name of the MP4 in the output folder, or None
-    fps, crf        of the video
-    compress_level  of the PNGs
-    """
-
+    # white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white; auto: the asset's environment, white where it has none
     background: str = "auto"
-    supersample: int = 1
-    exr: str = "first"
-    video: str | None = "turntable.mp4"
+    supersample: int = 1  # rays along each side of a pixel
+    exr: str = "first"  # "off", "first" or "all": which frames are written as EXR too
+    video: str | None = "turntable.mp4"  # name of the MP4 in the output folder, or None
+    # fps, crf: of the video
     fps: int = 30
     crf: int = 18
-    compress_level: int = USUAL
+    compress_level: int = USUAL  # of the PNGs
 
 
 Progress = Callable[[int, int], None]

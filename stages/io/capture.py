@@ -18,22 +18,15 @@ Lens = Literal["zoomed", "cropped"]
 
 @dataclass(frozen=True)
 class Photo:
-    """One image of the source and the camera that took it.
+    """One image of the source and the camera that took it."""
 
-    camera      in the capture's frame, for the image after EXIF rotation, at the source's full size; its name is the image's
-                path relative to the source folder
-    image       the file itself, without links
-    mask        the file of its mask, without links, or None
-    mask_ignore "black" if zero pixels of the mask are left out, "white" if the non-zero ones are
-    split       "train", "val" or "test" where the source states it, else None
-    near, far   along the view axis in the capture's units where the source states it, else None
-    """
-
+    # in the capture's frame, for the image after EXIF rotation, at the source's full size; its name is the image's path relative to the source folder
     camera: Camera
-    image: Path
-    mask: Path | None = None
-    mask_ignore: str = "black"
-    split: str | None = None
+    image: Path  # the file itself, without links
+    mask: Path | None = None  # the file of its mask, without links, or None
+    mask_ignore: str = "black"  # "black" if zero pixels of the mask are left out, "white" if the non-zero ones are
+    split: str | None = None  # "train", "val" or "test" where the source states it, else None
+    # near, far: along the view axis in the capture's units where the source states it, else None
     near: float | None = None
     far: float | None = None
 

@@ -23,24 +23,18 @@ _FISHEYE = ("fisheye", "fish-eye", "fish eye")  # in names of lenses; rectilinea
 
 @dataclass(frozen=True)
 class PhotoDetails:
-    """What is known of a photograph besides its pixels.
+    """What is known of a photograph besides its pixels."""
 
-    width, height            of the source after EXIF rotation, pixels
-    work_width, work_height  at working size
-    orientation              EXIF's number, 1 where there is none
-    focal                    pixels of the source, from EXIF, or None
-    maker                    make and model
-    fisheye                  whether EXIF names a fisheye lens
-    """
-
+    # width, height: of the source after EXIF rotation, pixels
     width: int
     height: int
+    # work_width, work_height: at working size
     work_width: int
     work_height: int
-    orientation: int
-    focal: float | None
-    maker: str
-    fisheye: bool
+    orientation: int  # EXIF's number, 1 where there is none
+    focal: float | None  # pixels of the source, from EXIF, or None
+    maker: str  # make and model
+    fisheye: bool  # whether EXIF names a fisheye lens
 
 
 @dataclass(frozen=True)

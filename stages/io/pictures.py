@@ -59,17 +59,13 @@ class UnreadableImage(Exception):
 
 @dataclass(frozen=True)
 class Header:
-    """The header of a picture.
+    """The header of a picture."""
 
-    stored_width, stored_height  of the pixels as stored
-    orientation                  EXIF's number, 1-8, of the pixels as they are decoded
-    alpha                        whether the format holds an alpha channel
-    """
-
+    # stored_width, stored_height: of the pixels as stored
     stored_width: int
     stored_height: int
-    orientation: int
-    alpha: bool
+    orientation: int  # EXIF's number, 1-8, of the pixels as they are decoded
+    alpha: bool  # whether the format holds an alpha channel
 
     @property
     def size(self) -> tuple[int, int]:

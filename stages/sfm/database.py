@@ -36,26 +36,19 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class WorkImage:
-    """The copy of one photograph after EXIF rotation.
+    """The copy of one photograph after EXIF rotation."""
 
-    name            of the photograph
-    file            of the copy: numbers in sorted order of name
-    width, height   of the photograph after EXIF rotation, pixels
-    work_width, work_height  of the copy
-    focal           pixels of the photograph, from its EXIF data, or None
-    camera_key      photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
-    fisheye         whether it was taken through a fisheye lens
-    """
-
-    name: str
-    file: str
+    name: str  # of the photograph
+    file: str  # of the copy: numbers in sorted order of name
+    # width, height: of the photograph after EXIF rotation, pixels
     width: int
     height: int
+    # work_width, work_height: of the copy
     work_width: int
     work_height: int
-    focal: float | None
-    camera_key: str
-    fisheye: bool = False
+    focal: float | None  # pixels of the photograph, from its EXIF data, or None
+    camera_key: str  # photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
+    fisheye: bool = False  # whether it was taken through a fisheye lens
 
 
 def images_of(work: Path) -> Path:

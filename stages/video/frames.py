@@ -30,11 +30,9 @@ Progress = Callable[..., None]
 
 @dataclass(frozen=True)
 class Looked:
-    """The result of the first reading of a video: number, time, sharpness and motion of each frame looked at.
+    """The result of the first reading of a video: number, time, sharpness and motion of each frame looked at."""
 
-    width, height  upright, pixels
-    """
-
+    # width, height: upright, pixels
     width: int
     height: int
     duration: float

@@ -50,29 +50,21 @@ class Row:
 
 @dataclass(frozen=True)
 class Figures:
-    """Results of a row's run; seconds are of training steps alone, evaluation excluded, as in the paper.
+    """Results of a row's run; seconds are of training steps alone, evaluation excluded, as in the paper."""
 
-    psnr             of the network, mean over the test views that were rendered, decibels; ssim likewise
-    step             seconds of a step, mean over the run
-    steady           seconds of a step, median over the last fifth of the run
-    hours            of all steps
-    coarse, fine     samples of a training ray that went through the coarse and the fine network, over the last fifth
-    valid, pivotal   shares over rays x N_c of the test views (equations 5 and 12)
-    curve            (seconds of training, PSNR of a validation view)
-    tree             figures of the baked tree, where baked: psnr, ssim, frames a second, size of a frame
-    """
-
-    psnr: float
+    psnr: float  # of the network, mean over the test views that were rendered, decibels; ssim likewise
     ssim: float | None
-    step: float
-    steady: float
-    hours: float
+    step: float  # seconds of a step, mean over the run
+    steady: float  # seconds of a step, median over the last fifth of the run
+    hours: float  # of all steps
+    # coarse, fine: samples of a training ray that went through the coarse and the fine network, over the last fifth
     coarse: float
     fine: float
+    # valid, pivotal: shares over rays x N_c of the test views (equations 5 and 12)
     valid: float
     pivotal: float
-    curve: tuple[list[float], list[float]]
-    tree: Mapping[str, Any] | None = None
+    curve: tuple[list[float], list[float]]  # (seconds of training, PSNR of a validation view)
+    tree: Mapping[str, Any] | None = None  # figures of the baked tree, where baked: psnr, ssim, frames a second, size of a frame
 
     @property
     def converged(self) -> bool:

@@ -37,15 +37,13 @@ MAX_CHUNKS = 32  # bounds the memory of the partial sums
 
 
 class PackedWeights(NamedTuple):
-    """Weights in the layouts that `product` reads: the dimension of the sum along rows, as int32 pairs where numbers are bfloat16.
+    """Weights in the layouts that `product` reads: the dimension of the sum along rows, as int32 pairs where numbers are bfloat16."""
 
-    first, middle, last                 (K', W), (L - 1, W', W), (W', V) for the forward pass; K' = K / elements per word, and so on
-    first_back, middle_back, last_back  (W', K), (L - 1, W', W), (V', W) for the backward pass
-    """
-
+    # first, middle, last: (K', W), (L - 1, W', W), (W', V) for the forward pass; K' = K / elements per word, and so on
     first: np.ndarray
     middle: np.ndarray
     last: np.ndarray
+    # first_back, middle_back, last_back: (W', K), (L - 1, W', W), (V', W) for the backward pass
     first_back: np.ndarray
     middle_back: np.ndarray
     last_back: np.ndarray

@@ -228,19 +228,15 @@ def _from_border(shape: tuple[int, ...]) -> np.ndarray:
 
 @dataclass(eq=False)
 class PhotographTexture:
-    """Texels of a mesh that look at photographs, one after the other: `look` at each, then `colours`.
+    """Texels of a mesh that look at photographs, one after the other: `look` at each, then `colours`."""
 
-    vertices, faces, normals  of the mesh, normals at its vertices
-    density    (F,) pixels on the side of each face, of the photograph that has most
-    sharpness  of each photograph, median
-    """
-
+    # vertices, faces, normals: of the mesh, normals at its vertices
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
     atlas: Atlas
-    density: np.ndarray
-    sharpness: float
+    density: np.ndarray  # (F,) pixels on the side of each face, of the photograph that has most
+    sharpness: float  # of each photograph, median
     seen: np.ndarray = field(init=False)
     weights: np.ndarray = field(init=False)
     halvings: int = field(init=False)  # of photographs, before texels look at them: several of whose pixels lie in a texel

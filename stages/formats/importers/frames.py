@@ -22,27 +22,20 @@ _BESIDE_IMAGES = NOT_PHOTOGRAPHS | {"confidence"}  # folders with files of the n
 
 @dataclass(frozen=True)
 class Frame:
-    """An image that a file lists.
+    """An image that a file lists."""
 
-    name    as listed, relative to the folder `beside`
-    where   what messages call it
-    camera  (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
-    bare    the format states no folder: the name alone is looked for, and its place is not reported
-    mask    where the format names masks; else one next to the image is looked for
-    near, far  along the view axis, where the format states them
-    own     what the format keeps of it for itself
-    """
-
-    name: str
+    name: str  # as listed, relative to the folder `beside`
     beside: Path
-    where: str
+    where: str  # what messages call it
+    # (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
     camera: Callable[[str, tuple[int, int]], Camera]
-    bare: bool = False
-    mask: Path | None = None
+    bare: bool = False  # the format states no folder: the name alone is looked for, and its place is not reported
+    mask: Path | None = None  # where the format names masks; else one next to the image is looked for
     split: str | None = None
+    # near, far: along the view axis, where the format states them
     near: float | None = None
     far: float | None = None
-    own: Any = None
+    own: Any = None  # what the format keeps of it for itself
 
 
 def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
