@@ -97,10 +97,7 @@ def _check_plain(path: Path, status: os.stat_result) -> None:
 
 
 def read_json(path: Path, limit: int = MAX_JSON, *, follow: bool = True) -> Any:
-    """The value in a plain file of at most `limit` bytes, finite and not deeply nested. Raises Unreadable; FileNotFoundError if there is none.
-
-    follow  see `open_plain`
-    """
+    """The value in a plain file of at most `limit` bytes, finite and not deeply nested. Raises Unreadable; FileNotFoundError if there is none."""
     try:
         with open(open_plain(path, follow=follow), "rb") as file:
             size = os.fstat(file.fileno()).st_size

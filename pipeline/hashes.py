@@ -55,7 +55,6 @@ class Hashes:
         """Digest of the file at `path`, to be at the place `key`. Raises OSError if it cannot be read.
 
         anew    read it whatever is remembered, and without a safe point: what a stage has just finished is not given up for a Ctrl-C
-        follow  whether `path` itself may be a link; not so for files of a run
         """
         before = os.stat(path, follow_symlinks=follow)
         known = self._entries.get(key)

@@ -71,10 +71,7 @@ def into_log(log: TextIO) -> Iterator[None]:
 
 @contextmanager
 def libraries_apart(*, show: bool) -> Iterator[TextIO | None]:
-    """While open, nothing but what is written to the stream that it yields, the former `sys.stderr`, comes to the terminal.
-
-    show  whether to show the output of libraries in the end
-    """
+    """While open, nothing but what is written to the stream that it yields, the former `sys.stderr`, comes to the terminal."""
     former = sys.stderr
     with contextlib.suppress(OSError, ValueError, AttributeError):
         former.flush()

@@ -63,11 +63,8 @@ def run_stages(
     start    run this stage and those after it even if they are fresh; those before it if they are not
     only     consider this stage alone, with the artifacts of those before it; warns if they are not fresh
     force    run the stages considered even if they are fresh
-    device   handed to the stages
     memory   handed to the stages; None: no limit
     report   takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
-    dry_run  report what would be done, and do nothing
-    execute  runs a stage
     beside   runs stages that do not need each other, at the same time, where the memory admits it; None: one stage after another
 
     Raises PipelineError. What was published before stays; the next call resumes what was interrupted.

@@ -17,7 +17,6 @@ from pipeline.run import NAME, cannot_write
 def check_files(paths: Sequence[Path], *, force: bool, inputs: Sequence[Path] = ()) -> None:
     """Raise UsageError unless each of the files may be written.
 
-    force   whether plain files may be replaced
     inputs  files that are read, and are no target even so
     """
     for number, path in enumerate(paths):

@@ -64,10 +64,7 @@ class FieldSamples:
 
 @torch.no_grad()
 def field_samples(m: Model, pixels: Pixels, count: int, threshold: float, done: Callable[[int, int], None]) -> FieldSamples:
-    """The samples of about `count` training pixels, evenly spread, that weigh more than `threshold`.
-
-    done  called with the number of pixels done and of all
-    """
+    """The samples of about `count` training pixels, evenly spread, that weigh more than `threshold`."""
     chosen = spread_pixels(pixels, count)
     rays: list[tuple[np.ndarray, ...]] = []
     samples: list[tuple[np.ndarray, ...]] = []

@@ -37,7 +37,6 @@ def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, pr
     """Gaussians that show what the tree shows.
 
     views     what they are fitted to, and whose cameras say which voxels show
-    progress  called with the work done, the total, and a text
 
     Raises NothingToShow, and ValueError without views.
     """

@@ -191,8 +191,6 @@ class Children:
 
         request  {"kind": "prepare" | "stage" | "finish", "run": path, ...}; "prepare" with "scene" and "memory" (bytes or None), "stage" with "stage",
                  "device" and "memory"; or {"kind": "job", ...}, see `side_by_side`: "run" is any name of the child then
-        cores    that it computes on
-        gpus     CUDA devices that it sees
         """
         run = self._name(request)
         try:

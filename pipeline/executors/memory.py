@@ -66,10 +66,7 @@ def size_text(count: float) -> str:
 
 
 def usable_memory(root: Path = Path("/")) -> Limit | None:
-    """The smallest limit on this process, less what is kept back; None where the system states none.
-
-    root  where /proc and /sys lie, for tests
-    """
+    """The smallest limit on this process, less what is kept back; None where the system states none."""
     limits = [Limit(int((1 - KEPT_BACK) * limit.bytes), limit.whose) for limit in (*_machine(root), *_cgroups(root))]
     limits += _rlimits(affinity())
     return min(limits, key=lambda limit: limit.bytes, default=None)

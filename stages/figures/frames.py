@@ -56,7 +56,6 @@ def render_frames(
     progress  called with (frames done, frames) before each and at the end; may raise to stop
     reuse     keep frames that are complete by their note: only for a scratch folder of this very request
     draw      `efficientnerf.asset.rendering.render`, unless another is given
-    warn      reports frames that can't be kept
     """
     background, similarity = frame_background(options.background), similarity_of(tree)
     surrounded = options.background == "auto" and tree.environment is not None

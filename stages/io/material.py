@@ -74,10 +74,7 @@ def _material_of(path: Path, allow_outside: bool, warn: Warn) -> Material:
 
 
 def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Material:
-    """The material with frames of its videos among the photographs; writes which were chosen, and why, into the artifact. Raises BadInput.
-
-    max_side  longest side of the frames, pixels
-    """
+    """The material with frames of its videos among the photographs; writes which were chosen, and why, into the artifact. Raises BadInput."""
     if not found.videos:
         return found
     sizes = []
@@ -102,10 +99,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
 
 
 def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material:
-    """The material with views of its panoramas in their place. Raises BadInput.
-
-    max_side  longest side of the views, pixels
-    """
+    """The material with views of its panoramas in their place. Raises BadInput."""
     if job.settings.lens in ("perspective", "fisheye"):
         return found
     panoramas: dict[str, Path] = {}

@@ -49,10 +49,7 @@ class Written:
 
 
 def decode(path: Path, as_stored: bool = False) -> Decoded:
-    """Every pixel of an image file; raises UnreadableImage, also where the file ends early.
-
-    as_stored  without the picture's colour profile
-    """
+    """Every pixel of an image file; raises UnreadableImage, also where the file ends early."""
     with opened(path) as image:
         orientation, profile = orientation_of(image), profile_of(image)
         verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image) and profile.transform is None
@@ -66,7 +63,6 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouett
     """Write the working image of a photo, and its mask if it has one.
 
     relative      path of the image below folder/images, with its source's extension
-    max_side      longest side of the working image, pixels
     silhouettes   what becomes the alpha channel of the working image: the photo's own, the levels of its mask, or where both are silhouettes the lower of
                   the two. Else pixels with alpha below one half, and those that the mask leaves out, go into the mask of the working image
     may_be_empty  whether a silhouette may leave nothing

@@ -30,7 +30,6 @@ def silhouettes_with_surroundings(
     were left below what is transparent.
 
     paths, masks  file of each photograph, and of its mask, by name
-    choice        `poses.masks`
     """
     photos = [photo for name in sorted(paths) if (photo := photo_without_camera(name, paths[name], masks.get(name))) is not None]
     kind = Silhouettes(alpha=not masks, masks=bool(masks))

@@ -70,7 +70,6 @@ def refuse_more_than(limit: Limit | None, what: str, need: Need, remedy: str) ->
     """TooLittleMemory where a need is more than the limit; None: no limit is known.
 
     what    has the need, the beginning of the sentence
-    remedy  as for `refuse_what_does_not_fit`
     """
     if limit is not None and need.total > limit.bytes:
         text = f"{what}: needs {need.text()}; {size_text(limit.bytes)} may be taken ({limit.whose}). {remedy} Or give more by --memory."

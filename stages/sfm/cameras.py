@@ -41,7 +41,6 @@ def find_cameras(
     """Find the pose and the intrinsics of each photograph's camera.
 
     folder, names   the photographs, paths relative to the folder, any order; or for each the file that is read
-    max_side        longest side of the photographs in which features are detected, pixels
     features        most features of a photograph; None: as `pairs.features_for` has it
     threads         on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
     matching        "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs

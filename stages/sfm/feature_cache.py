@@ -48,7 +48,6 @@ def keys_of(place: Path, files: Sequence[str], asked: Mapping[str, object]) -> d
     """The key of each copy.
 
     place  that `images` and `masks` are in
-    asked  COLMAP's options that features depend on
     """
     wanted = repr(sorted(asked.items())).encode()
     keys = {}

@@ -91,10 +91,7 @@ def match_for(arguments: Mapping[str, Any], *, progress: Callable[..., None], sa
 
 
 def match_block(database: Path, listed: Path, block: Block, names: Mapping[int, str], seed: int, guided: bool = False) -> None:
-    """Match pairs of images on one thread.
-
-    listed  scratch file
-    """
+    """Match pairs of images on one thread."""
     with quiet_pycolmap() as pycolmap:
         matching = pycolmap.FeatureMatchingOptions()
         matching.use_gpu = False

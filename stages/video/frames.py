@@ -68,9 +68,7 @@ class Reader:
 def frames_of(videos: Mapping[str, Path], *, count: int, max_side: int, reader: Reader) -> Chosen:
     """Choose frames of videos and write them. Raises UnreadableVideo, whose text names the video.
 
-    videos    file of each by name
     count     frames of all together, at most
-    max_side  longest side of what is written, pixels
     """
     looked = {name: _looked(name, path, place, reader) for place, (name, path) in enumerate(videos.items())}
     limits = choice.shares([found.motion[-1] for found in looked.values()], count)

@@ -63,7 +63,6 @@ def views_of(
 ) -> dict[str, Path]:
     """PNGs of the views of panoramas by name: that of the panorama, /, degrees to the right; without panoramas that cannot be read.
 
-    max_side  of a view, pixels
     work      scratch folder; what an earlier call left in it is used again
     """
     found: dict[str, Path] = {}

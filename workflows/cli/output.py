@@ -112,10 +112,7 @@ class Stream:
 
 @contextmanager
 def watched(*, debug: bool = False) -> Iterator[Stream]:
-    """While open, standard output and standard error are Streams, and what libraries say goes into a log (`pipeline.library_output`); yields the first.
-
-    debug  whether to show the log in the end
-    """
+    """While open, standard output and standard error are Streams, and what libraries say goes into a log (`pipeline.library_output`); yields the first."""
     _fill_descriptors()
     former = sys.stdout, sys.stderr
     with libraries_apart(show=debug) as terminal:

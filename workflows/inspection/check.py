@@ -24,7 +24,6 @@ CPU_PRESET = "preview"  # as `enerf run` has it without CUDA
 def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflow: Workflow) -> dict[str, Any]:
     """The verdict on a source as a document.
 
-    sets   as of --set
     limit  of memory, that what is needed is compared with
     Raises BadInput, UsageError.
     """

@@ -116,10 +116,7 @@ def _check_spiral(name: str, spiral: Any, unit: float) -> None:
 
 
 def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) -> None:
-    """Raises FormatError, naming the file `name`, at the first rule that is broken.
-
-    layouts  those that this build reads
-    """
+    """Raises FormatError, naming the file `name`, at the first rule that is broken."""
     if meta.get("format") != "nerftree":
         raise FormatError(f"{name}: metadata 'format' is {str(meta.get('format'))[:60]}; expected nerftree")
     version = str(meta.get("format_version")).split(".")

@@ -15,7 +15,6 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
     """Encode frames; returns how many.
 
     frames  (H, W, 3) uint8 sRGB, all of one size; an odd width or height is padded by repeating the last column or row
-    fps     frames per second
     crf     x264's quality, 0 lossless to 51 worst
     each    called before each frame; may raise to stop
 
