@@ -89,9 +89,3 @@ def quaternions_from(matrices: np.ndarray) -> np.ndarray:
     chosen = products[np.arange(len(m)), greatest]
     chosen = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
     return np.where(chosen[:, :1] < 0, -chosen, chosen)
-
-
-def covariances(gaussians: Gaussians) -> np.ndarray:
-    """(N, 3, 3) float64."""
-    axes = rotation_matrices(gaussians.rotations) * gaussians.scales[:, None, :].astype(np.float64)
-    return np.asarray(np.einsum("nij,nkj->nik", axes, axes))

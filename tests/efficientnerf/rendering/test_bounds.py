@@ -15,10 +15,11 @@ import pytest
 import torch
 
 from efficientnerf.asset.format import FormatError, describe, load
-from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays, render_reference
+from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.hostile import HOSTILE, filled
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import looking, random_tree, uniform_tree
 
 FAR = [1e9, 1e15, 1e18, 1e25, 1e200]

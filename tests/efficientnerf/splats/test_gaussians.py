@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.splats.gaussians import Gaussians, covariances, quaternions_from, rotation_matrices
+from efficientnerf.splats.gaussians import Gaussians, quaternions_from, rotation_matrices
+from tests.efficientnerf.splats_reference import covariances
 
 
 def some(count: int = 50, degree: int = 1, seed: int = 0) -> Gaussians:

@@ -9,7 +9,7 @@ results depend neither on timing nor on the number of threads.
 The harmonics of a packet are the mean of its rays': neighbouring pixels look the same way but for their distance over the focal length. A packet of one ray is
 exact, and so is one of parallel rays.
 
-The torch reference is `efficientnerf.asset.rendering.render_reference` and its autograd. Works in float32, and in float64 for tests.
+The torch reference is `tests.efficientnerf.tree_reference` and its autograd. Works in float32, and in float64 for tests.
 R rays, P packets, N voxels, K harmonics, M records, U chunks.
 """
 
