@@ -7,8 +7,6 @@ are blurred and noisy JPEGs; sheets are bent, their dictionary is none that is t
 those of structure from motion are. Writes markers.json and .md; exit code 1 where lengths or up are wrong by more than the issue allows.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """The wheel holds all that the packages need, and makes an asset where it is installed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Gradients of a rendered tree's loss, by autograd and by the kernels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Trees made smaller."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The asset file: FORMAT.md, a reader written from it alone, golden files, and a hostile file for each rule."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Files of whole scenes: nested grids, an environment map and a foreground region come back as they were saved."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Trees in normalised device coordinates: planes of the world at their depth, lookups by world points, harmonics along world directions."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Refinement of nested trees on the CPU: rays through all cascades, their gradients, steps by each cascade's own voxels, and the same bytes whatever the
 threads and interruptions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Images of trees by the CUDA kernel against the torch function and the CPU kernel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

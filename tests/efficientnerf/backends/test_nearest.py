@@ -1,7 +1,5 @@
 """Nearest lookup: the values of the voxel that holds a point, in the kernels, in files and in the fit; torch against the loop is in `test_render`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

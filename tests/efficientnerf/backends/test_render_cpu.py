@@ -1,7 +1,5 @@
 """Images of packed trees: against the torch reference, of every camera model, and what skipping may not change. Parts of the kernel: `test_render_parts`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where density lies against surfaces: closed forms in uniform trees, the reference render, cascades and normalised device coordinates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Rendering ends, whatever the file and the camera say; Python answers to signals meanwhile; and memory keeps to the file's size."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Renders of nested grids and environment maps on the CPU: against the reference, and what must not change them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pictures of trees and fields: loop, torch and kernel against each other, closed forms, and what skipping may not change."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a set of Gaussians may hold, and its frames."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

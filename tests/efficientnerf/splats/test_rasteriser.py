@@ -1,7 +1,5 @@
 """The rasteriser's kernels against plain torch: values and gradients."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Surfaces of analytic densities: areas and volumes in closed form, seams, closed boundaries, what is left out, even sampling."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

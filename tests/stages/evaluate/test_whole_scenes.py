@@ -1,7 +1,5 @@
 """Assets that hold a whole scene: rendered by themselves, and over what the network shows around cascade 0."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

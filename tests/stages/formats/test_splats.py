@@ -1,7 +1,5 @@
 """Files of 3D Gaussians: written by us, read by the letter of their formats, and by others where there are any."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """Displays: what is shown of the engine's events, and how often."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """Manifests of fleets: what they say, all their mistakes at once, and what hostile ones cannot do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
