@@ -1,9 +1,4 @@
-"""Images of trees: cameras to rays to pixels.
-
-`render` and `render_rays` use the kernels of the tree's device.
-
-R rays, N stored voxels, K harmonics.
-"""
+"""Images of trees: cameras to rays to pixels. `render` and `render_rays` use the kernels of the tree's device. R rays, N stored voxels, K harmonics."""
 
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,4 @@
-"""Cells of a coarse grid in which the rays of photographs end, with statistics of each.
-
-P points, M cells.
-"""
+"""Cells of a coarse grid in which the rays of photographs end, with statistics of each. P points, M cells."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Images of trained fields: cameras to rays to pixels.
-
-R rays, H, W height and width of an image.
-"""
+"""Images of trained fields: cameras to rays to pixels. R rays, H, W height and width of an image."""
 
 from __future__ import annotations
 

@@ -17,10 +17,7 @@ MAX_DEGREE = 3  # the most in formats and programs of 3DGS
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """3D Gaussians.
-
-    Raises ValueError for arrays of other shapes or types, and for values outside of these ranges.
-    """
+    """3D Gaussians. Raises ValueError for arrays of other shapes or types, and for values outside of these ranges."""
 
     means: np.ndarray  # (N, 3) float32  in the asset's scene frame
     scales: np.ndarray  # (N, 3) float32  standard deviations along the own axes, above 0

@@ -1,7 +1,4 @@
-"""Colours of surface points, as seen from outside.
-
-K directions, S samples.
-"""
+"""Colours of surface points, as seen from outside. K directions, S samples."""
 
 from collections.abc import Callable
 

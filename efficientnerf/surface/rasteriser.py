@@ -1,7 +1,4 @@
-"""Images of meshes: which face each pixel shows, and how deep it lies.
-
-H x W pixels, V vertices, F faces.
-"""
+"""Images of meshes: which face each pixel shows, and how deep it lies. H x W pixels, V vertices, F faces."""
 
 from dataclasses import dataclass
 

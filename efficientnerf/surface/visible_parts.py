@@ -1,7 +1,4 @@
-"""Parts of a surface that can be seen.
-
-V vertices, F faces, C components.
-"""
+"""Parts of a surface that can be seen. V vertices, F faces, C components."""
 
 from collections.abc import Callable
 

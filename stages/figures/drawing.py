@@ -14,8 +14,7 @@ from efficientnerf.backends.kernel_cache import cache_folder, first_private
 
 @functools.cache
 def matplotlib() -> Any:
-    """The package. On first import its list of fonts goes into `matplotlib` of our cache folder, and a `matplotlibrc`, as of the working folder, is
-    ignored."""
+    """The package. On first import its list of fonts goes into `matplotlib` of our cache folder, and a `matplotlibrc`, as of the working folder, is ignored."""
     first = "matplotlib" not in sys.modules
     if first:
         os.environ["MPLCONFIGDIR"] = _folder()

@@ -115,8 +115,7 @@ def upright_mask(mask: np.ndarray, orientation: int, width: int, height: int) ->
 
 
 def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
-    """Whether two sizes (both (width, height), or both (height, width)) have the same aspect: within 1 %, or within the rounding of a
-    side by one pixel."""
+    """Whether two sizes (both (width, height), or both (height, width)) have the same aspect: within 1 %, or within the rounding of a side by one pixel."""
     (w, h), (width, height) = size, other
     if min(w, h, width, height) <= 0:
         return False

@@ -162,8 +162,7 @@ def copy_database(work: Path, place: Path) -> None:
 
 
 def copy_with_own_cameras(work: Path, place: Path, images: Sequence[WorkImage]) -> None:
-    """Replace the database of another scratch folder by one of the same images, features and matches, but with a camera for each image, of the first
-    guess."""
+    """Replace the database of another scratch folder by one of the same images, features and matches, but with a camera for each image, of the first guess."""
     remove_database(database_path(place))
     _list_images(database_path(place), place, [replace(image, camera_key=image.file) for image in images])
     with contextlib.closing(attached(place, work)) as connection, connection:

@@ -1,7 +1,4 @@
-"""The command `enerf`.
-
-The module of a command is imported when the command is used, so that `--help` answers at once.
-"""
+"""The command `enerf`. The module of a command is imported when the command is used, so that `--help` answers at once."""
 
 import signal
 import sys

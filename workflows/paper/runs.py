@@ -223,8 +223,7 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
 
 
 def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
-    """PSNR and SSIM of the baked tree on the test views of the network (`wanted` of them, None: all), and frames a second at
-    their size."""
+    """PSNR and SSIM of the baked tree on the test views of the network (`wanted` of them, None: all), and frames a second at their size."""
     tree = format.load(BakeOutputs.of_run(run.path).asset).to(device)
     s = scene.load(run.folder("poses"))
     views, _ = evaluation_views(s)

@@ -1,7 +1,4 @@
-"""The targets of a fit: training pixels, and the background that a tree is composited with.
-
-R rays, H rows.
-"""
+"""The targets of a fit: training pixels, and the background that a tree is composited with. R rays, H rows."""
 
 from __future__ import annotations
 

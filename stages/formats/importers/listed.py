@@ -30,10 +30,7 @@ def stated_or_beside(source: Source, found: Sequence[tuple[Frame, Path]]) -> Mas
 
 @dataclass(frozen=True)
 class Listed:
-    """What a source states.
-
-    The others are fields of `Capture`.
-    """
+    """What a source states. The others are fields of `Capture`."""
 
     where: str  # what messages call it
     frames: Sequence[Frame]

@@ -1,7 +1,4 @@
-"""The shape that a file holds, and what may be wrong with one.
-
-N vertices, F triangles.
-"""
+"""The shape that a file holds, and what may be wrong with one. N vertices, F triangles."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

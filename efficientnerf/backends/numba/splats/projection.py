@@ -28,10 +28,7 @@ _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 
 class Lens(NamedTuple):
-    """A camera as kernels take it.
-
-    width, height of the picture
-    """
+    """A camera as kernels take it; width and height are those of its picture."""
 
     turn: np.ndarray  # (9,) float32, rows of the rotation from the world to the camera
     centre: np.ndarray  # (3,) float32
