@@ -45,14 +45,11 @@ _KINDS = {
 
 
 class Unreadable(ValueError):
-    """A JSON file that is too large, cut off or not valid; the text says why.
-
-    denied  the error of the system where that would not read the file; see `is_denied`
-    """
+    """A JSON file that is too large, cut off or not valid; the text says why."""
 
     def __init__(self, text: str, denied: OSError | None = None) -> None:
         super().__init__(text)
-        self.denied = denied
+        self.denied = denied  # the error of the system where that would not read the file; see `is_denied`
 
 
 def canonical_json(value: Any) -> bytes:

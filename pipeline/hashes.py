@@ -40,13 +40,10 @@ def sha256_of(path: Path, safe_point: SafePoint | None = None, *, follow: bool =
 
 
 class Hashes:
-    """Digests of files by key, where a key is the file's place within the run (or within the source), which moves with it.
-
-    path  the file that remembers them between processes; None: nothing is remembered. A damaged one is ignored: it only saves time
-    """
+    """Digests of files by key, where a key is the file's place within the run (or within the source), which moves with it."""
 
     def __init__(self, path: Path | None = None, *, safe_point: SafePoint | None = None) -> None:
-        self.path = path
+        self.path = path  # the file that remembers them between processes; None: nothing is remembered. A damaged one is ignored: it only saves time
         self.safe_point = safe_point
         self._changed = False
         self._entries: dict[str, Entry] = {} if path is None else _read(path)

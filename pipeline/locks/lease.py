@@ -35,14 +35,11 @@ _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EOPNOTSUPP, errno.E
 
 
 class Held(Exception):
-    """Another holds the lease.
-
-    age  seconds since it was last renewed
-    """
+    """Another holds the lease."""
 
     def __init__(self, age: float) -> None:
         super().__init__(f"renewed {age:.0f} s ago")
-        self.age = age
+        self.age = age  # seconds since it was last renewed
 
 
 class Lease:

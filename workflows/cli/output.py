@@ -25,15 +25,13 @@ _LARGEST = 2**64  # readers of JSON know no larger integers
 class Stream:
     """A text stream that keeps its first failure instead of raising it.
 
-    failure  the error of a write that was missed, or None
-
     It shows no `buffer`: click and others would write past it.
     """
 
     def __init__(self, stream: TextIO | None, *, missed: bool) -> None:
         self.stream = stream
         self.missed = missed
-        self.failure: OSError | None = None
+        self.failure: OSError | None = None  # the error of a write that was missed, or None
 
     def write(self, text: str) -> int:
         if not isinstance(text, str):

@@ -170,13 +170,10 @@ FORMER = {("train", "near_plane"): 0.0}  # defaults of 0.1.0 that are no setting
 
 
 class Settings:
-    """Builder of the settings of all stages; every value is checked when it is put.
-
-    types   {stage: its settings dataclass}
-    """
+    """Builder of the settings of all stages; every value is checked when it is put."""
 
     def __init__(self, types: Mapping[str, type]) -> None:
-        self.types = dict(types)
+        self.types = dict(types)  # {stage: its settings dataclass}
         self.about: dict[str, dict[str, SettingInfo]] = {
             stage: {info.name: info for info in describe_settings(settings_type)} for stage, settings_type in types.items()
         }
