@@ -12,7 +12,6 @@ import json
 import os
 import platform
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import torch
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.cores import affinity
 from pipeline.files import write_atomically
+from pipeline.manifest import tool_versions
 from stages.figures.plots import curve, with_palette
 from workflows.paper import tables
 from workflows.paper.result import PAPER, Request, Result, Table
@@ -112,13 +112,7 @@ def hardware(device: str) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    found = {}
-    for name in ("efficientnerf", "torch", "numba"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
+    return {name: version for name, version in tool_versions() if name in ("efficientnerf", "torch", "numba")}
 
 
 def _write(path: Path, text: str) -> None:
