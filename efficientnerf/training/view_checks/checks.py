@@ -6,9 +6,10 @@ neighbours is a suspect; it is left out only with further evidence:
     another place   a pose that is clearly elsewhere explains the photograph much better (`pose_search`)
     sparse points   those it observes lie outside its picture, or have other colours there
     no likeness     nothing of it is explained, as one picture nor inside tiles, and no sparse points confirm it
+    few points      it observes few, and its errors stand out far: no other pose is found while the field shows a second copy of the scene for it
 
 A photograph that observes as many sparse points as its neighbours, in the right colours, is no suspect. A view that is left out is held out: at the next check
-the field, which has not seen it since, decides whether its own camera or the one that was found is right; only then it is trained on again.
+the field, which has not seen it since, decides whether its own camera or one that is found then is right; only then it is trained on again.
 C views of training.
 """
 
@@ -48,6 +49,7 @@ TOO_LATE = 0.6  # of the schedule
 SUSPECT, SUSPECT_BOTH, WORSE = 1.5, 3.0, 1.8
 FAR_OUT = 2.0  # robust standard deviations of both errors: nothing is like
 UNEXPLAINED = 0.8  # of the variance, likewise
+FAR_WORSE = 3.5, 4.0  # robust standard deviations of both errors, and times the error inside tiles of its neighbours, where it observes few points
 TYPICAL = 1.0  # inside tiles, up to which a photograph is explained by another pose as its neighbours are by theirs
 BETTER = 0.7  # of its error: as small another pose has to make it
 ELSEWHERE = 1.5  # cells by which another pose moves the picture
@@ -76,7 +78,7 @@ class ViewChecks:
     replaced: np.ndarray  # (C,) bool: `pose` is the camera's, and trained on unless left out
     pose: np.ndarray  # (C, 4, 4) the pose that was found for a view, world from camera; else the given one
     # (C, 6) of each view that was ever left out: step, error inside tiles, that of its neighbours, that with the pose that was found, by how many cells this
-    # moves the picture (infinite without overlap), evidence as bits (1 another place, 2 points, 4 no likeness)
+    # moves the picture (infinite without overlap), evidence as bits (1 another place, 2 points, 4 no likeness, 8 few points)
     evidence: np.ndarray
 
     @staticmethod
@@ -189,20 +191,23 @@ def _judge_again(c: ViewChecks, now: _Look, view: int, pixels: Pixels) -> None:
         c.left_out[view] = c.replaced[view] = False
         c.pose[view] = c.given[view].world_from_camera
         return
-    if not c.replaced[view]:
-        return
     image, usable = photograph(pixels, view, now.background)
-    camera = refine_pose(now.search, replace(c.given[view], world_from_camera=c.pose[view]), image, usable, now.cells.size[view])[0]
+    if c.replaced[view]:
+        camera = refine_pose(now.search, replace(c.given[view], world_from_camera=c.pose[view]), image, usable, now.cells.size[view])[0]
+    else:
+        camera = find_pose(now.search, view, image, usable, now.cells.size[view], now.trusted & ~now.suspects)[0]
     error, outlying = now.with_camera(view, camera)
-    c.pose[view], c.evidence[view, 3] = camera.world_from_camera, error
-    if outlying[1] < TYPICAL and outlying[0] < FAR_OUT:
-        c.left_out[view] = False
+    explained = outlying[1] < TYPICAL and outlying[0] < FAR_OUT
+    if explained or c.replaced[view]:
+        c.pose[view], c.evidence[view, 3] = camera.world_from_camera, error
+    if explained:
+        c.left_out[view], c.replaced[view] = False, True
 
 
 def _leave_out(c: ViewChecks, now: _Look, pixels: Pixels, observed: Observations | None, number: int) -> None:
     """Leave out the suspects with further evidence against them, the worst first, as many as may be."""
     room = min(int(MOST * len(c.given)), len(c.given) - MIN_VIEWS) - int(c.left_out.sum())
-    for_view, against = point_evidence(now.search.cameras, now.cells, observed, now.trusted)
+    for_view, against, few = point_evidence(now.search.cameras, now.cells, observed, now.trusted)
     suspects = now.trusted & now.suspects & ~for_view
     order = [int(view) for view in np.argsort(-now.outlying[:, 1], kind="stable") if suspects[view]]
     believed = now.trusted & ~suspects
@@ -214,9 +219,11 @@ def _leave_out(c: ViewChecks, now: _Look, pixels: Pixels, observed: Observations
         moved = picture_moved(now.search, now.search.cameras[view], camera, now.cells.size[view])
         elsewhere = error <= BETTER * now.errors[view, 1] and moved >= ELSEWHERE
         unlike = bool(now.outlying[view].min() >= FAR_OUT and now.errors[view].min() >= UNEXPLAINED)
-        if not (elsewhere or against[view] or unlike):
+        far_worse = bool(now.outlying[view].min() >= FAR_WORSE[0] and now.errors[view, 1] >= FAR_WORSE[1] * now.usual[view])
+        evidence = elsewhere + 2 * bool(against[view]) + 4 * unlike + 8 * (far_worse and bool(few[view]))
+        if not evidence:
             continue
-        c.evidence[view] = (number, now.errors[view, 1], now.usual[view], error, moved, elsewhere + 2 * bool(against[view]) + 4 * unlike)
+        c.evidence[view] = number, now.errors[view, 1], now.usual[view], error, moved, evidence
         c.left_out[view], c.replaced[view] = True, elsewhere
         c.pose[view] = camera.world_from_camera if elsewhere else c.given[view].world_from_camera
         room -= 1
@@ -233,12 +240,14 @@ def picture_moved(s: Search, before: Camera, after: Camera, side: int) -> float:
     return float(np.median(apart)) / side
 
 
-def point_evidence(cameras: Sequence[Camera], cells: Cells, observed: Observations | None, trusted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(C,) bool and (C,) bool: whether the sparse points that a view observes confirm its camera, and whether they contradict it."""
+def point_evidence(
+    cameras: Sequence[Camera], cells: Cells, observed: Observations | None, trusted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(C,) bool each: whether the sparse points that a view observes confirm its camera, whether they contradict it, and whether they are few."""
     count = len(cameras)
     nothing = np.zeros(count, bool)
     if observed is None:
-        return nothing, nothing
+        return nothing, nothing, nothing
     errors, outside, known = np.ones(count), np.zeros(count), np.zeros(count, np.int64)
     for view, camera in enumerate(cameras):
         of_view = observed.view == view
@@ -247,12 +256,13 @@ def point_evidence(cameras: Sequence[Camera], cells: Cells, observed: Observatio
             errors[view], outside[view] = _point_errors(camera, cells, view, observed.xyz[of_view], observed.rgb[of_view])
     enough = known >= FEW_POINTS
     if enough.sum() < MIN_VIEWS:
-        return nothing, nothing
+        return nothing, nothing, nothing
     neighbours = neighbours_of(cameras)
     outlying, _ = standing_out(errors, neighbours, trusted & enough)
     usual = np.array([np.median(known[near]) for near in neighbours])
     against = enough & ((outside > OUTSIDE) | (outlying > COLOURS))
-    return enough & (known >= SHARE_OF_POINTS * usual) & (outside < OUTSIDE / 2) & (outlying < TYPICAL), against
+    few = known < SHARE_OF_POINTS * usual
+    return enough & ~few & (outside < OUTSIDE / 2) & (outlying < TYPICAL), against, few
 
 
 def _point_errors(camera: Camera, cells: Cells, view: int, xyz: np.ndarray, rgb: np.ndarray) -> tuple[float, float]:

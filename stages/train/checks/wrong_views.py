@@ -24,7 +24,12 @@ from stages.io.scene import Scene, View, read_points, views_of
 
 SIDE = 300  # of a photograph in the picture, pixels
 ROWS = 12  # of it: more views than that are in the report alone
-WITNESSES = ((1, "another place explains it better"), (2, "its sparse points contradict it"), (4, "nothing of it is explained"))
+WITNESSES = (
+    (1, "another place explains it better"),
+    (2, "its sparse points contradict it"),
+    (4, "nothing of it is explained"),
+    (8, "it observes few sparse points"),
+)
 
 
 def train_and_check(job: Job, t: Trainer, pixels: Pixels, s: Scene, sparse_depth: Callable[[Scene], SparseDepthRays | None]) -> Iterator[Progress]:
