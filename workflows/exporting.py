@@ -58,6 +58,7 @@ class Export:
     texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
     normal_map  next to the texture; None: as the settings say, where a file keeps it
     picture    how textures are stored
+    spz_version  of files .spz
     limit      of memory
     """
 
@@ -71,6 +72,7 @@ class Export:
     texture: str | None = None
     normal_map: bool | None = None
     picture: str = "png"
+    spz_version: int = 4
     limit: Limit | None = None
 
     @property
