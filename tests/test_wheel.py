@@ -45,7 +45,7 @@ def test_the_wheel_holds_each_file_of_the_packages_and_no_other(wheel: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3000)
+@pytest.mark.timeout(1800)
 def test_the_notebook_runs_where_the_wheel_is_installed(wheel: Path, tmp_path: Path) -> None:
     """Its cells one after another, as a program, in an environment of its own that borrows the libraries of this one."""
     place = tmp_path / "environment"
