@@ -75,7 +75,8 @@ def in_words(found: dict[str, Any]) -> list[str]:
     """Lines of text: the grade first."""
     about = found["forecast"]
     sizes = found["sizes"]
-    what = f"{found['photographs']} {plural(found['photographs'], 'photographs', 'photograph')}, {', '.join(sizes[:3])}{' ...' if len(sizes) > 3 else ''}, read as {found['format']}"
+    count = f"{found['photographs']} {plural(found['photographs'], 'photographs', 'photograph')}"
+    what = f"{count}, {', '.join(sizes[:3])}{' ...' if len(sizes) > 3 else ''}, read as {found['format']}"
     what += f"; {found['looked_at']} of them were checked" if found["looked_at"] < found["photographs"] else ""
     lines = [printable(f"{found['source']}: {found['grade']}; {what}", 400)]
     for problem in found["problems"]:
