@@ -201,6 +201,7 @@ def test_sog_codes_are_playcanvas_s(tmp_path: Path) -> None:
         meta = json.loads(archive.read("meta.json"))
         pixels = {name: np.asarray(Image.open(io.BytesIO(archive.read(name)))) for name in archive.namelist() if name != "meta.json"}
     assert (meta["version"], meta["count"], meta["shN"]["bands"], meta["shN"]["count"]) == (2, 3, 1, 3)
+    assert meta["asset"] == {"generator": "efficientnerf", "unit": Y_DOWN.unit}
     np.testing.assert_allclose([meta["means"]["mins"], meta["means"]["maxs"]], [[-1, 0, 0], [1, 0, 0]], atol=1e-7)
     assert pixels.pop("shN_centroids.webp").shape == (1, 192, 3)
     assert {image.shape[:2] for image in pixels.values()} == {(4, 4)}
