@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ from pipeline.stage import Job
 from stages.cores import count_cores, in_order
 from stages.framing.gps import in_metres
 from stages.framing.training_frame import estimated_up
-from stages.io.capture import Capture, Photo
+from stages.io.capture import Capture, Markers
 from stages.io.photo import read_photo
 from stages.io.pictures import MAX_SIDE, UnreadableImage
 from stages.poses.memory import reading_threads
@@ -33,16 +34,24 @@ LARGEST_ERROR = 0.03  # of a length: what is less sure is no scale
 TILT = 30.0  # degrees from the upward axis that the cameras suggest, up to which markers are taken to lie on the ground
 MIN_CONTRAST = 0.02  # of linear light between inside and outside of an edge
 Seen = dict[tuple[str, int], np.ndarray]  # dictionary and number of a marker -> (4, 2) its corners
+Size = tuple[int, int]
 
 
 def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], None]) -> Capture:
     """The capture in metres, by markers with edges of `size` metres; as it is, with a warning, where none are found. Raises BadInput where they disagree."""
-    views = _by_marker(job, capture)
+    seen = capture.markers
+    if seen is None:
+        seen = find_markers(job, {photo.camera.name: (photo.image, (photo.camera.width, photo.camera.height)) for photo in capture.photos})
+    views = {
+        number: [(photo, seen[photo.camera.name][number]) for photo in capture.photos if number in seen.get(photo.camera.name, {})]
+        for number in sorted({number for corners in seen.values() for number in corners})
+    }
+    views = {number: found for number, found in views.items() if len(found) >= MIN_VIEWS}
     if not views:
         tried = f"Dictionaries tried: {', '.join(DICTIONARIES)}; circular targets are not read."
         warn(f"no marker is seen by {MIN_VIEWS} photographs: lengths stay as they are. {tried}")
         return capture
-    fits = {number: fit_square([photo.camera for photo, _ in seen], np.stack([corners for _, corners in seen])) for number, seen in views.items()}
+    fits = {number: fit_square([photo.camera for photo, _ in found], np.stack([corners for _, corners in found])) for number, found in views.items()}
     still = {number: fit for number, fit in fits.items() if fit.still}
     moved = sorted(fits.keys() - still.keys())
     if len(still) <= len(moved):
@@ -78,31 +87,29 @@ def _listed(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers))
 
 
-def _by_marker(job: Job, capture: Capture) -> dict[int, list[tuple[Photo, np.ndarray]]]:
-    """Photographs and corners of each marker that enough of them see, of the dictionary that is seen most."""
-    sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
-    threads = reading_threads(job, sizes, count_cores())
+def find_markers(job: Job, files: Mapping[str, tuple[Path, Size]]) -> Markers:
+    """Corners of the markers in photographs, of those of the dictionary that is seen most that are seen in enough of them.
+
+    files  each photograph's file, by name, and its size after EXIF rotation: of another size there are none
+    """
+    threads = reading_threads(job, [size for _, size in files.values()], count_cores())
     found = []
-    for index, seen in enumerate(in_order(_markers_of, capture.photos, threads, job.safe_point)):
-        job.progress(index + 1, len(sizes), "finding markers")
+    for index, seen in enumerate(in_order(lambda each: _markers_of(*each), [*files.values()], threads, job.safe_point)):
+        job.progress(index + 1, len(files), "finding markers")
         found.append(seen)
     often = Counter(itertools.chain.from_iterable(found))
     kept = {key: count for key, count in often.items() if count >= MIN_VIEWS}
-    totals = {name: sum(count for (own, _), count in kept.items() if own == name) for name in DICTIONARIES}
-    best = max(DICTIONARIES, key=lambda name: totals[name])  # the first of equals
-    return {
-        number: [(photo, seen[name, number]) for photo, seen in zip(capture.photos, found, strict=True) if (name, number) in seen]
-        for name, number in sorted(kept)
-        if name == best
-    }
+    best = max(DICTIONARIES, key=lambda name: sum(count for (own, _), count in kept.items() if own == name))  # the first of equals
+    own = [{number: corners for (name, number), corners in sorted(seen.items()) if name == best and (name, number) in kept} for seen in found]
+    return {name: seen for name, seen in zip(files, own, strict=True) if seen}
 
 
-def _markers_of(photo: Photo) -> Seen:
+def _markers_of(path: Path, size: Size) -> Seen:
     try:
-        rgb = read_photo(photo.image, MAX_SIDE).rgb
+        rgb = read_photo(path, MAX_SIDE).rgb
     except UnreadableImage:  # reported where it is needed
         return {}
-    if rgb.shape[:2] != (photo.camera.height, photo.camera.width):
+    if rgb.shape[1::-1] != size:
         return {}
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     light = _LINEAR[grey]

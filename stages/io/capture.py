@@ -104,6 +104,9 @@ class Provenance(Struct, frozen=True, omit_defaults=True):
     gps: Alignment | None = None
 
 
+Markers = dict[str, dict[int, np.ndarray]]  # name of a photograph -> number of a marker in it -> (4, 2) its corners, px at full size
+
+
 @dataclass(frozen=True)
 class Capture:
     """A source, read.
@@ -123,6 +126,7 @@ class Capture:
     facts       what the format states besides; the report repeats it, nothing follows from it
     provenance  how the cameras were found, of photographs that state none
     overlaps    (name, name, verified matches) of pairs of photographs, registered or not, where they were compared
+    markers     those in the photographs, where they were looked for
     """
 
     kind: str
@@ -140,6 +144,7 @@ class Capture:
     provenance: Provenance = field(default_factory=Provenance)
     rejected_files: dict[str, Path] = field(default_factory=dict)
     overlaps: tuple[tuple[str, str, int], ...] = ()
+    markers: Markers | None = None
 
 
 def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, str]]) -> Capture:

@@ -14,7 +14,7 @@ from typing import Any, Unpack
 import msgspec
 import numpy as np
 
-from stages.io.capture import Capture
+from stages.io.capture import Capture, Markers
 from stages.sfm import process
 from stages.sfm.database import database_path, remove_database
 from stages.sfm.images import Callables, Masks
@@ -38,6 +38,7 @@ def find_cameras(
     networks: tuple[Path, Path] | None = None,
     work: Path,
     copies: Path | None = None,
+    markers: Markers | None = None,
     **callables: Unpack[Callables],
 ) -> Capture:
     """Find the pose and the intrinsics of each photograph's camera.
@@ -49,8 +50,9 @@ def find_cameras(
     matching        "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
     masks           of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
     lens            "fisheye", "perspective", or "auto": fisheye where EXIF data say so
-    networks        files of a detector and a matcher (`stages.sfm.learned.networks`), for photographs that SIFT leaves without a camera
+    networks        files of a detector and a matcher (`stages.sfm.added.networks`), for photographs that SIFT leaves without a camera
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
+    markers         corners at full size of markers that photographs see, by name and number: tie points
     copies          folder in which the stage keeps photographs that were decoded; None: one in the scratch folder
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
 
@@ -59,7 +61,9 @@ def find_cameras(
     Raises BadInput where fewer than 3 or less than half of the photographs are registered, StageFailed where the process aborts.
     """
     paths = dict(names) if isinstance(names, Mapping) else {name: folder / name for name in names}
-    request = Request(folder, paths, work, max_side, features or features_for(len(paths)), matching, seed, threads, dict(masks or {}), lens, networks, copies)
+    request = Request(
+        folder, paths, work, max_side, features or features_for(len(paths)), matching, seed, threads, dict(masks or {}), lens, networks, copies, markers or {}
+    )
     resumed = database_path(work).exists()
     try:
         return msgspec.convert(process.run(_plain(request), **callables), Capture, dec_hook=_from_plain)

@@ -20,8 +20,9 @@ from msgspec import structs
 
 from pipeline.files import remove
 from stages.cores import count_cores
-from stages.io.capture import Capture
+from stages.io.capture import Capture, Markers
 from stages.sfm import attempts, mapping, matches, result
+from stages.sfm.added.markers import keep_markers
 from stages.sfm.attempts import BEGIN_ANEW, CROPPED, EACH, MERGED, NETWORK, NETWORK_ANEW, SMALL_ANGLES, Attempt, Search, anew
 from stages.sfm.database import open_database
 from stages.sfm.images import Callables, prepare_images
@@ -76,6 +77,7 @@ class Request:
     lens: str = "auto"
     networks: tuple[Path, Path] | None = None
     copies: Path | None = None
+    markers: Markers = field(default_factory=dict)
 
 
 def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
@@ -89,6 +91,8 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
     )  # fmt: skip
     if len(images) < mapping.MIN_MODEL_SIZE:
         raise result.too_few(r.folder, images, unreadable)
+
+    keep_markers(r.work, images, r.markers)
 
     # Features, matches of pairs, and COLMAP's mapper, with further attempts where photographs have no camera.
     search = Search(r.work, images, r.seed, r.features, threads, progress, safe_point, r.networks)
