@@ -119,16 +119,17 @@ def _markers_of(path: Path, size: Size) -> Seen:
     if numbers is None:
         return {}
     for place, number, index in zip(corners, numbers.ravel().tolist(), which.ravel().tolist(), strict=True):
-        exact = refined(light, place.reshape(4, 2).astype(np.float64))
+        exact = refined(light, place.reshape(4, 2).astype(np.float64), dictionaries[index].markerSize + 2)
         if exact is not None:
             found[DICTIONARIES[index], number] = exact + 0.5  # OpenCV's centres are integers
     return found
 
 
-def refined(light: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+def refined(light: np.ndarray, corners: np.ndarray, cells: int) -> np.ndarray | None:
     """(4, 2) corners of a dark square on a light ground where the lines through its edges meet; None where there are no edges.
 
     light  (H, W) float32, linear; corners (4, 2) clockwise, centres of pixels at integers
+    cells  along an edge; blur carries light of white ones behind the border to it, and an edge counts little there
     """
     for _ in range(8):
         lines = []
@@ -140,11 +141,16 @@ def refined(light: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
             u = np.linspace(0.12, 0.88, int(np.clip(0.8 * length, 8, 200))) * length
             v = np.linspace(-reach, reach, int(np.ceil(4 * reach)) + 1)
             at = (start + u[:, None, None] * along + v[None, :, None] * out).astype(np.float32)
-            rise = np.diff(cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR), axis=1)
+            values = cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+            rise = np.diff(values, axis=1)
             whole = rise.sum(1)
             weight = np.maximum(whole, 0.0)
             if np.median(weight) < MIN_CONTRAST:
                 return None
+            behind = (start + u[:, None] * along - 1.5 * length / cells * out).astype(np.float32)
+            inner = cv2.remap(light, behind[None, :, 0], behind[None, :, 1], cv2.INTER_LINEAR)[0]
+            white = (inner - inner.min()) / max(float(np.median(values[:, -1])) - float(inner.min()), MIN_CONTRAST)
+            weight = weight * np.clip(1 - white, 0.05, 1) ** 2
             edge = np.clip((rise * (v[1:] + v[:-1]) / 2).sum(1) / np.maximum(whole, MIN_CONTRAST), -reach, reach)
             basis, used = np.stack([np.ones_like(u), u], 1), weight
             for _ in range(5):
