@@ -26,7 +26,8 @@ from stages.framing.training_frame import estimated_up
 from stages.io.capture import Capture, Markers
 from stages.io.photo import read_photo
 from stages.io.pictures import MAX_SIDE, UnreadableImage
-from stages.poses.memory import reading_threads
+from stages.memory.need import refuse_what_does_not_fit
+from stages.poses.memory import decoding_needed, reading_threads
 
 DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "ARUCO_MIP_36h12", "APRILTAG_25h9", "APRILTAG_36h11")
 WINDOW, NARROWEST, WIDEST = 0.05, 1.5, 8.0  # to both sides of an edge: share of its length, and pixels
@@ -92,7 +93,9 @@ def find_markers(job: Job, files: Mapping[str, tuple[Path, Size]]) -> Markers:
 
     files  each photograph's file, by name, and its size after EXIF rotation: of another size there are none
     """
-    threads = reading_threads(job, [size for _, size in files.values()], count_cores())
+    sizes = [size for _, size in files.values()]
+    refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
+    threads = reading_threads(job, sizes, count_cores())
     found = []
     for index, seen in enumerate(in_order(lambda each: _markers_of(*each), [*files.values()], threads, job.safe_point)):
         job.progress(index + 1, len(files), "finding markers")

@@ -32,6 +32,7 @@ from stages.sfm.added.networks import given_networks
 from stages.sfm.attempts import ENOUGH
 from stages.sfm.cameras import find_cameras
 from stages.sfm.pairs import features_for
+from stages.sfm.reconstruction import Request
 
 Find = Callable[[str, Mapping[str, Path | None]], Capture]
 
@@ -147,24 +148,22 @@ def _search(
     features = resolved(settings.max_features) or features_for(len(paths))
 
     def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
-        return find_cameras(
+        request = Request(
             source,
-            paths,
+            dict(paths),
+            job.work / name,
             max_side=settings.feature_image_size,
             features=features,
             matching=settings.matching,
             seed=settings.seed,
             threads=feature_threads(job, sizes, settings.feature_image_size, features, count_cores(), networks=networks is not None),
-            masks=masks,
+            masks=dict(masks),
             lens="perspective" if settings.lens == "equirectangular" else settings.lens,
             networks=networks,
-            work=job.work / name,
             copies=reader.folder,
-            markers=markers,
-            progress=job.progress,
-            safe_point=job.safe_point,
-            warn=warn,
+            markers=markers or {},
         )
+        return find_cameras(request, progress=job.progress, safe_point=job.safe_point, warn=warn)
 
     return find
 
