@@ -42,7 +42,7 @@ def find_cameras(request: Request, **callables: Unpack[Callables]) -> Capture:
 
 def capture_for(arguments: Mapping[str, Any], **callables: Unpack[Callables]) -> dict[str, Any]:
     """`reconstruct` for a request that has come through JSON; the capture as JSON can hold it, bit for bit."""
-    request = msgspec.convert(arguments, Request, dec_hook=_from_plain)
+    request = msgspec.convert(arguments, Request, dec_hook=_from_plain, str_keys=True)  # numbers of markers
     with _alone(request.work, callables["safe_point"]):
         return _plain(reconstruct(request, **callables))
 

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from efficientnerf.geometry.cameras import project
+from pipeline.errors import BadInput
 from stages.io.png import write_png
 from stages.sfm.added.markers import GRID, keep_markers, tie_markers
+from stages.sfm.cameras import find_cameras
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, mapper_database
-from tests.stages.sfm.made_matches import POINTS, cameras, matched
+from stages.sfm.reconstruction import Request
+from tests.stages.sfm.made_matches import POINTS, QUIET, cameras, matched
 
 EDGE = 0.12
+
+
+def test_markers_reach_the_process_that_ties_them(tmp_path: Path) -> None:
+    """Which refuses grey photographs, and not what it was asked."""
+    paths = {f"{k}.png": tmp_path / f"{k}.png" for k in range(3)}
+    for path in paths.values():
+        write_png(np.full((90, 120, 3), 128, np.uint8), path)
+    request = Request(tmp_path, paths, tmp_path / "work", markers={"0.png": {7: np.array([[10.0, 10], [30, 10], [30, 30], [10, 30]])}})
+    with pytest.raises(BadInput, match="cameras found for 0 of 3"):
+        find_cameras(request, **QUIET, warn=lambda *a, **k: None)
+    noted = json.loads((tmp_path / "work/markers.json").read_bytes())
+    np.testing.assert_allclose(noted["00000.png"]["7"][4], [20, 20])
 
 
 def test_markers_tie_photographs_that_see_them_and_without_any_nothing_changes(tmp_path: Path) -> None:
