@@ -5,7 +5,7 @@
 In dist/: the sdist, the wheel, `contents.txt` (each file of both) and `licences.txt` (what a plain install brings: version, licence, size).
 Then, in an empty environment for each Python that this machine has, and with `uv tool install` and `pipx`: the wheel is installed, `enerf --version`
 answers, and the sample becomes an asset with the preset `tiny`. --quick leaves out all that installs. --publish uploads what is in
-dist/. Needs build, twine, uv and pipx.
+dist/, if the version of pyproject.toml is that of CHANGELOG.md, CITATION.cff and the tag. Needs build, twine, uv and pipx.
 """
 
 from __future__ import annotations
@@ -62,18 +62,37 @@ def stated_version() -> str:
     return version
 
 
-def is_dated(version: str) -> bool:
-    """Whether CHANGELOG.md has a section of this version with a date, and none of what is unreleased above it."""
-    heading = next(line for line in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines() if line.startswith("## "))
-    return re.fullmatch(rf"## \[{re.escape(version)}\] - \d{{4}}-\d\d-\d\d", heading) is not None
+def disagreements(version: str) -> list[str]:
+    """What CHANGELOG.md and CITATION.cff say that differs from the version of pyproject.toml."""
+    changes, citation = ((ROOT / name).read_text(encoding="utf-8") for name in ("CHANGELOG.md", "CITATION.cff"))
+    dated = re.search(rf"^## \[{re.escape(version)}\] - (\d{{4}}-\d\d-\d\d)$", changes, re.MULTILINE)
+    cited = dict(re.findall(r"^(version|date-released): (\S+)$", citation, re.MULTILINE))
+    found = [] if dated else [f"CHANGELOG.md has no dated section [{version}]"]
+    if cited.get("version") != version:
+        found.append(f"CITATION.cff has the version {cited.get('version')}")
+    if dated and cited.get("date-released") != dated[1]:
+        found.append(f"CITATION.cff has the date {cited.get('date-released')}, CHANGELOG.md {dated[1]}")
+    return found
+
+
+def obstacles(version: str) -> list[str]:
+    """Why a version cannot be published now: disagreements, and changes that no version has yet."""
+    newest = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.MULTILINE)[1]
+    unreleased = newest.startswith("[Unreleased]") and "".join(newest.splitlines()[1:]).strip()
+    return [*disagreements(version), *(["CHANGELOG.md has unreleased changes"] if unreleased else [])]
 
 
 def publish() -> None:
     """Upload; asks for a token unless TWINE_PASSWORD has it."""
     version = stated_version()
     files = [*DIST.glob(f"efficientnerf-{version}*.whl"), *DIST.glob(f"efficientnerf-{version}.tar.gz")]
-    if not is_dated(version) or len(files) != 2:
-        sys.exit(f"release: {version} has no dated section on top of CHANGELOG.md, or is not built. Run make release.")
+    reasons = obstacles(version)
+    if f"v{version}" not in call("git", "-C", ROOT, "tag", "--points-at", "HEAD").split():
+        reasons.append(f"this commit has no tag v{version}")
+    if len(files) != 2:
+        reasons.append(f"dist/ has no build of {version}; run make release")
+    if reasons:
+        sys.exit(f"release: {version} is not published: {'; '.join(reasons)}.")
     subprocess.run([sys.executable, "-m", "twine", "upload", *files], check=True)
 
 
@@ -152,10 +171,10 @@ def main() -> None:
         if absent := sorted({*wanted} - {*there}):
             print(f"not tried: Python {', '.join(absent)}, which this machine does not have")
         as_tool(wheel)
-    if is_dated(version):
-        print(f"ready: git tag v{version} && git push origin v{version} && make publish")
+    if reasons := obstacles(version):
+        print(f"{version} is not ready to be published: {'; '.join(reasons)}.")
     else:
-        print(f"not ready to be published: CHANGELOG.md has no dated section [{version}]. The version stands in pyproject.toml alone.")
+        print(f"ready: git tag v{version} && git push origin v{version} && make publish")
 
 
 if __name__ == "__main__":

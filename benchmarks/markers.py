@@ -1,10 +1,12 @@
 """Lengths and up by markers in made captures: how far off they are, and how often the truth is outside of the stated error.
 
-    python -m benchmarks.markers --work FOLDER [--captures 100] [--width 3000] [--out benchmarks/results]
+    python -m benchmarks.markers --work FOLDER [--captures 114] [--width 3000] [--out benchmarks/results] [--cameras]
 
 A sheet on a table, with markers whose edges are 1 to 3 % of the longest side of a picture: the board of `enerf board`, or four at places of their own. Pictures
 are blurred and noisy JPEGs; sheets are bent, their dictionary is none that is tried, or markers move from photograph to photograph. The cameras are off, as
 those of structure from motion are. Writes markers.json and .md; exit code 1 where lengths or up are wrong by more than the issue allows.
+
+With --cameras: what structure from motion finds on a table without any texture, with the markers as tie points and without; markers_cameras.json.
 """
 
 import argparse
@@ -19,15 +21,17 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.cameras import Camera, closest_similarity, project
 from efficientnerf.rendering.colour import srgb_from_linear
 from pipeline.errors import BadInput
 from pipeline.files import write_atomically
 from pipeline.stage import Job
 from stages.figures.board import DPI, draw_board
-from stages.framing.markers import with_markers
+from stages.framing.markers import find_markers, with_markers
 from stages.io.capture import Capture, Photo
 from stages.poses.settings import PosesSettings
+from stages.sfm.cameras import find_cameras
+from stages.sfm.reconstruction import Request
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("plain",) * 8 + ("blurred", "blurred", "noisy", "noisy", "bent", "bent", "one moves", "all move", "wrong dictionary", "few views") * 1
@@ -120,6 +124,37 @@ def inexact(camera: Camera, rng: np.random.Generator) -> Camera:
     return Camera(camera.name, camera.width, camera.height, camera.model, camera.params, pose)
 
 
+def found(number: int, work: Path, width: int) -> dict[str, Any]:
+    """Of a made capture of a bare table: photographs with a camera, root mean square error of their places as a share of their distance, and error of the focal
+    length, with markers as tie points and without."""
+    rng, on_board = np.random.default_rng(number), number % 2 == 0
+    share = 0.05 if on_board else 0.02
+    views, texel = cameras(rng, 10, width, share), EDGE / (share * width) / SAMPLES
+    places = np.array([[-0.13, -0.11], [0.12, -0.13], [-0.11, 0.12], [0.13, 0.1]]) + rng.uniform(-0.03, 0.03, (4, 2))
+    sheet = board(texel, 0.0) if on_board else four(texel, places, rng.uniform(0, 6, 4), "APRILTAG_36h11")
+    work.mkdir(parents=True, exist_ok=True)
+    for view in views:
+        light = cv2.GaussianBlur(sheet.seen(view), (0, 0), 0.8)
+        grey = 255 * _SRGB[np.rint(4095 * np.clip(light, 0, 1)).astype(np.int16)] + 3 * rng.standard_normal(light.shape, np.float32)
+        Image.fromarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8)).convert("RGB").save(work / view.name, quality=92)
+    job = Job(settings=PosesSettings(marker_size=EDGE), out=work / "out", work=work / "scratch", source=work)
+    markers = find_markers(job, {view.name: (work / view.name, (view.width, view.height)) for view in views})
+    facts: dict[str, Any] = {"board": on_board, "markers": max(map(len, markers.values()))}
+    quiet: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
+    for name, tied in (("tied", markers), ("without", {})):
+        try:
+            capture = find_cameras(Request(work, {view.name: work / view.name for view in views}, work / name, markers=tied), **quiet)
+        except BadInput as error:
+            facts[name] = {"refused": str(error).removeprefix(f"{work}: ")[:60]}
+            continue
+        true = {view.name: view.centre for view in views}
+        centres, at = np.array([photo.camera.centre for photo in capture.photos]), np.array([true[photo.camera.name] for photo in capture.photos])
+        away = np.linalg.norm(closest_similarity(centres, at).points(centres) - at, axis=1) / np.linalg.norm(at, axis=1)
+        focal = float(np.median([photo.camera.intrinsics["fx"] for photo in capture.photos]) / views[0].params[0] - 1)
+        facts[name] = {"cameras": len(centres), "centre": float(np.sqrt((away**2).mean())), "focal": focal}
+    return facts
+
+
 def measured(number: int, work: Path, width: int) -> dict[str, Any]:
     """A made capture, and what its markers give."""
     rng, kind = np.random.default_rng(number), KINDS[number % len(KINDS)]
@@ -198,10 +233,15 @@ def in_markdown(table: dict[str, dict[str, Any]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--captures", type=int, default=100)
+    parser.add_argument("--captures", type=int, default=114)
     parser.add_argument("--width", type=int, default=3000)
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
+    parser.add_argument("--cameras", action="store_true")
     given = parser.parse_args(arguments)
+    if given.cameras:
+        rows = [found(number, given.work / f"cameras_{number}", given.width) for number in range(given.captures)]
+        write_atomically(given.out / "markers_cameras.json", (json.dumps(rows, indent=1) + "\n").encode())
+        return 0
     rows = []
     for number in range(given.captures):
         rows.append(measured(number, given.work / "capture", given.width))

@@ -20,6 +20,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import pose_from_opengl
 from stages.sfm.cameras import find_cameras
+from stages.sfm.reconstruction import Request
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -59,9 +60,7 @@ def main() -> None:
     phases: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as work:
         capture = find_cameras(
-            arguments.photographs,
-            names,
-            work=Path(work),
+            Request(arguments.photographs, {name: arguments.photographs / name for name in names}, Path(work)),
             progress=lambda done, total, text="", **facts: phases.update({text: round(time.perf_counter() - started, 2)}),
             safe_point=lambda: None,
             warn=lambda text, **facts: print(text),

@@ -1,5 +1,8 @@
 """The wheel holds all that the packages need, and makes an asset where it is installed."""
 
+from __future__ import annotations
+
+import json
 import os
 import shutil
 import subprocess
@@ -42,9 +45,9 @@ def test_the_wheel_holds_each_file_of_the_packages_and_no_other(wheel: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_wheel_makes_an_asset_where_it_is_installed(wheel: Path, tmp_path: Path) -> None:
-    """In an environment of its own that borrows the libraries of this one."""
+@pytest.mark.timeout(1800)
+def test_the_notebook_runs_where_the_wheel_is_installed(wheel: Path, tmp_path: Path) -> None:
+    """Its cells one after another, as a program, in an environment of its own that borrows the libraries of this one."""
     place = tmp_path / "environment"
     call(sys.executable, "-m", "venv", "--without-pip", place)
     python = place / "bin" / "python"
@@ -54,7 +57,12 @@ def test_the_wheel_makes_an_asset_where_it_is_installed(wheel: Path, tmp_path: P
     (packages / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
     where = call(python, "-c", "import workflows, efficientnerf; print(workflows.__file__, efficientnerf.__file__)", cwd=tmp_path, env=environment)
     assert all(name.startswith(str(packages)) for name in where.split())
-    run = tmp_path / "run"
-    call(place / "bin" / "enerf", "run", ROOT / "examples" / "still_life", "--preset", "tiny", "--out", run, cwd=tmp_path, env=environment)
+    cells = json.loads((ROOT / "examples/still_life.ipynb").read_text(encoding="utf-8"))["cells"]
+    program = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    (tmp_path / "still_life").symlink_to(ROOT / "examples/still_life")
+    ending = '\nassert metrics["asset"]["psnr"] > 10 and picture.shape == (240, 1280, 3) and hit.any()'
+    call(python, "-c", program + ending, cwd=tmp_path, env=environment)
     for name in ("bake/asset.nerftree", "mesh/mesh.glb", "points/points.ply", "turntable/turntable.mp4", "evaluate/verdict.json", "report.html"):
-        assert (run / name).stat().st_size > 0
+        assert (tmp_path / "runs/notebook" / name).stat().st_size > 0
+    version = call(place / "bin" / "enerf", "--version", cwd=tmp_path, env=environment)
+    assert version.split()[-1] in wheel.name

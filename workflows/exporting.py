@@ -1,6 +1,8 @@
 """`enerf export`: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras. 3D Gaussians:
 `workflows.exporting_splats`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,20 +48,32 @@ Written = dict[str, Any]
 
 @dataclass(frozen=True)
 class Export:
-    """An export request."""
+    """An export request.
 
-    what: Path  # a run or an asset
-    files: tuple[Path, ...]  # to write, by extension; those that are there only if `force`
-    as_points: bool = False  # points instead of a mesh
-    as_splats: bool = False  # 3D Gaussians instead of a mesh
-    # region, crop: of the asset; None: as the settings say
+    what       a run or an asset
+    files      to write, by extension; those that are there only if `force`
+    as_points  points instead of a mesh
+    as_splats  3D Gaussians instead of a mesh
+    region, crop  of the asset; None: as the settings say
+    texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
+    normal_map  next to the texture; None: as the settings say, where a file keeps it
+    picture    how textures are stored
+    spz_version  of files .spz
+    limit      of memory
+    """
+
+    what: Path
+    files: tuple[Path, ...]
+    as_points: bool = False
+    as_splats: bool = False
     region: str | None = None
     crop: Box | None = None
     force: bool = False
-    texture: str | None = None  # of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
-    normal_map: bool | None = None  # next to the texture; None: as the settings say, where a file keeps it
-    picture: str = "png"  # how textures are stored
-    limit: Limit | None = None  # of memory
+    texture: str | None = None
+    normal_map: bool | None = None
+    picture: str = "png"
+    spz_version: int = 4
+    limit: Limit | None = None
 
     @property
     def formats(self) -> dict[str, Format]:

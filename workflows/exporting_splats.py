@@ -35,7 +35,8 @@ def export_splats(export: Export, settings: Settings, progress: Progress) -> lis
     written: list[Written] = []
     for path in export.splats:
         with writing(path, force=export.force):
-            export.format(path)(gaussians, path, frame)
+            options = {"version": export.spz_version} if path.suffix.lower() == ".spz" else {}
+            export.format(path)(gaussians, path, frame, **options)
         written.append({"path": str(path.absolute()), "Gaussians": len(gaussians), "bytes": path.stat().st_size})
     return written
 

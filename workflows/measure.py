@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.errors import BadInput, CorruptArtifact, UsageError
 from pipeline.run import Run
+from stages.artifacts import TurntableOutputs
 from stages.framing.true_frame import AS_CAPTURED, NAME, TrueFrame, load_frame, save_frame
 from workflows import measuring
 from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
@@ -115,7 +116,8 @@ def orient(run: Path, places: tuple[str, ...], up: str | None, plane: bool, forg
         facts = {"up": list(ground.up), "up_error": error, "ground": ground.height, "degrees_from_run": angle, "up_of_run": words}
         write_json({"event": "summary", "ok": True, "run": str(run), **facts, "exit_code": 0})
     elif not quiet:
-        closing(f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}")
+        again = [f"Its turntable keeps the former up. Upright: enerf render {run}"] if TurntableOutputs.of_run(run).video.is_file() and angle > CONFLICT else []
+        closing(f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}", *again)
 
 
 def _keep(opened: Run, frame: TrueFrame) -> None:

@@ -6,8 +6,9 @@ where half of the light between inside and outside is reached, of light that is 
 
 import itertools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,10 +21,11 @@ from pipeline.stage import Job
 from stages.cores import count_cores, in_order
 from stages.framing.gps import in_metres
 from stages.framing.training_frame import estimated_up
-from stages.io.capture import Capture, Photo
+from stages.io.capture import Capture, Markers
 from stages.io.photo import read_photo
 from stages.io.pictures import MAX_SIDE, UnreadableImage
-from stages.poses.memory import reading_threads
+from stages.memory.need import refuse_what_does_not_fit
+from stages.poses.memory import decoding_needed, reading_threads
 
 DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "ARUCO_MIP_36h12", "APRILTAG_25h9", "APRILTAG_36h11")
 WINDOW, NARROWEST, WIDEST = 0.05, 1.5, 8.0  # to both sides of an edge: share of its length, and pixels
@@ -31,16 +33,24 @@ LARGEST_ERROR = 0.03  # of a length: what is less sure is no scale
 TILT = 30.0  # degrees from the upward axis that the cameras suggest, up to which markers are taken to lie on the ground
 MIN_CONTRAST = 0.02  # of linear light between inside and outside of an edge
 Seen = dict[tuple[str, int], np.ndarray]  # dictionary and number of a marker -> (4, 2) its corners
+Size = tuple[int, int]
 
 
 def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], None]) -> Capture:
     """The capture in metres, by markers with edges of `size` metres; as it is, with a warning, where none are found. Raises BadInput where they disagree."""
-    views = _by_marker(job, capture)
+    seen = capture.markers
+    if seen is None:
+        seen = find_markers(job, {photo.camera.name: (photo.image, (photo.camera.width, photo.camera.height)) for photo in capture.photos})
+    views = {
+        number: [(photo, seen[photo.camera.name][number]) for photo in capture.photos if number in seen.get(photo.camera.name, {})]
+        for number in sorted({number for corners in seen.values() for number in corners})
+    }
+    views = {number: found for number, found in views.items() if len(found) >= MIN_VIEWS}
     if not views:
         tried = f"Dictionaries tried: {', '.join(DICTIONARIES)}; circular targets are not read."
         warn(f"no marker is seen by {MIN_VIEWS} photographs: lengths stay as they are. {tried}")
         return capture
-    fits = {number: fit_square([photo.camera for photo, _ in seen], np.stack([corners for _, corners in seen])) for number, seen in views.items()}
+    fits = {number: fit_square([photo.camera for photo, _ in found], np.stack([corners for _, corners in found])) for number, found in views.items()}
     still = {number: fit for number, fit in fits.items() if fit.still}
     moved = sorted(fits.keys() - still.keys())
     if len(still) <= len(moved):
@@ -76,31 +86,31 @@ def _listed(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers))
 
 
-def _by_marker(job: Job, capture: Capture) -> dict[int, list[tuple[Photo, np.ndarray]]]:
-    """Photographs and corners of each marker that enough of them see, of the dictionary that is seen most."""
-    sizes = [(photo.camera.width, photo.camera.height) for photo in capture.photos]
+def find_markers(job: Job, files: Mapping[str, tuple[Path, Size]]) -> Markers:
+    """Corners of the markers in photographs, of those of the dictionary that is seen most that are seen in enough of them.
+
+    files  each photograph's file, by name, and its size after EXIF rotation: of another size there are none
+    """
+    sizes = [size for _, size in files.values()]
+    refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
     threads = reading_threads(job, sizes, count_cores())
     found = []
-    for index, seen in enumerate(in_order(_markers_of, capture.photos, threads, job.safe_point)):
-        job.progress(index + 1, len(sizes), "finding markers")
+    for index, seen in enumerate(in_order(lambda each: _markers_of(*each), [*files.values()], threads, job.safe_point)):
+        job.progress(index + 1, len(files), "finding markers")
         found.append(seen)
     often = Counter(itertools.chain.from_iterable(found))
     kept = {key: count for key, count in often.items() if count >= MIN_VIEWS}
-    totals = {name: sum(count for (own, _), count in kept.items() if own == name) for name in DICTIONARIES}
-    best = max(DICTIONARIES, key=lambda name: totals[name])  # the first of equals
-    return {
-        number: [(photo, seen[name, number]) for photo, seen in zip(capture.photos, found, strict=True) if (name, number) in seen]
-        for name, number in sorted(kept)
-        if name == best
-    }
+    best = max(DICTIONARIES, key=lambda name: sum(count for (own, _), count in kept.items() if own == name))  # the first of equals
+    own = [{number: corners for (name, number), corners in sorted(seen.items()) if name == best and (name, number) in kept} for seen in found]
+    return {name: seen for name, seen in zip(files, own, strict=True) if seen}
 
 
-def _markers_of(photo: Photo) -> Seen:
+def _markers_of(path: Path, size: Size) -> Seen:
     try:
-        rgb = read_photo(photo.image, MAX_SIDE).rgb
+        rgb = read_photo(path, MAX_SIDE).rgb
     except UnreadableImage:  # reported where it is needed
         return {}
-    if rgb.shape[:2] != (photo.camera.height, photo.camera.width):
+    if rgb.shape[1::-1] != size:
         return {}
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     light = _LINEAR[grey]
@@ -110,16 +120,17 @@ def _markers_of(photo: Photo) -> Seen:
     if numbers is None:
         return {}
     for place, number, index in zip(corners, numbers.ravel().tolist(), which.ravel().tolist(), strict=True):
-        exact = refined(light, place.reshape(4, 2).astype(np.float64))
+        exact = refined(light, place.reshape(4, 2).astype(np.float64), dictionaries[index].markerSize + 2)
         if exact is not None:
             found[DICTIONARIES[index], number] = exact + 0.5  # OpenCV's centres are integers
     return found
 
 
-def refined(light: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+def refined(light: np.ndarray, corners: np.ndarray, cells: int) -> np.ndarray | None:
     """(4, 2) corners of a dark square on a light ground where the lines through its edges meet; None where there are no edges.
 
     light  (H, W) float32, linear; corners (4, 2) clockwise, centres of pixels at integers
+    cells  along an edge; blur carries light of white ones behind the border to it, and an edge counts little there
     """
     for _ in range(8):
         lines = []
@@ -131,11 +142,16 @@ def refined(light: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
             u = np.linspace(0.12, 0.88, int(np.clip(0.8 * length, 8, 200))) * length
             v = np.linspace(-reach, reach, int(np.ceil(4 * reach)) + 1)
             at = (start + u[:, None, None] * along + v[None, :, None] * out).astype(np.float32)
-            rise = np.diff(cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR), axis=1)
+            values = cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+            rise = np.diff(values, axis=1)
             whole = rise.sum(1)
             weight = np.maximum(whole, 0.0)
             if np.median(weight) < MIN_CONTRAST:
                 return None
+            behind = (start + u[:, None] * along - 1.5 * length / cells * out).astype(np.float32)
+            inner = cv2.remap(light, behind[None, :, 0], behind[None, :, 1], cv2.INTER_LINEAR)[0]
+            white = (inner - inner.min()) / max(float(np.median(values[:, -1])) - float(inner.min()), MIN_CONTRAST)
+            weight = weight * np.clip(1 - white, 0.05, 1) ** 2
             edge = np.clip((rise * (v[1:] + v[:-1]) / 2).sum(1) / np.maximum(whole, MIN_CONTRAST), -reach, reach)
             basis, used = np.stack([np.ones_like(u), u], 1), weight
             for _ in range(5):

@@ -91,7 +91,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
         job.say(f"{about['video']}: {about['chosen']} of {about['frames']} frames chosen", video=about["video"], chosen=about["chosen"])
     if len(found.paths) + len(chosen.paths) < MIN_IMAGES:
         raise BadInput(
-            f"{job.source}: {len(chosen.paths)} frames that differ; at least {MIN_IMAGES} are needed, and 50 or more from all sides are better."
+            f"{job.source}: frames that differ: {len(chosen.paths)}; at least {MIN_IMAGES} are needed, and 50 or more from all sides are better."
             " Walk round the subject while filming."
         )
     _write_record(job, chosen.record, chosen.paths)

@@ -1,7 +1,7 @@
 """Cameras of photographs that state none: found by what masks keep, or by all that the photographs show, whichever the camera moved past."""
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,9 @@ from pipeline.stage import Job
 from stages.cores import count_cores
 from stages.formats.importers import IMPORTERS, posed_format
 from stages.framing.gps import with_gps, with_stated_cameras
+from stages.framing.markers import find_markers
 from stages.framing.mask_use import MIN_AGREEING, share_that_fits
-from stages.io.capture import FOREGROUND, Capture, Provenance, Silhouettes
+from stages.io.capture import FOREGROUND, Capture, Markers, Provenance, Silhouettes
 from stages.io.material import photographs_of
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.reader import PhotoReader
@@ -25,10 +26,11 @@ from stages.masking.made import made_masks, masks_by_network
 from stages.masking.polarity import INVERTED_NOTICE, kept_white
 from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
+from stages.sfm.added.networks import given_networks
 from stages.sfm.attempts import ENOUGH
 from stages.sfm.cameras import find_cameras
-from stages.sfm.learned.networks import given_networks
 from stages.sfm.pairs import features_for
+from stages.sfm.reconstruction import Request
 
 Find = Callable[[str, Mapping[str, Path | None]], Capture]
 
@@ -37,7 +39,9 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     """The capture of the job's photographs and videos. Raises BadInput."""
     found = photographs_of(job, warn)
     paths, settings = found.paths, job.settings
-    find = _search(job, paths, reader, warn)
+    sizes = _sizes(job, paths)
+    markers = None if settings.marker_size == "off" else find_markers(job, {name: (paths[name], size) for name, size in sizes.items()})
+    find = _search(job, paths, reader, warn, [*sizes.values()], markers)
     given = kept_white(job, paths, found.masks, reader)
     masks = {**given.masks, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     guessed = not masks and settings.mask_from == "auto" and settings.masks != "ignore"
@@ -51,7 +55,7 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     capture, sentences = _in_known_frame(job, capture, paths)
     for sentence in sentences:
         job.say(sentence)
-    return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected})
+    return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected}, markers=markers)
 
 
 def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tuple[Capture, list[str]]:
@@ -122,35 +126,42 @@ def mask_choice(settings: Any, provenance: Provenance) -> str:
     return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
 
 
-def _search(job: Job, paths: Mapping[str, Path], reader: PhotoReader, warn: Any) -> Find:
+def _sizes(job: Job, paths: Mapping[str, Path]) -> dict[str, tuple[int, int]]:
+    """Of the photographs that can be read."""
+    sizes = {}
+    for name, path in paths.items():
+        job.safe_point()
+        with contextlib.suppress(UnreadableImage):  # reported where it is read
+            sizes[name] = read_header(path).size
+    return sizes
+
+
+def _search(
+    job: Job, paths: Mapping[str, Path], reader: PhotoReader, warn: Any, sizes: Sequence[tuple[int, int]], markers: Markers | None
+) -> Find:
     """Structure from motion on photographs, with a scratch folder of its own for each name."""
     source, settings = job.source, job.settings
     assert source is not None
     networks = given_networks(settings.features_model, settings.matcher_model)
-    features, sizes = resolved(settings.max_features) or features_for(len(paths)), []
-    for path in paths.values():
-        job.safe_point()
-        with contextlib.suppress(UnreadableImage):  # reported where it is read
-            sizes.append(read_header(path).size)
+    features = resolved(settings.max_features) or features_for(len(paths))
 
     def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
-        return find_cameras(
+        request = Request(
             source,
-            paths,
+            dict(paths),
+            job.work / name,
             max_side=settings.feature_image_size,
             features=features,
             matching=settings.matching,
             seed=settings.seed,
             threads=feature_threads(job, sizes, settings.feature_image_size, features, count_cores(), networks=networks is not None),
-            masks=masks,
+            masks=dict(masks),
             lens="perspective" if settings.lens == "equirectangular" else settings.lens,
             networks=networks,
-            work=job.work / name,
             copies=reader.folder,
-            progress=job.progress,
-            safe_point=job.safe_point,
-            warn=warn,
+            markers=markers or {},
         )
+        return find_cameras(request, progress=job.progress, safe_point=job.safe_point, warn=warn)
 
     return find
 

@@ -17,8 +17,8 @@ from stages.io.photo import working_size
 from stages.io.pictures import UnreadableImage, read_header
 from stages.memory.forecast import Known, files_below, sizes_below
 from stages.memory.need import IMAGING, MIB, Need, most_threads, refuse_what_does_not_fit
-from stages.sfm.learned.matches import AT_ONCE
-from stages.sfm.learned.networks import LONGEST
+from stages.sfm.added.matches import AT_ONCE
+from stages.sfm.added.networks import LONGEST
 from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
 from stages.sfm.pairs import BLOCK_SIZE, features_for
 from stages.video.panorama import VIEWS

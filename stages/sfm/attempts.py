@@ -12,10 +12,10 @@ from typing import Any
 from efficientnerf.geometry.cameras import Similarity
 from pipeline.files import SafePoint
 from stages.sfm import mapping, matches, merging, pairs
+from stages.sfm.added.matches import add_matches, pairs_of
 from stages.sfm.database import FEATURES, PAIRS, WorkImage, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, neighbours, pair_id_of
 from stages.sfm.images import Progress
 from stages.sfm.intrinsics import zoom
-from stages.sfm.learned.matches import add_matches, pairs_of
 from stages.verdict.verdict import DOUBTFUL
 
 ENOUGH = 0.9  # of the photographs with a camera, from which the costlier attempts are not made; and

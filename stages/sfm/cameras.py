@@ -1,11 +1,13 @@
 """Cameras of photographs: structure from motion in a process of its own (`stages.sfm.process`), and what passes to it and back."""
 
+from __future__ import annotations
+
 import base64
 import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -15,60 +17,32 @@ import numpy as np
 from stages.io.capture import Capture
 from stages.sfm import process
 from stages.sfm.database import database_path, remove_database
-from stages.sfm.images import Callables, Masks
-from stages.sfm.pairs import features_for
+from stages.sfm.images import Callables
 from stages.sfm.reconstruction import Request, reconstruct
 
 WAIT = 0.05  # seconds between two checks of a lock
 
 
-def find_cameras(
-    folder: Path,
-    names: Sequence[str] | Mapping[str, Path],
-    *,
-    max_side: int = 1600,
-    features: int | None = None,
-    matching: str = "auto",
-    seed: int = 0,
-    threads: int | None = None,
-    masks: Masks | None = None,
-    lens: str = "auto",
-    networks: tuple[Path, Path] | None = None,
-    work: Path,
-    copies: Path | None = None,
-    **callables: Unpack[Callables],
-) -> Capture:
-    """Find the pose and the intrinsics of each photograph's camera.
-
-    folder, names   the photographs, paths relative to the folder, any order; or for each the file that is read
-    features        most features of a photograph; None: as `pairs.features_for` has it
-    threads         on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
-    matching        "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
-    masks           of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
-    lens            "fisheye", "perspective", or "auto": fisheye where EXIF data say so
-    networks        files of a detector and a matcher (`stages.sfm.learned.networks`), for photographs that SIFT leaves without a camera
-    work            scratch folder; what a killed call left in it is used again, and the result has the same bits
-    copies          folder in which the stage keeps photographs that were decoded; None: one in the scratch folder
-    returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
+def find_cameras(request: Request, **callables: Unpack[Callables]) -> Capture:
+    """Find the pose and the intrinsics of each photograph's camera: a Capture of kind "photographs"; those that were not registered are in `rejected`, with the
+    reason.
 
     It is done in a process of its own (`stages.sfm.process`), whose callables are called here.
 
     Raises BadInput where fewer than 3 or less than half of the photographs are registered, StageFailed where the process aborts.
     """
-    paths = dict(names) if isinstance(names, Mapping) else {name: folder / name for name in names}
-    request = Request(folder, paths, work, max_side, features or features_for(len(paths)), matching, seed, threads, dict(masks or {}), lens, networks, copies)
-    resumed = database_path(work).exists()
+    resumed = database_path(request.work).exists()
     try:
         return msgspec.convert(process.run(_plain(request), **callables), Capture, dec_hook=_from_plain)
     except process.ChildAborted:
         if resumed:  # leftovers of an earlier attempt may be what COLMAP cannot bear
-            remove_database(database_path(work))
+            remove_database(database_path(request.work))
         raise
 
 
 def capture_for(arguments: Mapping[str, Any], **callables: Unpack[Callables]) -> dict[str, Any]:
     """`reconstruct` for a request that has come through JSON; the capture as JSON can hold it, bit for bit."""
-    request = msgspec.convert(arguments, Request, dec_hook=_from_plain)
+    request = msgspec.convert(arguments, Request, dec_hook=_from_plain, str_keys=True)  # numbers of markers
     with _alone(request.work, callables["safe_point"]):
         return _plain(reconstruct(request, **callables))
 

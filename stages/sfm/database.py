@@ -28,8 +28,11 @@ _BLOBS = {"F": 72, "E": 72, "H": 72, "qvec": 32, "tvec": 24}  # bytes, where the
 MAX_IMAGES = 2147483647  # COLMAP's
 _MAX_KEYPOINTS = 2**20
 FISHEYE_FOCAL = 0.4  # of the longest side: 180 degrees along the diagonal of a picture of 4:3
+TIED = "markers"  # folder in a scratch folder, of the database with corners of markers
 OVERLAPPING = 30  # verified matches, from which two photographs count as overlapping
 HOMOGRAPHIES = (4, 5, 6)  # of COLMAP's two-view geometries: planar, panoramic, either of them
+PLANAR = HOMOGRAPHIES[0]
+ROUND_MARKER = 1.2  # times its size, within which features are on a marker
 
 Row = dict[str, Any]
 
@@ -59,6 +62,12 @@ def images_of(work: Path) -> Path:
 
 def database_path(work: Path) -> Path:
     return work / "database.db"
+
+
+def mapper_database(work: Path) -> Path:
+    """That cameras are found from: with corners of markers, where there are any (`stages.sfm.added.markers`)."""
+    tied = database_path(work / TIED)
+    return tied if tied.exists() else database_path(work)
 
 
 def remove_database(path: Path) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 from efficientnerf.capture.moving_parts import moving_parts
 from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
 from pipeline.files import SafePoint, remove
+from stages.sfm.added.markers import tie_markers
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
-from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts
+from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts, mapper_database
 from stages.sfm.images import Progress
 
 MIN_MODEL_SIZE = 3  # registered photographs
@@ -113,11 +114,12 @@ def _incremental_mapping(
         if start is not None:
             start.write(begun)
             registered = start.num_reg_images()
+        tie_markers(work, seed, safe_point)
         pycolmap.set_random_seed(seed)
         safe_point()
         with every_image_read(pycolmap, work):  # for the colours of its points
             models = pycolmap.incremental_mapping(
-                database_path(work),
+                mapper_database(work),
                 images_of(work),
                 output,
                 options,
@@ -270,11 +272,11 @@ def match_agreement(work: Path, model: Any) -> float:
     COLMAP drops observations that do not fit, so that its reprojection error is small even where repeated structure was folded onto itself.
     """
     cameras, agreeing, total = cameras_of(model), 0, 0
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(mapper_database(work)) as database:
         directions = {
             image_id: rays(camera, np.asarray(database.read_keypoints(image_id), np.float64)[:, :2])[1] for image_id, camera in cameras.items()
         }  # (N, 3) each
-        for (first, second), count in inlier_counts(database_path(work)).items():
+        for (first, second), count in inlier_counts(mapper_database(work)).items():
             if count < MIN_MATCHES or first not in cameras or second not in cameras:
                 continue
             inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)

@@ -16,8 +16,9 @@ import numpy as np
 from efficientnerf.geometry.cameras import Similarity, closest_similarity, rays
 from pipeline.files import SafePoint, remove
 from stages.sfm import mapping
+from stages.sfm.added.markers import tie_markers
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
-from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts
+from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts, mapper_database
 
 LEAST, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
 TOLERANCE = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart
@@ -163,9 +164,10 @@ def _joined(parts: Sequence[Sights]) -> Sights:
 
 def triangulated(work: Path, images: Sequence[WorkImage], models: Sequence[Any], placed: Mapping[int, Similarity], seed: int, safe_point: SafePoint) -> Any:
     """A model of the photographs of all that are placed; one that is in several has its pose of the first."""
+    tie_markers(work, seed, safe_point)
     with quiet_pycolmap() as pycolmap:
         whole = pycolmap.Reconstruction()
-        with pycolmap.Database.open(database_path(work)) as database:
+        with pycolmap.Database.open(mapper_database(work)) as database:
             whole.load(pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions()))
         lenses: set[int] = set()
         for number, place in placed.items():
@@ -185,7 +187,7 @@ def triangulated(work: Path, images: Sequence[WorkImage], models: Sequence[Any],
             remove(output)
             output.mkdir()
             with every_image_read(pycolmap, work):
-                whole = pycolmap.triangulate_points(whole, database_path(work), images_of(work), output, True, options)
+                whole = pycolmap.triangulate_points(whole, mapper_database(work), images_of(work), output, True, options)
             safe_point()
             mapping.bundle_adjust(pycolmap, whole, mapping.cameras_with_fixed_focal(images, whole))
         remove(output)

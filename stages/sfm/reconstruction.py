@@ -4,6 +4,8 @@ On the CPU, bit-exact from run to run. The capture's frame is COLMAP's: its scal
 own; docs/experiments/sfm.md says why the steps are these.
 """
 
+from __future__ import annotations
+
 import contextlib
 import errno
 import os
@@ -18,14 +20,15 @@ from msgspec import structs
 
 from pipeline.files import remove
 from stages.cores import count_cores
-from stages.io.capture import Capture
+from stages.io.capture import Capture, Markers
 from stages.sfm import attempts, mapping, matches, result
+from stages.sfm.added.markers import keep_markers
 from stages.sfm.attempts import BEGIN_ANEW, CROPPED, EACH, MERGED, NETWORK, NETWORK_ANEW, SMALL_ANGLES, Attempt, Search, anew
 from stages.sfm.database import open_database
 from stages.sfm.images import Callables, prepare_images
 from stages.sfm.intrinsics.own import with_own_intrinsics
 from stages.sfm.mapping import DEFAULTS, FORWARD, RELAXED
-from stages.sfm.pairs import matching_for
+from stages.sfm.pairs import features_for, matching_for
 
 # What is tried after the mapper's first run, in order, where its condition holds; a result is kept where it is better than those before it.
 #
@@ -54,41 +57,56 @@ ATTEMPTS = (
 @dataclass(frozen=True)
 class Request:
     """
-    The others are those of `stages.sfm.cameras.find_cameras`.
+    folder    of the photographs, for errors
+    paths     the file of each photograph, by name
+    work      scratch folder; what a killed call left in it is used again, and the result has the same bits
+    max_side  longest side of the photographs in which features are detected, pixels
+    features  most features of a photograph; None: as `pairs.features_for` has it
+    matching  "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
+    threads   on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
+    masks     of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
+    lens      "fisheye", "perspective", or "auto": fisheye where EXIF data say so
+    networks  files of a detector and a matcher (`stages.sfm.added.networks`), for photographs that SIFT leaves without a camera
+    copies    folder in which the stage keeps photographs that were decoded; None: one in the scratch folder
+    markers   those in the photographs, whose corners tie them
     """
 
-    folder: Path  # of the photographs, for errors
-    paths: dict[str, Path]  # the file of each photograph, by name
-    work: Path  # scratch folder; what a killed call left in it is used again
-    max_side: int
-    features: int
+    folder: Path
+    paths: dict[str, Path]
+    work: Path
+    max_side: int = 1600
+    features: int | None = None
     matching: str = "auto"
     seed: int = 0
     threads: int | None = None
-    masks: dict[str, Path | None] = field(default_factory=dict)  # of some or all names; None: the photograph as a whole, whatever its alpha channel says
+    masks: dict[str, Path | None] = field(default_factory=dict)
     lens: str = "auto"
     networks: tuple[Path, Path] | None = None
     copies: Path | None = None
+    markers: Markers = field(default_factory=dict)
 
 
 def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
     """The capture of photographs. Raises BadInput where fewer than 3, or less than half of them, get a camera."""
     progress, safe_point, threads = callables["progress"], callables["safe_point"], r.threads or count_cores()
+    features = r.features or features_for(len(r.paths))
 
     # Copies of the photographs at working size, with their masks.
     images, unreadable = prepare_images(
-        r.paths, max_side=r.max_side, features=r.features, seed=r.seed, masks=r.masks, lens=r.lens, threads=threads, work=r.work, copies=r.copies,
+        r.paths, max_side=r.max_side, features=features, seed=r.seed, masks=r.masks, lens=r.lens, threads=threads, work=r.work, copies=r.copies,
         **callables,
     )  # fmt: skip
     if len(images) < mapping.MIN_MODEL_SIZE:
         raise result.too_few(r.folder, images, unreadable)
 
+    keep_markers(r.work, images, r.markers)
+
     # Features, matches of pairs, and COLMAP's mapper, with further attempts where photographs have no camera.
-    search = Search(r.work, images, r.seed, r.features, threads, progress, safe_point, r.networks)
+    search = Search(r.work, images, r.seed, features, threads, progress, safe_point, r.networks)
     matching = matching_for(len(images)) if r.matching == "auto" else r.matching
     with _full_disk_named(r.work):
         open_database(r.work, images, callables["warn"])
-        matches.extract_features(r.work, images, features=r.features, threads=threads, progress=progress, safe_point=safe_point)
+        matches.extract_features(r.work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
         find_models(search, matching)
     rejected = [*unreadable, *result.unregistered(search)]
     if mapping.num_registered(search.models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):

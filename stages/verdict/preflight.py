@@ -261,10 +261,11 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
     if count < FEW:
         grade = "failed" if count < MIN_IMAGES else "poor" if count < 6 else "usable"
         sentence = f"There {plural(count, 'are', 'is')} only {count} {plural(count, 'photographs', 'photograph')}."
-        found.append(Problem("few", grade, sentence, "20 or more all round a subject are better."))
+        needed = f"At least {MIN_IMAGES} are needed; " if grade == "failed" else ""
+        found.append(Problem("few", grade, sentence, f"{needed}20 or more all round a subject are better."))
     reduced = tuple(name for name, each in small.items() if TINY <= max(each.size) < SMALL)
     if len(reduced) > 0.5 * len(small):
-        sentence = f"{len(reduced)} of {len(small)} photographs are smaller than {SMALL} px."
+        sentence = f"{len(reduced)} of {len(small)} photographs {plural(len(reduced), 'are', 'is')} smaller than {SMALL} px."
         found.append(Problem("small", "usable", sentence, "Give the originals, of 1000 px or more.", reduced))
     groups = zooms({name: 1000.0 * each.focal / max(each.size) for name, each in small.items() if each.focal is not None})
     if len(groups) > 1:

@@ -9,6 +9,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ FASTEST = 240.0  # frames a second that a file is believed to have; WebM that br
 USUAL = 30.0  # frames a second of a video of an unknown rate
 HD = 720  # rows, from which a video that does not state its matrix has Rec. 709's
 _BUFFER = 2**20  # bytes of a read
+_TOLERANT: dict[str, Any] = {"metadata_errors": "replace"} if int(version("av").partition(".")[0]) < 19 else {}  # of text that is no UTF-8
 _UNSPECIFIED, _PQ, _HLG = 2, 16, 18  # of ITU-T H.273: matrix; transfer characteristics
 _FULL_RANGE, _STUDIO_RANGE = 2, 1
 
@@ -157,7 +159,7 @@ def opened(path: Path, threads: int = 1) -> Iterator[Video]:
             name = _format(file.read(12))
             file.seek(0)
             limits = {"max_pixels": str(MAX_PIXELS)}
-            with av.open(file, "r", format=name, options=limits, metadata_errors="replace", buffer_size=_BUFFER) as container:
+            with av.open(file, "r", format=name, options=limits, buffer_size=_BUFFER, **_TOLERANT) as container:
                 stream = _pictures(container)
                 stream.codec_context.options = limits
                 stream.codec_context.thread_count, stream.codec_context.thread_type = threads, "AUTO"

@@ -1,4 +1,5 @@
-// Places on the surface that were clicked at, the lengths between them, a box and its sides, and the commands that give the same.
+// Places on the surface that were clicked at, the lengths between them, the ground through the first three, a box and its sides, and the commands that give the
+// same.
 
 import { projected, turned } from "./camera.js";
 
@@ -98,6 +99,22 @@ export class Measure {
     return [`box: ${sides.join(" × ")}`, `enerf export ${quoted(this.title)} --crop ${corners.join(" ")} --to box.glb`];
   }
 
+  // Lines about the plane through the first three places, and the command that makes it the ground; none where they are in a row, or nearly.
+  grounded() {
+    const [first, ...rest] = this.points.map((point) => this.captured(point)), ways = rest.map((point) => point.map((x, axis) => x - first[axis]));
+    if (ways.length < 2) return [];
+    const [a, b] = ways, normal = [0, 1, 2].map((axis) => a[(axis + 1) % 3] * b[(axis + 2) % 3] - a[(axis + 2) % 3] * b[(axis + 1) % 3]), area = Math.hypot(...normal);
+    if (!(area > 0.05 * Math.max(Math.hypot(...a), Math.hypot(...b), apart(a, b)) ** 2)) return [];
+    const from = this.placed([0, 0, 0]), raised = turned(this.viewer.eye.upright, this.placed(normal).map((x, axis) => x - from[axis]))[2], sign = raised < 0 ? -1 : 1;
+    const heights = ways.slice(2).map((way, n) => `${n + 4}: ${this.length((this.scale * sign * way.reduce((sum, x, axis) => sum + x * normal[axis], 0)) / area)}`);
+    return [...(heights.length ? [`over the plane of 1, 2 and 3: ${heights.join(", ")}`] : []), `enerf orient ${quoted(this.title)} ${this.places().slice(0, 3).join(" ")}`];
+  }
+
+  // As commands take them.
+  places() {
+    return this.points.map((point) => this.captured(point).map((x) => Number(x.toPrecision(9))).join(","));
+  }
+
   text() {
     const { points } = this, legs = points.slice(1).map((point, n) => apart(points[n], point));
     if (this.missed) return "There is no surface. Click at another place.";
@@ -111,10 +128,11 @@ export class Measure {
       `upright box round them: ${extent.map((side) => this.length(side)).join(" × ")}`,
       this.ground
         ? `over the ground: ${points.map((point, n) => `${n + 1}: ${this.length(this.scale * this.captured(point).reduce((sum, x, axis) => sum + x * this.ground[axis], 0))}`).join(", ")}`
-        : "The ground is not set: enerf orient RUN --plane.",
+        : "The ground is not set: pick three places on it, or enerf orient RUN --plane.",
+      ...this.grounded(),
       ...this.boxed(),
       ...(this.metric ? [] : ["The unit is not known: enerf measure RUN --known-length A B LENGTH."]),
-      `enerf measure ${quoted(this.title)} ${points.map((point) => this.captured(point).map((x) => Number(x.toPrecision(9))).join(",")).join(" ")}`,
+      `enerf measure ${quoted(this.title)} ${this.places().join(" ")}`,
     ].join("\n");
   }
 

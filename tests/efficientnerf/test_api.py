@@ -2,8 +2,6 @@
 
 import ast
 import importlib
-import json
-import os
 import re
 import subprocess
 import sys
@@ -61,16 +59,3 @@ def test_a_name_of_0_1_warns_and_is_the_same() -> None:
     former = importlib.import_module("stages.framing.camera_paths")
     with pytest.warns(DeprecationWarning, match=r"efficientnerf\.turntable_cameras"):
         assert former.turntable_cameras is en.turntable_cameras
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_the_notebook_runs(tmp_path: Path) -> None:
-    """Its cells one after another, as a program."""
-    cells = json.loads((ROOT / "examples/still_life.ipynb").read_text(encoding="utf-8"))["cells"]
-    program = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    (tmp_path / "still_life").symlink_to(ROOT / "examples/still_life")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    ending = '\nassert metrics["asset"]["psnr"] > 10 and picture.shape == (240, 1280, 3) and hit.any()'
-    done = subprocess.run([sys.executable, "-c", program + ending], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr

@@ -9,6 +9,7 @@ import pytest
 from efficientnerf.backends import kernel_cache
 from tests.workflows.command import Enerf
 from workflows.inspection import doctor
+from workflows.inspection.self_test import self_test
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,6 +39,21 @@ def test_the_self_test_decides_the_exit_code(enerf: Enerf, monkeypatch: pytest.M
     assert result.code == code
     assert f"self-test: {state}" in result.out
     assert ("what was wrong" in result.err) == (code == 3)
+
+
+@pytest.mark.slow
+def test_the_self_test_passes(tmp_path: Path) -> None:
+    self_test(tmp_path)
+    assert (tmp_path / "run/bake/asset.nerftree").exists()
+
+
+def test_a_bug_report_has_no_name_of_the_user(enerf: Enerf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "cache/features").mkdir(parents=True)
+    out = enerf("doctor", "--seconds", "0").out
+    assert "ENERF_CACHE_DIR=~/cache" in out
+    assert str(tmp_path) not in out
 
 
 def test_clearing_removes_what_is_made_again_alone(enerf: Enerf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

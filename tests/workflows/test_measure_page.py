@@ -40,7 +40,7 @@ pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browse
 
 HOME: dict[str, Any] = {**ORBIT, "centre": (0.0, 0.0, 0.0)}
 BOX = "-0.1 -0.2 -0.3 0.2 0.2 0.2"
-CORNERS = np.array([[0.35, 0.3], [0.6, 0.45], [0.45, 0.7]])  # shares of the canvas
+CORNERS = np.array([[0.35, 0.3], [0.6, 0.45], [0.45, 0.7], [0.4, 0.5]])  # shares of the canvas
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
         boxed = page.page.input_value("#lengths").splitlines()
         page.page.click("#crop")
         page.page.click("#undo")
-        assert "in all" not in page.page.input_value("#lengths")
+        assert "3 to 4" not in page.page.input_value("#lengths")
         page.page.click("#copy")
         page.page.click("#clear")
         page.page.keyboard.press("m")
@@ -146,7 +146,7 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
     assert (program, verb, name) == ("enerf", "measure", "a run")
     found = enerf("measure", run, *given, "--json")
     assert found.code == 0, found.err
-    shown = [float(line.split(": ")[1].removesuffix(" m")) for line in lines[:3]]
+    shown = [float(line.split(": ")[1].removesuffix(" m")) for line in lines[:4]]
     measured = [*(each["length"] for each in found.object["lengths"]), found.object["total"]]
     np.testing.assert_allclose(shown, measured, rtol=1e-3)
 
@@ -159,10 +159,16 @@ def test_lengths_in_the_page_are_those_of_the_command(chromium: Any, enerf: Ener
     on_surface = true.points(SIMILARITY.inverse().points(origins + (depth / (directions @ camera.forward))[:, None] * directions))
     picked = np.array([place["position"] for place in found.object["places"]])
     assert np.linalg.norm(picked - on_surface, axis=1).max() < 0.01 * depth.min() * true.scale / SIMILARITY.scale
+    normal = np.cross(picked[1] - picked[0], picked[2] - picked[0])
+    assert shlex.split(lines[8]) == ["enerf", "orient", "a run", *given[:3]]
+    over_plane = float(lines[7].removeprefix("over the plane of 1, 2 and 3: 4: ").removesuffix(" m"))
+    up = true.rotation @ SIMILARITY.rotation.T @ [0, 0, 1] if frame == "as captured" else np.array([0, 0, 1])
+    expected = (picked[3] - picked[0]) @ normal / np.linalg.norm(normal) * np.sign(normal @ up)
+    np.testing.assert_allclose(over_plane, expected, rtol=1e-3, atol=1e-4)
     if frame == "set":  # z is up, in the picture too
-        heights = float(lines[3].split(": ")[1].removesuffix(" m")), float(lines[4].rpartition("×")[2].removesuffix(" m"))
+        heights = float(lines[4].split(": ")[1].removesuffix(" m")), float(lines[5].rpartition("×")[2].removesuffix(" m"))
         np.testing.assert_allclose(heights, [picked[-1, 2] - picked[0, 2], np.ptp(picked[:, 2])], rtol=1e-3)
-        over_ground = [float(each.split(": ")[1].removesuffix(" m")) for each in lines[5].removeprefix("over the ground: ").split(", ")]
+        over_ground = [float(each.split(": ")[1].removesuffix(" m")) for each in lines[6].removeprefix("over the ground: ").split(", ")]
         np.testing.assert_allclose(over_ground, picked[:, 2], rtol=1e-3, atol=1e-4)
         right = true.rotation @ SIMILARITY.rotation.T @ pose[:3, 0]
         assert abs(right[2]) < 1e-6

@@ -53,7 +53,7 @@ def sentence(error: BaseException) -> str:
         text = error.format_message()
         # click says where help is to be found in lines of its own; one will do.
         context = getattr(error, "ctx", None)
-        return f"{text} Try '{context.command_path} --help'." if context is not None else text
+        return f"{text if text.endswith(('.', '?')) else f'{text}.'} Try '{context.command_path} --help'." if context is not None else text
     if isinstance(error, OSError):
         if isinstance(error, FileNotFoundError) and not error.filename and _working_folder_is_gone():
             return "the working folder is gone: it was deleted or moved, and relative paths lead nowhere. Change to another folder, or give absolute paths."

@@ -62,6 +62,7 @@ Crop = tuple[float, float, float, float, float, float] | None
     help="A normal map with the detail lost in decimation, instead of mesh.normal_map; materials are then lit.",
 )
 @click.option("--jpeg", is_flag=True, help="Write textures as JPEG instead of PNG, for smaller files.")
+@click.option("--spz-version", type=click.Choice(("3", "4")), default="4", show_default=True, help="Version of .spz files; 3 for older programs and Spark.")
 @force_option
 @memory_option
 @set_option
@@ -87,8 +88,8 @@ def export(
         return
     if what is None or first is None:
         raise UsageError("Give a run or an asset, and --to FILE. 'enerf export --list' names the formats.")
-    faces, size, jpeg = (given.pop(name) for name in ("faces", "texture_size", "jpeg"))
-    asked = exporting.Export(what, (first, *more), limit=memory_limit(memory), picture="jpeg" if jpeg else "png", **given)
+    faces, size, jpeg, spz = (given.pop(name) for name in ("faces", "texture_size", "jpeg", "spz_version"))
+    asked = exporting.Export(what, (first, *more), limit=memory_limit(memory), picture="jpeg" if jpeg else "png", spz_version=int(spz), **given)
     exporting.check(asked)
     options = [] if faces is None else [f"mesh.max_faces={exporting.faces_from_text(faces)}"]
     options += [] if size is None else [f"mesh.texture_size={size}"]

@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None, workflow: Workflow | None = Non
 
     Errors are one or two lines on standard error, and a JSON object with --json.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     as_json, debug = "--json" in given, "--debug" in given
     keep_to_quota()
     with watched(debug=debug) as out:

@@ -12,6 +12,7 @@ from stages.cores import count_cores
 from stages.formats.importers import candidates
 from stages.io.material import find_material
 from stages.verdict.preflight import check
+from stages.verdict.verdict import plural
 from stages.video.frames import Reader, frames_of
 from stages.video.reading import UnreadableVideo
 from workflows.cli.progress import duration, size
@@ -19,6 +20,10 @@ from workflows.cli.resolve import Settings, read_preset
 from workflows.workflow import Workflow
 
 CPU_PRESET = "preview"  # as `enerf run` has it without CUDA
+STANDING = {  # of a video of which a run would keep hardly a frame
+    "sentence": "Hardly a frame of the video differs from the others: the camera stands still, or all is dark.",
+    "remedy": "Walk round the subject while filming, slowly, in good light.",
+}
 
 
 def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflow: Workflow) -> dict[str, Any]:
@@ -36,7 +41,10 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
     stages = settings.resolved()
     poses = stages["poses"]
     with TemporaryDirectory() as work:
-        found = check(with_frames_for_videos(source, poses, Path(work)), poses, count_cores(), stages).document() | {"source": str(source)}
+        folder = with_frames_for_videos(source, poses, Path(work))
+        found = check(folder, poses, count_cores(), stages).document() | {"source": str(source)}
+        if folder != source:
+            found["problems"] = [each | STANDING if (each["what"], each["grade"]) == ("few", "failed") else each for each in found["problems"]]
     found["forecast"]["memory_limit"] = None if limit is None else limit.bytes
     found["forecast"]["fits"] = limit is None or found["forecast"]["run_bytes"] <= limit.bytes
     return found
@@ -64,7 +72,8 @@ def in_words(found: dict[str, Any]) -> list[str]:
     """Lines of text: the grade first."""
     about = found["forecast"]
     sizes = found["sizes"]
-    what = f"{found['photographs']} photographs, {', '.join(sizes[:3])}{' ...' if len(sizes) > 3 else ''}, read as {found['format']}"
+    count = f"{found['photographs']} {plural(found['photographs'], 'photographs', 'photograph')}"
+    what = f"{count}, {', '.join(sizes[:3])}{' ...' if len(sizes) > 3 else ''}, read as {found['format']}"
     what += f"; {found['looked_at']} of them were checked" if found["looked_at"] < found["photographs"] else ""
     lines = [printable(f"{found['source']}: {found['grade']}; {what}", 400)]
     for problem in found["problems"]:
@@ -72,6 +81,8 @@ def in_words(found: dict[str, Any]) -> list[str]:
     if not found["problems"]:
         lines.append("  No problems found.")
     lines += [printable(f"  {sentence}", 600) for sentence in found["left_aside"]]
+    if found["grade"] == "failed":
+        return [*lines, "  A run would end without cameras."]
     compared = f", {about['pairs']} pairs compared" if about["pairs"] else ""
     longer = f", up to {duration(about['poses_seconds_at_most'])} where photographs match badly" if about["pairs"] else ""
     seconds, memory = duration(about["poses_seconds"]), size(about["poses_bytes"])

@@ -43,7 +43,7 @@ class SelfTestFailed(PipelineError):
 
 
 @click.command()
-@click.option("--seconds", type=click.IntRange(0), default=10, show_default=True, help="Time for the self-test; 0 leaves it out.")
+@click.option("--seconds", type=click.IntRange(0), default=30, show_default=True, help="Most time for the self-test; 0 leaves it out.")
 @json_option
 @common_options
 def doctor(seconds: int, as_json: bool) -> None:
@@ -162,7 +162,13 @@ def _self_test(seconds: int) -> dict[str, Any]:
 
 
 def _cache_line(each: dict[str, Any]) -> str:
-    return f"{each['what']:<18}{size(each['bytes']):>8}  {each['path']}"
+    return f"{each['what']:<18}{size(each['bytes']):>8}  {_without_home(each['path'])}"
+
+
+def _without_home(path: str) -> str:
+    """Bug reports are public, and home folders have people's names."""
+    home = os.path.expanduser("~")
+    return f"~{path.removeprefix(home)}" if path.startswith(home + os.sep) else path
 
 
 def _list(found: dict[str, Any]) -> None:
@@ -172,7 +178,7 @@ def _list(found: dict[str, Any]) -> None:
         f"enerf {found['enerf']}, Python {found['python']}, {found['system']}",
         f"{found['processor']} ({' '.join(found['instructions'])}), {found['cores']} cores; {found['cuda_devices']} CUDA devices",
         f"memory {memory}{available}; {size(found['disk_free'])} free here; computes on {found['device']}",
-        *(f"{name}={value}" for name, value in found["environment"].items()),
+        *(f"{name}={_without_home(value)}" for name, value in found["environment"].items()),
         ", ".join(f"{name} {found or 'MISSING'}" for name, found in found["packages"].items()),
         *map(_cache_line, found["caches"]),
         *(f"{each['for']:<30}{'yes' if each['installed'] else 'no: ' + each['get']}" for each in found["optional"]),

@@ -32,7 +32,7 @@ class Format:
     beside: bool = False  # whether a texture lies in files next to it: `companions` of its module
 
     def __call__(self, what: Any, path: Path, frame: Any, **options: Any) -> None:
-        """Write it. `options`: picture, of formats that keep textures. The module is imported now. Raises BadInput and UsageError."""
+        """Write it. `options`: picture, of formats that keep textures; version, of .spz. The module is imported now. Raises BadInput and UsageError."""
         self.refuse_without_package(path)
         getattr(import_module(f"{__name__}.{self.module}"), self.function)(what, path, frame, **options)
 
@@ -82,7 +82,7 @@ _SPLATS = (
     Format(".ply", "3D Gaussians with view-dependent colours, as 3DGS writes them; the capture's frame", "what fewer Gaussians than voxels cannot show",
            "PlayCanvas, Spark, three.js, splat-transform; should: whatever reads 3DGS", "splats.ply", "write_splats"),
     Format(".spz", "the same in an eighth of the bytes; y up", "precision: colours, sizes and opacities of 8 bits; the capture's axes",
-           "Spark, three.js, splat-transform; should: others of SPZ 3", "splats.spz", "write_splats"),
+           "splat-transform, of version 3 Spark, three.js; should: of version 4 PlayCanvas, three.js", "splats.spz", "write_splats"),
     Format(".sog", "the same in an eighth of the bytes or less; y down, as its programs have it",
            "precision: harmonics by a palette, colours, sizes and opacities of 8 bits; the capture's axes",
            "splat-transform; should: SuperSplat, PlayCanvas, Babylon.js, Spark", "splats.sog", "write_splats"),

@@ -53,7 +53,7 @@ class Grid:
 
 def write_volume(tree: NerfTree, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write an asset's densities and colours in the capture's frame. Raises UsageError for a forward-facing scene, BadInput for an empty asset."""
-    write_grids(grids_of(tree, frame, path), path)
+    write_grids(grids_of(tree, frame, path), path, frame.unit)
 
 
 def grids_of(tree: NerfTree, frame: SourceFrame, path: Path) -> list[Grid]:
@@ -121,8 +121,8 @@ def _towards(points: np.ndarray, eye: np.ndarray) -> np.ndarray:
     return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12))
 
 
-def write_grids(grids: list[Grid], path: Path) -> None:
-    """Write grids to one file, whole or not at all; the same grids give the same bytes."""
+def write_grids(grids: list[Grid], path: Path, unit: str = "unknown") -> None:
+    """Write grids to one file, whole or not at all, whose metadata state the unit; the same grids give the same bytes."""
     trees = [_Tree(grid) for grid in grids]
     digest = hashlib.sha256()
     for tree in trees:
@@ -131,7 +131,8 @@ def write_grids(grids: list[Grid], path: Path) -> None:
     name = digest.hexdigest()
     identity = "-".join((name[:8], name[8:12], name[12:16], name[16:20], name[20:32])).upper()
     head = struct.pack("<qI2IB", MAGIC, VERSION, *LIBRARY, 1) + identity.encode("ascii")
-    write_parts(path, _parts(head + _table({"creator": ("string", b"efficientnerf")}) + struct.pack("<i", len(grids)), trees))
+    about = _table({"creator": ("string", b"efficientnerf"), "unit": ("string", unit.encode("ascii"))})
+    write_parts(path, _parts(head + about + struct.pack("<i", len(grids)), trees))
 
 
 def _parts(head: bytes, trees: list[_Tree]) -> Iterator[bytes]:

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from efficientnerf.splats.gaussians import Gaussians
+from stages.formats.exporters.splats.spz import zstd
 from tests.stages.io.meshes import accessor, glb_document
 
 
@@ -41,7 +42,8 @@ class SpzHeader:
 
 
 def read_spz(path: Path) -> tuple[SpzHeader, Gaussians]:
-    data = gzip.decompress(path.read_bytes())
+    data = path.read_bytes()
+    data = joined_streams(data) if data[:4] == b"NGSP" else gzip.decompress(data)
     magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
     assert (magic, reserved) == (0x5053474E, 0)
     above = (degree + 1) ** 2 - 1
@@ -59,6 +61,20 @@ def read_spz(path: Path) -> tuple[SpzHeader, Gaussians]:
     opacities = np.clip(raw[1][:, 0] / 255, 1e-3, 1 - 1e-3)
     arrays = (places, np.exp(raw[3] / 16 - 10), quaternions, opacities, harmonics)
     return SpzHeader(version, count, degree, bits, flags), Gaussians(*(array.astype(np.float32) for array in arrays))
+
+
+def joined_streams(data: bytes) -> bytes:
+    """What version 4 holds, as version 3 has it before its compression."""
+    streams, table, *reserved = struct.unpack_from("<BI3I", data, 15)
+    assert reserved == [0, 0, 0]
+    at, parts = table + 16 * streams, [data[:15] + b"\0"]
+    for n in range(streams):
+        stored, unpacked = struct.unpack_from("<QQ", data, table + 16 * n)
+        parts.append(zstd.decompress(data[at : at + stored]))
+        assert len(parts[-1]) == unpacked
+        at += stored
+    assert at == len(data)
+    return b"".join(parts)
 
 
 def _quaternion(code: int) -> list[float]:

@@ -19,6 +19,7 @@ from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.splats import description
 from stages.formats.exporters.splats.description import describe_splats
 from stages.formats.exporters.splats.frames import with_y_down, with_y_up
+from stages.formats.exporters.splats.spz import zstd
 from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Y_DOWN, Z_UP, block
 
@@ -92,10 +93,22 @@ def test_the_older_spz_versions(tmp_path: Path) -> None:
     assert (first["format"], second["format"], first["notes"], second["notes"]) == ("SPZ 1", "SPZ 2", [], ["antialiased"])
 
 
-def spz4(count: int = 5, degree: int = 1, streams: int = 6, table: int = 32, stored: bytes = b"zstd" * 6, places: int | None = None) -> bytes:
-    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, 12, 0, streams, table)
-    sizes = [number for k in range(streams) for number in (4, (9 * count if places is None else places) if k == 0 else 1)]
-    return head + bytes(table - 32 if table < 1000 else 0) + struct.pack(f"<{2 * streams}Q", *sizes) + stored
+def spz4(count: int = 5, degree: int = 1, table: int = 32, most: int = 6, cut: int = 0, change: Callable[[list[bytes]], list[bytes]] = list) -> bytes:
+    """Zeros. most: streams; cut: bytes that are not there at the end; change: of the streams before they are compressed."""
+    parts = change([bytes(count * width) for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1))][:most])
+    streams = [zstd.compress(part) for part in parts]
+    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, 12, 0, len(parts), table)
+    sizes = b"".join(struct.pack("<QQ", len(stream), len(part)) for stream, part in zip(streams, parts, strict=True))
+    whole = head + sizes + b"".join(streams)
+    return whole[: len(whole) - cut]
+
+
+def lying(whole: bytes, stated: int, held: int) -> bytes:
+    """The same with a first stream that unpacks to another number of bytes than the table states."""
+    stored, unpacked = struct.unpack_from("<QQ", whole, 32)
+    assert unpacked == stated
+    other, begin = zstd.compress(bytes(held)), 32 + 16 * whole[15]
+    return whole[:32] + struct.pack("<QQ", len(other), stated) + whole[48:begin] + other + whole[begin + stored :]
 
 
 @pytest.mark.parametrize("extension", [".ply", ".glb"])
@@ -227,9 +240,12 @@ HOSTILE: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "two million Gaussians of nothing": (".spz", lambda whole: spz(3, 2_000_000, 0, bytes(40_000_000)), "not as many"),
     "a wrong checksum": (".spz", lambda whole: whole[:-8] + b"abcd" + whole[-4:], "gzip"),
     "no room for the table": (".spz", lambda whole: spz4(table=2**31), "table of 6 streams"),
-    "too few streams": (".spz", lambda whole: spz4(streams=1), "table of 1 streams"),
-    "streams beyond the end": (".spz", lambda whole: spz4(stored=b""), "for its streams"),
-    "places of another size": (".spz", lambda whole: spz4(places=7), "places of 7 bytes"),
+    "too few streams": (".spz", lambda whole: spz4(most=1), "table of 1 streams"),
+    "streams beyond the end": (".spz", lambda whole: spz4(cut=3), "for its streams"),
+    "places of another size": (".spz", lambda whole: spz4(change=lambda parts: [b"seven..", *parts[1:]]), "streams of 7,"),
+    "no frame of zstd": (".spz", lambda whole: (made := spz4())[:128] + bytes(len(made) - 128), "zstd"),
+    "a frame that holds less": (".spz", lambda whole: lying(spz4(), 9 * 5, 9 * 4), "end before"),
+    "a frame that holds more": (".spz", lambda whole: lying(spz4(), 9 * 5, 9 * 6), "goes on"),
     "no zip": (".sog", lambda whole: b"\0" * 50, "BadZipFile"),
     "version 1": (".sog", sog_with(lambda meta: meta.pop("version")), "KeyError"),
     "version 3": (".sog", sog_with(lambda meta: meta.update(version=3)), "no SOG of version 2"),

@@ -24,11 +24,12 @@ from pipeline.errors import BadInput, CorruptArtifact
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.splats import sog
+from stages.formats.exporters.splats.description import describe_splats
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import property_names, read_splats
 from stages.formats.exporters.writing import SourceFrame
 from tests.efficientnerf.splats_reference import covariances
-from tests.stages.formats.gaussians import read_glb_splats, read_sog, read_spz, scattered
+from tests.stages.formats.gaussians import joined_streams, read_glb_splats, read_sog, read_spz, scattered
 from tests.stages.io.meshes import Y_DOWN, Z_UP, accessor, glb_document
 
 Y_UP = SourceFrame(Similarity(1, np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3)))
@@ -152,6 +153,20 @@ def test_spz_codes_are_niantic_s(tmp_path: Path) -> None:
     assert set(above[:, 3:].ravel()) == {124}, "-0.05 is -6 of 128, and that as near to -4 as to -8"
 
 
+@pytest.mark.parametrize("degree", range(4))
+def test_spz_4_holds_what_spz_3_does(degree: int, tmp_path: Path) -> None:
+    some = scattered(300, degree)
+    for version in (3, 4):
+        SPLAT_EXPORTERS[".spz"](some, tmp_path / f"{version}.spz", Y_UP, version=version)
+    new, old = (tmp_path / "4.spz").read_bytes(), gzip.decompress((tmp_path / "3.spz").read_bytes())
+    joined = joined_streams(new)
+    assert new[15] == (6 if degree else 5)
+    assert (joined[:4], joined[4], joined[8:]) == (old[:4], 4, old[8:])
+    described = [describe_splats(tmp_path / f"{version}.spz") for version in (3, 4)]
+    assert [facts.pop("format") for facts in described if facts] == ["SPZ 3", "SPZ 4"]
+    assert described[0] == described[1]
+
+
 @pytest.mark.parametrize(("size", "at"), [(1e-3, 0.0), (500.0, 0.0), (1e-4, 7e6)])
 def test_places_in_spz_are_as_fine_as_their_bits_allow(size: float, at: float, tmp_path: Path) -> None:
     """Finer than the thinnest Gaussians, unless they lie too far away for 24 bits."""
@@ -185,6 +200,7 @@ def test_sog_codes_are_playcanvas_s(tmp_path: Path) -> None:
         meta = json.loads(archive.read("meta.json"))
         pixels = {name: np.asarray(Image.open(io.BytesIO(archive.read(name)))) for name in archive.namelist() if name != "meta.json"}
     assert (meta["version"], meta["count"], meta["shN"]["bands"], meta["shN"]["count"]) == (2, 3, 1, 3)
+    assert meta["asset"] == {"generator": "efficientnerf", "unit": Y_DOWN.unit}
     np.testing.assert_allclose([meta["means"]["mins"], meta["means"]["maxs"]], [[-1, 0, 0], [1, 0, 0]], atol=1e-7)
     assert pixels.pop("shN_centroids.webp").shape == (1, 192, 3)
     assert {image.shape[:2] for image in pixels.values()} == {(4, 4)}
@@ -303,11 +319,14 @@ def read_any_ply(path: Path) -> Gaussians:
 
 
 @pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="needs PlayCanvas' reader: npm install -g @playcanvas/splat-transform, or SPLAT_TRANSFORM=its path")
-@pytest.mark.parametrize(("extension", "to"), [(".ply", ".ply"), (".spz", ".ply"), (".sog", ".ply"), (".ply", ".glb")])
-def test_splat_transform_reads_what_was_written(extension: str, to: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("extension", "to", "options"),
+    [(".ply", ".ply", {}), (".spz", ".ply", {"version": 3}), (".spz", ".ply", {"version": 4}), (".sog", ".ply", {}), (".ply", ".glb", {})],
+)
+def test_splat_transform_reads_what_was_written(extension: str, to: str, options: dict[str, int], tmp_path: Path) -> None:
     """Without a warning, and its own PLY and GLB hold the same. In a GLB it turns a PLY by half a turn about z, harmonics too."""
     some = scattered(200, degree=3)
-    SPLAT_EXPORTERS[extension](some, tmp_path / f"a{extension}", Z_UP)
+    SPLAT_EXPORTERS[extension](some, tmp_path / f"a{extension}", Z_UP, **options)
     done = subprocess.run([str(SPLAT_TRANSFORM), f"a{extension}", f"b{to}"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "warn" not in (done.stdout + done.stderr).lower()

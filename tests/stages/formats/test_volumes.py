@@ -43,6 +43,7 @@ for grid in grids:
     out[grid.name + " at"] = numpy.array([grid.transform.indexToWorld(tuple(map(float, place))) for place in places])
     out[grid.name + " count"] = grid.activeVoxelCount()
     out[grid.name + " class"] = str(grid.metadata["class"])
+out["unit"] = about["unit"]
 numpy.savez(sys.argv[3], **out)
 """
 
@@ -61,7 +62,7 @@ def scattered() -> list[Grid]:
 @pytest.mark.skipif(READER is None, reason="needs OpenVDB's library: set BLENDER_PYTHON to an interpreter with bpy")
 def test_openvdb_reads_what_was_written(tmp_path: Path) -> None:
     grids = scattered()
-    write_grids(grids, tmp_path / "a.vdb")
+    write_grids(grids, tmp_path / "a.vdb", "metre")
     np.savez(tmp_path / "at.npz", **{grid.name: grid.coordinates for grid in grids})
     done = subprocess.run([str(READER), "-c", READ, *(str(tmp_path / name) for name in ("a.vdb", "at.npz", "out.npz"))], capture_output=True, check=False)
     assert (tmp_path / "out.npz").is_file(), done.stderr  # Blender's library may end with complaints of its own
@@ -72,6 +73,7 @@ def test_openvdb_reads_what_was_written(tmp_path: Path) -> None:
         assert found[f"{grid.name} count"] == len(grid.coordinates)
         np.testing.assert_allclose(found[f"{grid.name} at"], grid.coordinates @ grid.matrix[:3, :3].T + grid.matrix[:3, 3], atol=1e-9)
     assert found["density class"] == "fog volume"
+    assert found["unit"] == "metre"
 
 
 def test_the_bytes_are_those_that_openvdb_has_read(tmp_path: Path) -> None:
@@ -79,7 +81,7 @@ def test_the_bytes_are_those_that_openvdb_has_read(tmp_path: Path) -> None:
     grids = scattered()
     write_grids(grids, tmp_path / "a.vdb")
     content = (tmp_path / "a.vdb").read_bytes()
-    assert hashlib.sha256(content).hexdigest() == "5a09b0d0fc636d820cf1a66cad9a230b5946eb070d5bfca908f1f8d0c757a750"
+    assert hashlib.sha256(content).hexdigest() == "71500d7a3bea462ccb3d663cb3368b10e270252d35ce813b83cd5fc58b21a1d9"
     other = np.random.default_rng(1).permutation(len(grids[0].coordinates))
     write_grids([replace(grid, coordinates=grid.coordinates[other], values=grid.values[other]) for grid in grids], tmp_path / "b.vdb")
     assert (tmp_path / "b.vdb").read_bytes() == content

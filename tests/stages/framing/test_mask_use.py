@@ -16,6 +16,7 @@ from stages.io.capture import Capture, Photo
 from stages.io.scene import Scene
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
+from stages.sfm.reconstruction import Request
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH
 
@@ -184,7 +185,8 @@ class Found:
     def __init__(self, *right: str) -> None:
         self.right, self.asked = right, list[str]()
 
-    def __call__(self, folder: Path, names: dict[str, Path], *, masks: dict[str, Path | None], work: Path, **options: Any) -> Capture:
+    def __call__(self, request: Request, **callables: Any) -> Capture:
+        folder, masks = request.folder, request.masks
         everywhere = not masks if (folder / "masks").is_dir() else bool(masks) and not any(masks.values())
         self.asked.append("surroundings" if everywhere else "object")
         made = captures.cameras()

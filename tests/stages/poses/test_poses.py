@@ -18,6 +18,7 @@ from stages.io.scene import Scene
 from stages.poses import run as poses
 from stages.poses.run import assign_splits
 from stages.poses.settings import PosesSettings
+from stages.sfm.reconstruction import Request
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS
 
@@ -218,16 +219,16 @@ def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest
     captures.write_picture(source / "masks/img_1.png", np.eye(HEIGHT, WIDTH, dtype=np.uint8) * 255)
     asked: dict[str, Any] = {}
 
-    def find_cameras(folder: Path, names: list[str], **options: Any) -> Capture:
-        asked.update(options, names=names)
-        found = tuple(Photo(camera, folder / camera.name, options["masks"].get(camera.name)) for camera in made[:5])
-        options["warn"]("one was not registered")
+    def find_cameras(request: Request, **callables: Any) -> Capture:
+        asked.update(vars(request))
+        found = tuple(Photo(camera, request.folder / camera.name, request.masks.get(camera.name)) for camera in made[:5])
+        callables["warn"]("one was not registered")
         return Capture(kind="photographs", photos=found, background=None, rejected=(("img_5.png", "overlaps no other"),), warnings=("one was not registered",))
 
     monkeypatch.setattr("stages.masking.photographs.find_cameras", find_cameras)
     whole, warnings = run(source, tmp_path / "a", max_features=1000, matching="sequential", feature_image_size=800, seed=3)
     assert (asked["features"], asked["matching"], asked["max_side"], asked["seed"]) == (1000, "sequential", 800, 3)
-    assert [*asked["names"]] == [camera.name for camera in made]
+    assert [*asked["paths"]] == [camera.name for camera in made]
     assert asked["work"].is_relative_to(tmp_path / "a/work")
     assert warnings[0] == "one was not registered"
     assert [warning.partition(":")[0] for warning in warnings[1:]] == ["6 of 6 photographs are too small, 32 px on the longest side"]

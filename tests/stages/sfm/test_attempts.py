@@ -15,7 +15,7 @@ from stages.sfm.attempts import Search
 from stages.sfm.cameras import find_cameras
 from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics import zoom
-from stages.sfm.reconstruction import find_models
+from stages.sfm.reconstruction import Request, find_models
 
 ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
@@ -145,7 +145,7 @@ def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> 
         with Image.open(STILL_LIFE / name) as image:
             faint = np.asarray(image.filter(ImageFilter.GaussianBlur(1.0)), np.float32) * 0.15 + 85
             (Image.fromarray(faint.astype(np.uint8)) if name == names[2] else image).save(tmp_path / name, quality=95)
-    capture = find_cameras(tmp_path, names, work=tmp_path / "work", max_side=360, warn=lambda *a, **k: None, **QUIET)
+    capture = find_cameras(Request(tmp_path, {name: tmp_path / name for name in names}, tmp_path / "work", 360), warn=lambda *a, **k: None, **QUIET)
     rungs = {rung["rung"]: rung["registered"] for rung in capture.provenance.rungs}
     assert rungs["exhaustive"] == rungs["wider matching"] == 5
     assert rungs["more features"] == 6
@@ -160,7 +160,7 @@ def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:
         coarse = Image.fromarray(rng.integers(0, 255, (24, 32, 3), np.uint8))
         coarse.resize((160, 120), Image.Resampling.BICUBIC).save(tmp_path / f"{k}.png")
     with pytest.raises(BadInput, match=r"verdict\.json"):
-        find_cameras(tmp_path, [f"{k}.png" for k in range(3)], work=tmp_path / "work", warn=lambda *a, **k: None, **QUIET)
+        find_cameras(Request(tmp_path, {f"{k}.png": tmp_path / f"{k}.png" for k in range(3)}, tmp_path / "work"), warn=lambda *a, **k: None, **QUIET)
     from pipeline.files import read_json
 
     said = read_json(tmp_path / "work/verdict.json")

@@ -10,6 +10,7 @@ from benchmarks.poses import aligned_errors
 from benchmarks.scenes import room as rooms
 from efficientnerf.geometry.cameras import Camera, rays
 from stages.sfm.cameras import find_cameras
+from stages.sfm.reconstruction import Request
 
 WIDTH, HEIGHT = 400, 300
 LENS = (132.0, 132.4, 200.0, 150.0, 0.03, -0.008, 0.002, -0.0005)  # 174 degrees from left to right
@@ -25,7 +26,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Camera]]:
 
 def test_cameras_and_lens_are_those_that_took_the_photographs(room: tuple[Path, list[Camera]], tmp_path: Path) -> None:
     folder, made = room
-    found = find_cameras(folder, [camera.name for camera in made], work=tmp_path, **QUIET)
+    found = find_cameras(Request(folder, {camera.name: folder / camera.name for camera in made}, tmp_path), **QUIET)
     assert [photo.camera.name for photo in found.photos] == [camera.name for camera in made]
     assert {photo.camera.model for photo in found.photos} == {"OPENCV_FISHEYE"}
     assert not found.warnings

@@ -9,14 +9,14 @@ import pytest
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
 from stages.sfm import matches
+from stages.sfm.added.matches import NEIGHBOURS, pairs_of
 from stages.sfm.database import FEATURES, forget
-from stages.sfm.learned.matches import NEIGHBOURS, pairs_of
 from stages.sfm.reconstruction import Request, reconstruct
 
 pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
 
-from stages.sfm.learned.networks import Detector, Features, Matcher
+from stages.sfm.added.networks import Detector, Features, Matcher
 from tests.stages.sfm.made_networks import WIDE, _Graph, detector, matcher, value
 
 ROOT = Path(__file__).resolve().parents[3]

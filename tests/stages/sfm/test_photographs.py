@@ -42,8 +42,10 @@ def chosen() -> list[str]:
 
 
 def find(folder: Path, names: list[str], work: Path, **changes: object) -> Capture:
-    keywords: dict[str, object] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None, "max_side": SIDE}
-    return find_cameras(folder, names, work=work, **(keywords | changes))  # type: ignore[arg-type]
+    callables: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
+    callables |= {name: changes.pop(name) for name in [*changes] if name in callables}
+    asked: dict[str, Any] = {"max_side": SIDE} | changes
+    return find_cameras(Request(folder, {name: folder / name for name in names}, work, **asked), **callables)
 
 
 def numbers(capture: Capture) -> tuple[bytes, ...]:
@@ -98,11 +100,12 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from stages.sfm.cameras import find_cameras
+from stages.sfm.reconstruction import Request
 folder, work, phase, moment, side = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
 def progress(done, total, text="", **facts):
     if text == phase and done >= moment:
         os.kill(os.getpid(), signal.SIGKILL)
-find_cameras(folder, sys.argv[6:], work=work, progress=progress, safe_point=lambda: None, warn=print, max_side=side)
+find_cameras(Request(folder, {name: folder / name for name in sys.argv[6:]}, work, side), progress=progress, safe_point=lambda: None, warn=print)
 """
 
 

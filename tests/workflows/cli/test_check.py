@@ -34,7 +34,7 @@ def test_check_names_problems_and_exits_with_2_where_it_is_hopeless(enerf: Enerf
     assert (unmeasured.code, unmeasured.object["forecast"]["run_seconds"]) == (2, None)
     text = enerf("check", folder, "--set", "train.field=nerf")
     assert text.code == 2
-    assert all(words in text.err + text.out for words in (str(folder), "failed", "64x48", "--budget"))
+    assert all(words in text.err + text.out for words in (str(folder), "failed", "64x48", "without cameras"))
 
 
 def test_check_says_what_is_left_aside(enerf: Enerf, tmp_path: Path) -> None:
@@ -54,5 +54,7 @@ def test_check_looks_at_the_frames_that_a_run_would_choose_of_a_video(enerf: Ene
     told = enerf("check", clip, "--json", "--set", "poses.frames=5").object
     assert (told["source"], told["format"], told["photographs"], told["sizes"]) == (str(clip), "photographs", 5, ["96x64"])
     assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]  # nothing is left
+    still = enerf("check", clips.write_clip(tmp_path / "still.mp4", clips.pan(1, 0.0) * 12))
+    assert (still.code, "the camera stands still" in still.out) == (2, True)
     (tmp_path / "clip.mp4").write_bytes(b"no video")
     assert "clip.mp4: unreadable" in enerf("check", clip).err

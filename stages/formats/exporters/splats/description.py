@@ -30,7 +30,6 @@ MAX_SOG_JSON = 2**20  # bytes; it takes ten thousand
 DENSEST = 1032  # bytes that one byte of deflate, or of a zstd frame as SPZ writes them, can stand for
 FEW, USUAL = 2**20, 64  # Gaussians that any file may hold; and bytes that one byte stands for in larger ones at most: those of scenes have 3
 SPZ_DEGREES = range(5)
-STREAMS = 6  # of SPZ 4, at least: places, opacities, colours, scales, rotations, harmonics
 _PLY_NAMES = {*"xyz", *(f"{name}_{k}" for name, count in (("f_dc", 3), ("scale", 3), ("rot", 4)) for k in range(count)), "opacity"}
 
 
@@ -157,28 +156,63 @@ def _spz(file: BinaryIO, size: int) -> _Found:
         found.opacities.add(np.frombuffer(inflated.take(some), np.uint8)[:, None] / 255)
     inflated.skip(3 * count)
     for some in _pieces(count):
-        found.scales.add(np.exp(np.frombuffer(inflated.take(3 * some), np.uint8).reshape(some, 3) / spz.SCALE_STEPS + spz.SMALLEST_SCALE))
+        found.scales.add(spz.scales(inflated.take(3 * some)))
     inflated.skip(count * ((3 if version < 3 else 4) + 3 * ((degree + 1) ** 2 - 1)))
     inflated.finish(more=bool(flags & 2))
     return found
 
 
 def _spz4(file: BinaryIO, size: int) -> _Found:
-    """Version 4, whose header is not compressed. Its streams are zstd's, and are not opened: there is no such decoder here."""
+    """Version 4: a header and a table of streams that are not compressed, then the streams, each a frame of zstd."""
     version, count, degree, bits, flags, streams, table = struct.unpack("<IIBBBBI", exactly(file, 16))
     if version != 4:
         raise Damaged(f"no SPZ of version 1 to 4: version {version}")
-    if streams < STREAMS or table < 32 or table + 16 * streams > size:
-        raise Damaged(f"a table of {streams} streams at byte {table} of {size}; expected at least {STREAMS}, within the file")
     found = _spz_header(version, count, degree, bits, flags, size)
+    widths = [9, 1, 3, 3, 4, *([3 * ((degree + 1) ** 2 - 1)] if degree else [])]
+    if streams < len(widths) or table < spz.HEADER.size or table + 16 * streams > size:
+        raise Damaged(f"a table of {streams} streams at byte {table} of {size}; expected at least {len(widths)}, within the file")
     file.seek(table)
-    sizes = struct.unpack(f"<{2 * streams}Q", exactly(file, 16 * streams))
-    if table + 16 * streams + sum(sizes[::2]) != size:
-        raise Damaged(f"{size} bytes; expected {table + 16 * streams + sum(sizes[::2])} for its streams")
-    if sizes[1] != 9 * count:
-        raise Damaged(f"places of {sizes[1]} bytes; expected {9 * count} for {count} Gaussians")
-    found.notes.append("bounds are not read: this version is compressed with zstd")
+    stated = struct.unpack(f"<{2 * streams}Q", exactly(file, 16 * streams))
+    stored, unpacked = stated[::2], stated[1::2]
+    if table + 16 * streams + sum(stored) != size:
+        raise Damaged(f"{size} bytes; expected {table + 16 * streams + sum(stored)} for its streams")
+    if unpacked[: len(widths)] != tuple(width * count for width in widths):
+        raise Damaged(f"streams of {', '.join(map(str, unpacked[: len(widths)]))} bytes; expected {', '.join(str(width * count) for width in widths)}")
+    frames = [_Frame(exactly(file, some)) for some in stored[:4]]
+    for some in _pieces(count):
+        found.places.add(spz.places(frames[0].take(9 * some), bits))
+        found.opacities.add(np.frombuffer(frames[1].take(some), np.uint8)[:, None] / 255)
+        found.scales.add(spz.scales(frames[3].take(3 * some)))
+    for frame in (frames[0], frames[1], frames[3]):
+        frame.finish()
     return found
+
+
+class _Frame:
+    """A frame of zstd, of which no more is unpacked than is asked for."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.stream = data, spz.zstd.ZstdDecompressor()
+
+    def take(self, count: int) -> bytes:
+        """So many bytes. Raises Damaged where they are not there."""
+        found: list[bytes] = []
+        while count and not self.stream.eof:
+            try:
+                found.append(self.stream.decompress(self.data, count))
+            except spz.zstd.ZstdError as error:
+                raise Damaged(f"it does not unpack as zstd ({error})") from error
+            if not found[-1] and not self.data and self.stream.needs_input:
+                break
+            self.data, count = b"", count - len(found[-1])
+        if count:
+            raise Damaged("its Gaussians end before as many have come as its header names")
+        return b"".join(found)
+
+    def finish(self) -> None:
+        """Raises Damaged where it goes on."""
+        if not self.stream.eof and self.stream.decompress(b"", 1):
+            raise Damaged("it goes on after its last Gaussian")
 
 
 def _spz_header(version: int, count: int, degree: int, bits: int, flags: int, size: int) -> _Found:

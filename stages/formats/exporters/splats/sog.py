@@ -43,7 +43,7 @@ OLDEST = (1980, 1, 1, 0, 0, 0)  # no time: the same Gaussians give the same byte
 def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write Gaussians given in the capture's frame. Raises BadInput."""
     check_gaussians(gaussians, path)
-    files = files_of(with_y_down(gaussians, frame))
+    files = files_of(with_y_down(gaussians, frame), frame.unit)
     with atomic(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():
             entry = zipfile.ZipInfo(name, OLDEST)
@@ -51,8 +51,8 @@ def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_
             archive.writestr(entry, content)
 
 
-def files_of(gaussians: Gaussians) -> dict[str, bytes]:
-    """The files in the zip."""
+def files_of(gaussians: Gaussians, unit: str) -> dict[str, bytes]:
+    """The files in the zip; `unit` is stated in meta.json, and readers pass over it."""
     places = gaussians.means.astype(np.float64)
     places = np.sign(places) * np.log1p(np.abs(places))
     low, high = places.min(axis=0), places.max(axis=0)
@@ -67,7 +67,7 @@ def files_of(gaussians: Gaussians) -> dict[str, bytes]:
         "sh0": _picture(np.concatenate([colour_codes, opacities[:, None]], axis=1)),
     }  # fmt: skip
     meta: dict[str, Any] = {
-        "version": VERSION, "asset": {"generator": "efficientnerf"}, "count": len(chosen), "antialias": False,
+        "version": VERSION, "asset": {"generator": "efficientnerf", "unit": unit}, "count": len(chosen), "antialias": False,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scales, "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]}, "sh0": {"codebook": colours, "files": ["sh0.webp"]},
     }  # fmt: skip

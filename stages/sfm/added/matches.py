@@ -8,10 +8,10 @@ import numpy as np
 from pipeline.files import SafePoint
 from stages.cores import in_order
 from stages.io.png import read_png
+from stages.sfm.added.networks import FEWEST, Detector, Features, Matcher
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, forget, images_of, pair_id_of
 from stages.sfm.images import Progress
-from stages.sfm.learned.networks import FEWEST, Detector, Features, Matcher
 from stages.sfm.pairs import Pair, ordered
 
 MOST = 2048  # features of a photograph: what LightGlue takes grows with their square
@@ -72,7 +72,7 @@ def add_matches(
         lenses = {position: database.read_camera(of[position].camera_id) for position in used}
     forget(place, FEATURES, [of[position].image_id for position in used])
     forget(place, PAIRS, [pair_id_of(*(of[i].image_id for i in pair)) for pair in pairs])
-    every = {position: _appended(before[position], found[position].xy) for position in used}
+    every = {position: appended(before[position], found[position].xy) for position in used}
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     matched = in_order(lambda pair: matcher.matches(found[pair[0]], found[pair[1]]), pairs, at_once, safe_point)
@@ -90,7 +90,7 @@ def add_matches(
             progress(done + 1, len(pairs), "matching pairs by a network")
 
 
-def _appended(keypoints: np.ndarray, xy: np.ndarray) -> np.ndarray:
+def appended(keypoints: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """(N + M, K) key points of a database, and others of no size and direction."""
     columns = keypoints.shape[1] if keypoints.ndim == 2 and len(keypoints) else 2
     more = np.zeros((len(xy), columns), np.float32)
