@@ -7,8 +7,6 @@ The first photographs of examples/still_life, which go round in order and whose 
 error names one of the problems that the capture has. Writes bad_captures.json and .md.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

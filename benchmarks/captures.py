@@ -10,8 +10,6 @@ again. Results: captures.json, captures.md and captures/NAME.webp (photograph, a
 --before is given and the asset of a set is worse than there by more than 0.1 dB.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import json

@@ -9,8 +9,6 @@ a part that has not ended after its share of --seconds is stopped and recorded a
 (the tests pytest too): neither pycolmap nor this project has to be installed.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import json

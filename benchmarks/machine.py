@@ -1,7 +1,5 @@
 """The machine, for the benchmarks' results."""
 
-from __future__ import annotations
-
 import os
 import platform
 from pathlib import Path

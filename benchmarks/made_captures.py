@@ -7,8 +7,6 @@ untrained model are masked, as the train stage does. Of the voxels that hold a p
 share that is masked. Writes made_captures.json and .md; exit code 1 where any is above MOST_MASKED. No photograph is rendered here.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

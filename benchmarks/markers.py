@@ -9,8 +9,6 @@ those of structure from motion are. Writes markers.json and .md; exit code 1 whe
 With --cameras: what structure from motion finds on a table without any texture, with the markers as tie points and without; markers_cameras.json.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -4,8 +4,6 @@ A row is a mapping: `method`, `set`, `minutes` and `options` name it; `code` is 
 there are none. Rows of several files (ours, peers') are shown in one table.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence

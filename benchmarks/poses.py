@@ -6,8 +6,6 @@ Prints, and saves as the row of the folder's name: photographs registered, RMS a
 alignment, in per cent of their mean distance to the centroid, the camera model, seconds, processor seconds and the load average before and after.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

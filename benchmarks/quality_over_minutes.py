@@ -9,8 +9,6 @@ Writes quality_over_minutes.json, and a table and a plot of it with the rows of 
 the marks in a document. Made scenes are written to FOLDER/scenes where they are not there: `python -m benchmarks.scenes`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -96,26 +96,6 @@ def measure(tree: Any, views: list[Any], supersample: int, normals: bool) -> dic
     }
 
 
-def counts(tree: Any, views: list[Any]) -> dict[str, float]:
-    """Means over the rays of some renders: what the kernel looks up, and the bytes that it reads, most of them from caches."""
-    import numpy as np
-
-    from efficientnerf.backends.numba.tree.rendering import ray_statistics
-
-    work = np.concatenate([ray_statistics(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
-    cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
-    # A cell is 4 bytes, and so is a mask; an interpolated sample reads four rows, and the four half floats of eight voxels, colours among them.
-    read = 4 * cells + 4 * tested + (4 * 8 + 8 * 8) * mixed
-    return {
-        "cells_per_ray": round(cells, 3),
-        "samples_per_ray": round(tested, 3),
-        "samples_with_density_per_ray": round(mixed, 3),
-        "colours_per_ray": round(colours, 3),
-        "bytes_per_ray": round(read, 1),
-        "rays_that_hit": round(float((work[:, 3] > 0).mean()), 4),
-    }
-
-
 def memory(tree: Any, view: Any) -> dict[str, float]:
     """Bytes in memory while rendering: the tree, its packed form, the colours of the view, and the framebuffer."""
     from efficientnerf.asset.rendering import render
@@ -162,7 +142,6 @@ def measure_task(task: dict[str, Any]) -> dict[str, Any]:
                 "sh_degree": tree.degree,
                 "load_s": round(loading, 3),
             },
-            "work": counts(tree, views),
             "memory": memory(tree, views[0]),
         }
     return result
@@ -191,7 +170,6 @@ def compare(task: dict[str, Any], other: Path | None, rounds: int) -> dict[str, 
         if other is not None:
             others.append(_in_process(task | {"checkout": str(other.resolve())}))
     row = {name: task[name] for name in ("width", "height", "supersample", "normals", "frames", "threads")} | mine[0] | {"speed": _mean(mine)}
-    row["speed"]["read_gb_per_s"] = round(row["work"]["bytes_per_ray"] * row["speed"]["rays_per_s"] / 1e9, 1)
     if others:
         row["before"] = _mean(others)
         row["times_as_fast"] = round(row["before"]["mean_ms"] / row["speed"]["mean_ms"], 2)

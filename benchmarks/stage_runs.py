@@ -1,7 +1,5 @@
 """Commands, with the time and memory that they take."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -8,8 +8,6 @@ Pictures are those of the captured cameras, else of an orbit, at 320 pixels; `pi
 --shots: the page as it looks wide and narrow, light and dark.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import json

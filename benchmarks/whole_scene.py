@@ -4,8 +4,6 @@ Surfaces are shells of voxels about three thick, as baked ones are; colours are 
 `compact` load.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

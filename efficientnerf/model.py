@@ -1,7 +1,5 @@
 """The model: coarse field, fine field, density voxels and the space they live in; how it renders rays (EfficientNeRF, figure 2)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -41,12 +39,7 @@ class Sky(nn.Module):
 
 @dataclass
 class Model:
-    """See the module. The settings are those that it was made with, and do not change.
-
-    step        length of a coarse interval in the box, world units
-    max_intervals  intervals on a ray at most
-    background  constant colour behind the scene, or None: then `sky` is
-    """
+    """See the module. The settings are those that it was made with, and do not change."""
 
     space: Space
     settings: TrainSettings
@@ -55,9 +48,9 @@ class Model:
     voxels: DensityVoxels
     strategy: Strategy
     sky: Sky
-    background: tuple[float, float, float] | None
-    step: float
-    max_intervals: int
+    background: tuple[float, float, float] | None  # constant colour behind the scene, or None: then `sky` is
+    step: float  # length of a coarse interval in the box, world units
+    max_intervals: int  # intervals on a ray at most
 
     @property
     def prunes(self) -> bool:

@@ -4,8 +4,6 @@
 settings (`pipeline.stage.settings_from`). Every number has a lowest and a highest value, and a stage can work with both. Imports nothing heavy.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated, Any, Literal, TypeVar
 

@@ -1,7 +1,5 @@
 """Render views of an asset in Python: python examples/asset.py runs/mine/bake/asset.nerftree views/"""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

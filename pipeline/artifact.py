@@ -20,8 +20,6 @@ Only names that these lines give are completed, undone or deleted, only for stag
 .work may be untrusted. links.py has checked that it holds no links.
 """
 
-from __future__ import annotations
-
 import fnmatch
 import stat
 from collections.abc import Collection, Iterable

@@ -7,8 +7,6 @@ partial  work on the present request was cut short; the published artifact, if a
 corrupt  the files are not those that were written
 """
 
-from __future__ import annotations
-
 import difflib
 import os
 from collections.abc import Collection, Sequence
@@ -29,25 +27,16 @@ _CHANGES_SHOWN = 4
 
 @dataclass(frozen=True)
 class Decision:
-    """The state of one stage.
-
-    state     fresh, stale, missing, partial or corrupt
-    reason    why it has to run; None if and only if fresh
-    note      a remark for the user
-    request   of a run of the stage now; None where it cannot be determined, and then
-    obstacle  the error that prevents it
-    manifest  of the published artifact, if it can be read
-    extra     files in its folder that it did not write
-    """
+    """The state of one stage."""
 
     stage: str
-    state: str
-    reason: str | None
-    note: str | None = None
-    request: Request | None = None
+    state: str  # fresh, stale, missing, partial or corrupt
+    reason: str | None  # why it has to run; None if and only if fresh
+    note: str | None = None  # a remark for the user
+    request: Request | None = None  # of a run of the stage now; None where `obstacle` prevents that it is determined
     obstacle: PipelineError | None = None
-    manifest: Manifest | None = None
-    extra: tuple[str, ...] = ()
+    manifest: Manifest | None = None  # of the published artifact, if it can be read
+    extra: tuple[str, ...] = ()  # files in its folder that it did not write
 
     @property
     def fresh(self) -> bool:

@@ -13,8 +13,6 @@ PipelineError
 └── Interrupted        130 by Ctrl-C, 143 by SIGTERM
 """
 
-from __future__ import annotations
-
 import signal
 
 
@@ -41,25 +39,19 @@ class UnknownSetting(UsageError):
 
 
 class Mistakes(UsageError):
-    """All mistakes in what was given; the text says how many and names the first.
-
-    details  a line for each that is shown
-    """
+    """All mistakes in what was given; the text says how many and names the first."""
 
     def __init__(self, text: str, details: tuple[str, ...]) -> None:
         super().__init__(text)
-        self.details = details
+        self.details = details  # a line for each that is shown
 
 
 class TooLittleMemory(UsageError):
-    """A stage needs more memory than it may take; found out before its work.
-
-    needed  bytes; 0 where it is not known
-    """
+    """A stage needs more memory than it may take; found out before its work."""
 
     def __init__(self, text: str, needed: int = 0) -> None:
         super().__init__(text)
-        self.needed = needed
+        self.needed = needed  # bytes; 0 where it is not known
 
 
 class StageFailed(PipelineError):
@@ -73,16 +65,13 @@ class DiskFull(StageFailed):
 
 
 class CorruptArtifact(PipelineError):
-    """Files of a run are not those that were written.
-
-    files  "stage/relative/path" of each that is known, else empty
-    """
+    """Files of a run are not those that were written."""
 
     exit_code = 4
 
     def __init__(self, text: str, files: tuple[str, ...] = ()) -> None:
         super().__init__(text)
-        self.files = files
+        self.files = files  # "stage/relative/path" of each that is known, else empty
 
 
 class RunLocked(PipelineError):
@@ -92,13 +81,9 @@ class RunLocked(PipelineError):
 
 
 class Interrupted(PipelineError):
-    """A signal asked to stop and a safe point was reached. Work so far is kept.
-
-    number     SIGINT or SIGTERM
-    exit_code  128 + number: 130 or 143
-    """
+    """A signal asked to stop and a safe point was reached. Work so far is kept."""
 
     def __init__(self, number: int = signal.SIGINT, text: str | None = None) -> None:
         super().__init__(text or f"interrupted by {signal.Signals(number).name}")
-        self.number = int(number)
-        self.exit_code = 128 + self.number
+        self.number = int(number)  # SIGINT or SIGTERM
+        self.exit_code = 128 + self.number  # 128 + number: 130 or 143

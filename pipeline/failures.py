@@ -1,7 +1,5 @@
 """From an exception of a stage, or of the system, to the error that is shown to the user."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ What must survive a kill or a power cut goes through these functions and no othe
 one writer of files that appear whole or not at all. Nothing is written or deleted through a link, and nothing but plain files is opened.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json
@@ -47,14 +45,11 @@ _KINDS = {
 
 
 class Unreadable(ValueError):
-    """A JSON file that is too large, cut off or not valid; the text says why.
-
-    denied  the error of the system where that would not read the file; see `is_denied`
-    """
+    """A JSON file that is too large, cut off or not valid; the text says why."""
 
     def __init__(self, text: str, denied: OSError | None = None) -> None:
         super().__init__(text)
-        self.denied = denied
+        self.denied = denied  # the error of the system where that would not read the file; see `is_denied`
 
 
 def canonical_json(value: Any) -> bytes:
@@ -99,10 +94,7 @@ def _check_plain(path: Path, status: os.stat_result) -> None:
 
 
 def read_json(path: Path, limit: int = MAX_JSON, *, follow: bool = True) -> Any:
-    """The value in a plain file of at most `limit` bytes, finite and not deeply nested. Raises Unreadable; FileNotFoundError if there is none.
-
-    follow  see `open_plain`
-    """
+    """The value in a plain file of at most `limit` bytes, finite and not deeply nested. Raises Unreadable; FileNotFoundError if there is none."""
     try:
         with open(open_plain(path, follow=follow), "rb") as file:
             size = os.fstat(file.fileno()).st_size

@@ -1,7 +1,5 @@
 """SHA-256 of files, remembered by size, times and inode so that an unchanged run is recognised without reading it."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import time
@@ -42,13 +40,10 @@ def sha256_of(path: Path, safe_point: SafePoint | None = None, *, follow: bool =
 
 
 class Hashes:
-    """Digests of files by key, where a key is the file's place within the run (or within the source), which moves with it.
-
-    path  the file that remembers them between processes; None: nothing is remembered. A damaged one is ignored: it only saves time
-    """
+    """Digests of files by key, where a key is the file's place within the run (or within the source), which moves with it."""
 
     def __init__(self, path: Path | None = None, *, safe_point: SafePoint | None = None) -> None:
-        self.path = path
+        self.path = path  # the file that remembers them between processes; None: nothing is remembered. A damaged one is ignored: it only saves time
         self.safe_point = safe_point
         self._changed = False
         self._entries: dict[str, Entry] = {} if path is None else _read(path)
@@ -57,7 +52,6 @@ class Hashes:
         """Digest of the file at `path`, to be at the place `key`. Raises OSError if it cannot be read.
 
         anew    read it whatever is remembered, and without a safe point: what a stage has just finished is not given up for a Ctrl-C
-        follow  whether `path` itself may be a link; not so for files of a run
         """
         before = os.stat(path, follow_symlinks=follow)
         known = self._entries.get(key)

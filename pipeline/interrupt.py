@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM: the first asks to stop at the next safe point, a second Ctrl-C ends the process at once."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

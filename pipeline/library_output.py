@@ -6,8 +6,6 @@ While a command runs, standard error's descriptor, 2, leads into the log, so tha
 and `.cache/libraries.log` of a run while its stages run; `--debug` shows it in the end.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging
@@ -73,10 +71,7 @@ def into_log(log: TextIO) -> Iterator[None]:
 
 @contextmanager
 def libraries_apart(*, show: bool) -> Iterator[TextIO | None]:
-    """While open, nothing but what is written to the stream that it yields, the former `sys.stderr`, comes to the terminal.
-
-    show  whether to show the output of libraries in the end
-    """
+    """While open, nothing but what is written to the stream that it yields, the former `sys.stderr`, comes to the terminal."""
     former = sys.stderr
     with contextlib.suppress(OSError, ValueError, AttributeError):
         former.flush()

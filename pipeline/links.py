@@ -6,8 +6,6 @@ such: they are replaced, never written in place (sharing.py). A run that breaks 
 itself, and what lies above it, may be reached by links.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import stat

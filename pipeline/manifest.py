@@ -7,8 +7,6 @@ the rest  seconds, processor time, peak memory, tool versions: for people, outsi
 checksum  of all of the above, so that a damaged manifest is known as such
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -41,18 +39,13 @@ _Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e12)]
 
 @dataclass(frozen=True)
 class Request:
-    """All that decides the bytes of an artifact.
-
-    settings  plain JSON values
-    inputs    need -> digest of its artifact
-    source    path relative to the source -> SHA-256 (or ABSENT); None for a stage that does not read the source
-    """
+    """All that decides the bytes of an artifact."""
 
     stage: str
     version: _Count
-    settings: dict[str, Any]
-    inputs: dict[str, Sha256]
-    source: dict[str, _Sha256OrAbsent] | None = None
+    settings: dict[str, Any]  # plain JSON values
+    inputs: dict[str, Sha256]  # need -> digest of its artifact
+    source: dict[str, _Sha256OrAbsent] | None = None  # path relative to the source -> SHA-256 (or ABSENT); None for a stage that does not read the source
 
     def plain(self) -> dict[str, Any]:
         return {"stage": self.stage, "version": self.version, "settings": self.settings, "inputs": self.inputs, "source": self.source}
@@ -92,27 +85,18 @@ def tool_versions() -> tuple[tuple[str, str], ...]:
 
 @dataclass(frozen=True)
 class Manifest:
-    """See the module.
-
-    seconds      wall clock of the process that finished it
-    peak_memory  bytes, of that process during the stage
-    cpu_seconds  processor time of that process and its children during the stage; 0 where it is not known
-    cores        that the process might use; 0 where it is not known
-    resumed      whether it went on from the scratch of an earlier process
-    made         seconds since 1970
-    facts        what the stage recorded (`Job.record`), as JSON holds it
-    """
+    """See the module."""
 
     request: Request
     outputs: dict[str, Output]
-    seconds: float = 0.0
-    peak_memory: int = 0
-    resumed: bool = False
-    made: float = field(default_factory=time.time)
+    seconds: float = 0.0  # wall clock of the process that finished it
+    peak_memory: int = 0  # bytes, of that process during the stage
+    resumed: bool = False  # whether it went on from the scratch of an earlier process
+    made: float = field(default_factory=time.time)  # seconds since 1970
     versions: dict[str, str] = field(default_factory=lambda: dict(tool_versions()))
-    cpu_seconds: float = 0.0
-    cores: int = 0
-    facts: dict[str, Any] = field(default_factory=dict)
+    cpu_seconds: float = 0.0  # processor time of that process and its children during the stage; 0 where it is not known
+    cores: int = 0  # that the process might use; 0 where it is not known
+    facts: dict[str, Any] = field(default_factory=dict)  # what the stage recorded (`Job.record`), as JSON holds it
 
     @property
     def cores_busy(self) -> float:

@@ -78,30 +78,20 @@ def resume_in_words(
 
 @dataclass
 class Run:
-    """A run folder and its run.json. `Run(path, ...)` alone writes nothing: a planned run, for a dry run.
+    """A run folder and its run.json. `Run(path, ...)` alone writes nothing: a planned run, for a dry run."""
 
-    path         absolute
-    source       absolute, or None
-    also         further sources, absolute: of one scene, together with the first
-    settings     stage -> the resolved values of its settings, plain JSON
-    memory       bytes that stages may take; None: what the machine has
-    viewer       what its page in a browser shows; None: what there is
-    resume_text  how to go on with the run, for messages
-    stages       names of the stages that it may have, see `refuse_links`
-    """
-
-    path: Path
-    source: Path | None = None
-    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    path: Path  # absolute
+    source: Path | None = None  # absolute, or None
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)  # stage -> the resolved values of its settings, plain JSON
     preset: str | None = None
     seed: int | None = None
     device: str | None = None
-    memory: int | None = None
-    viewer: str | None = None
-    also: tuple[Path, ...] = ()
+    memory: int | None = None  # bytes that stages may take; None: what the machine has
+    viewer: str | None = None  # what its page in a browser shows; None: what there is
+    also: tuple[Path, ...] = ()  # further sources, absolute: of one scene, together with the first
     created: float = field(default_factory=time.time)
-    resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)
-    stages: frozenset[str] | None = field(default=None, repr=False, compare=False)
+    resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)  # how to go on with the run, for messages
+    stages: frozenset[str] | None = field(default=None, repr=False, compare=False)  # names of the stages that it may have, see `refuse_links`
     _holds: int = field(default=0, init=False, repr=False, compare=False)
     _lease: Lease | None = field(default=None, init=False, repr=False, compare=False)
 

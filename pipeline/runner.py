@@ -1,7 +1,5 @@
 """Runs the stages that `decide` finds not fresh, and verifies a run."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading
@@ -33,21 +31,14 @@ POLL = 0.1  # seconds between two looks for a signal while stages run at the sam
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one stage.
-
-    action   "ran", "skipped" (it was fresh), "would run" or, of a dry run, "may run" (if those before it give something new)
-    reason   why it ran; None if it was fresh
-    seconds  that it took, also when it was fresh
-    size     bytes of its artifact
-    digest   of its artifact
-    """
+    """What became of one stage."""
 
     stage: str
-    action: str
-    reason: str | None = None
-    seconds: float = 0.0
-    size: int = 0
-    digest: str | None = None
+    action: str  # "ran", "skipped" (it was fresh), "would run" or, of a dry run, "may run" (if those before it give something new)
+    reason: str | None = None  # why it ran; None if it was fresh
+    seconds: float = 0.0  # that it took, also when it was fresh
+    size: int = 0  # bytes of its artifact
+    digest: str | None = None  # of its artifact
 
 
 def run_stages(
@@ -72,11 +63,8 @@ def run_stages(
     start    run this stage and those after it even if they are fresh; those before it if they are not
     only     consider this stage alone, with the artifacts of those before it; warns if they are not fresh
     force    run the stages considered even if they are fresh
-    device   handed to the stages
     memory   handed to the stages; None: no limit
     report   takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
-    dry_run  report what would be done, and do nothing
-    execute  runs a stage
     beside   runs stages that do not need each other, at the same time, where the memory admits it; None: one stage after another
 
     Raises PipelineError. What was published before stays; the next call resumes what was interrupted.

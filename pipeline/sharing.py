@@ -4,8 +4,6 @@ Published files are replaced, never written in place: runs share them by hard li
 links between the two, files are copied.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Collection
 from pathlib import Path

@@ -42,31 +42,22 @@ class ByName:
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of a workflow: a function from folders to a folder.
+    """One step of a workflow: a function from folders to a folder."""
 
-    name          also the name of its folder in the run
-    version       raise it whenever the same request gives other bytes
-    settings      a frozen dataclass, every field with a default
-    needs         names of the stages whose artifacts it reads
-    run           writes its outputs into job.out; a `ByName` where its module imports what takes time
-    reads_source  whether it is handed the source; then the files of the source are part of its request
-    source_files  (source, settings) -> the files of the source that matter (cheap: they are hashed, not read); None: every file in it
-    uses_device   whether it computes on job.device
-    check         takes the settings of the stages that are considered, by name, its own among them, and raises UsageError where it cannot work with them:
-                  called before the first stage runs, so that hours of the stages before it are not spent in vain. Cheap
-    volatile      fnmatch patterns of outputs (relative, posix) that depend on the clock: kept and hashed, but outside the
-                  artifact's digest, so that a log does not make later stages stale
-    """
-
-    name: str
-    version: int
-    settings: type
-    needs: tuple[str, ...]
-    run: Callable[[Job], None]
-    reads_source: bool = False
+    name: str  # also the name of its folder in the run
+    version: int  # raise it whenever the same request gives other bytes
+    settings: type  # a frozen dataclass, every field with a default
+    needs: tuple[str, ...]  # names of the stages whose artifacts it reads
+    run: Callable[[Job], None]  # writes its outputs into job.out; a `ByName` where its module imports what takes time
+    reads_source: bool = False  # whether it is handed the source; then the files of the source are part of its request
+    # (source, settings) -> the files of the source that matter (cheap: they are hashed, not read); None: every file in it
     source_files: Callable[[Path, Any], list[Path]] | None = None
-    uses_device: bool = False
+    uses_device: bool = False  # whether it computes on job.device
+    # takes the settings of the stages that are considered, by name, its own among them, and raises UsageError where it cannot work with them: called before
+    # the first stage runs, so that hours of the stages before it are not spent in vain. Cheap
     check: Callable[[Mapping[str, Any]], None] | None = None
+    # fnmatch patterns of outputs (relative, posix) that depend on the clock: kept and hashed, but outside the artifact's digest, so that a log does not make
+    # later stages stale
     volatile: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

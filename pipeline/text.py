@@ -3,8 +3,6 @@
 All that a stranger wrote goes through `printable` where it enters a message; every line goes through it once more on its way to a terminal.
 """
 
-from __future__ import annotations
-
 _SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 

@@ -31,13 +31,10 @@ class Name:
 
 @dataclass(frozen=True)
 class Outputs:
-    """The outputs of a stage.
-
-    stage  its name, which is also that of its folder in a run
-    """
+    """The outputs of a stage."""
 
     folder: Path
-    stage: ClassVar[str]
+    stage: ClassVar[str]  # its name, which is also that of its folder in a run
 
     @classmethod
     def of_run(cls, run: Path) -> Self:

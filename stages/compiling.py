@@ -1,7 +1,5 @@
 """Stages that report when kernels are compiled; no time budget counts that."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """How many cores a stage computes on, and how pictures are read on several."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence

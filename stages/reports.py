@@ -1,7 +1,5 @@
 """The reports and verdicts of stages as far as a later stage follows them, or the page of a run shows them: what has no place in the other files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 

@@ -5,8 +5,6 @@ counts only where the note and all of its files are as they were written, and th
 removed, and the piece is made again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -24,15 +22,11 @@ Warn = Callable[[str], object]
 
 
 class _Note(msgspec.Struct, forbid_unknown_fields=True):
-    """
-    value   whatever the stage needs to know again
-    files   SHA-256 of each file by its path relative to the note's folder
-    sha256  of all this
-    """
+    """What is noted of a piece of work."""
 
-    value: Any
-    files: dict[str, str]
-    sha256: str
+    value: Any  # whatever the stage needs to know again
+    files: dict[str, str]  # SHA-256 of each file by its path relative to the note's folder
+    sha256: str  # of all this
 
 
 def note(path: Path, value: Any, outputs: Sequence[Path] = ()) -> None:

@@ -4,8 +4,6 @@ A default stands once, in the dataclass; presets, the command line and the docum
 values against it (`pipeline.stage.settings_from`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import types
 import typing

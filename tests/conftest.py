@@ -6,8 +6,6 @@ longer than the work takes where the machine is busy. Set before anything is imp
 Artifacts are flushed to the disk step by step. On a disk, a flush waits for all that other workers write; in a file system in memory it waits for nothing.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Stand-ins with closed forms: a ball that answers like a NerfTree, and a renderer of it with surroundings that answers like a FieldRenderer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,8 +1,6 @@
 """Who may import whom and where, how large folders, functions and signatures may be, over the syntax trees; and that what must start quickly imports
 nothing heavy."""
 
-from __future__ import annotations
-
 import ast
 import graphlib
 import re

@@ -1,7 +1,5 @@
 """The workflow from photographs to assets: its stages in order."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """How `--budget` is shared by the stages that train: the field first, then the asset."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol

@@ -4,8 +4,6 @@ Every file is written aside and renamed, so that it is complete or not there at 
 neither followed nor replaced, a pipe or a device (/dev/stdout) cannot be written so.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator, Sequence
@@ -19,7 +17,6 @@ from pipeline.run import NAME, cannot_write
 def check_files(paths: Sequence[Path], *, force: bool, inputs: Sequence[Path] = ()) -> None:
     """Raise UsageError unless each of the files may be written.
 
-    force   whether plain files may be replaced
     inputs  files that are read, and are no target even so
     """
     for number, path in enumerate(paths):

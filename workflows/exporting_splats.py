@@ -1,7 +1,5 @@
 """3D Gaussians of a run or an asset as files: those of the run's stage `splats` where it has made the same, else made here."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

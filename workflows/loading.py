@@ -1,7 +1,5 @@
 """Assets of runs and of files, read and checked."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from efficientnerf.asset.format import FormatError, describe, load

@@ -1,7 +1,5 @@
 """`enerf measure` and `enerf orient`."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

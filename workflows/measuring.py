@@ -4,8 +4,6 @@ A place is `X,Y,Z` in the frame of the run's exports, as the viewer copies it, o
 of the photograph at full size and upright, from its upper left corner. All is computed in the capture's frame, and scaled at the end.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """A workflow of a command line: stages in order, presets, and forecasts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,17 +10,12 @@ from pipeline.stage import Stage
 
 @dataclass(frozen=True)
 class Workflow:
-    """Stages and presets of a command line.
+    """Stages and presets of a command line."""
 
-    stages   in order
-    presets  the folder of its presets, TOML files
-    child    the module that runs its stages in processes of their own; see `pipeline.executors.serving`
-    space    (stage, run, its sources, settings by stage, bytes of memory or None) -> bytes that the stage writes
-    memory   (stage, run, its sources, settings by stage, device) -> bytes that the stage takes; None: not known, it has a share of its worker's
-    """
-
-    stages: tuple[Stage, ...]
-    presets: Path
-    child: str = "workflows.fleet.child"
+    stages: tuple[Stage, ...]  # in order
+    presets: Path  # the folder of its presets, TOML files
+    child: str = "workflows.fleet.child"  # the module that runs its stages in processes of their own; see `pipeline.executors.serving`
+    # (stage, run, its sources, settings by stage, bytes of memory or None) -> bytes that the stage writes
     space: Callable[[str, Path, Sequence[Path], Mapping[str, Any], int | None], int] = lambda *_: 0
+    # (stage, run, its sources, settings by stage, device) -> bytes that the stage takes; None: not known, it has a share of its worker's
     memory: Callable[[str, Path, Sequence[Path], Mapping[str, Any], str], int | None] = lambda *_: None

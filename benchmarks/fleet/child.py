@@ -1,7 +1,5 @@
 """Stages that sleep and write a few bytes, with checkpoints, and the process that runs them."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A fleet on Dask whose client, worker and scheduler are killed (SIGKILL) at random moments and started again, until it is done."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

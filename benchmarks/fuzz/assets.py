@@ -1,7 +1,5 @@
 """The asset's file, of every layout: what is read is described, rendered from inside, outside and far away, looked up at points, meshed and written again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Mutation of bytes: cut, flipped, copied, and numbers of every width set to their extremes."""
 
-from __future__ import annotations
-
 import struct
 from random import Random
 

@@ -1,7 +1,5 @@
 """Many inputs on many readers, in batches, and on after the input of which a worker died; what the workers report is added up."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """Readers of posed data sets: a small folder in each format, of which one file is the input."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """Pictures in the formats that cameras and programs write, and mutations that know their structure: EXIF blocks, chunks, TIFF directories."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Mutation of JSON: one or a few values replaced, anywhere in the document; the text itself changed at times."""
 
-from __future__ import annotations
-
 import json
 import re
 from random import Random

@@ -1,7 +1,5 @@
 """Mutation of text in lines and words: COLMAP's text files, logs."""
 
-from __future__ import annotations
-
 from random import Random
 
 from benchmarks.fuzz.binary import LARGEST, changed_bytes

@@ -1,7 +1,5 @@
 """Readers of mesh files that `inspect` describes, and of the pages of a run."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

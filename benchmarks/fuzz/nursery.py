@@ -1,7 +1,5 @@
 """A process that has imported everything, and forks a worker for each batch of inputs: importing takes longer than thousands of inputs."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Readers of photographs and masks."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

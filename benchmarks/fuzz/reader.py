@@ -5,8 +5,6 @@ Anything else is a finding: another exception, a message that is too long or can
 what is allowed, a process that dies.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Readers of what a user hands to a command beside the source: a configuration, settings on the command line, a camera path."""
 
-from __future__ import annotations
-
 import copy
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Readers of a run folder's files: what the engine, `status`, `verify`, `report`, `inspect` and `export` read."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

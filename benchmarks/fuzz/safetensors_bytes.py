@@ -1,7 +1,5 @@
 """Mutation of safetensors files: the header's JSON, its metadata, the tensors; digests in the metadata are put right."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from random import Random

@@ -1,7 +1,5 @@
 """Readers of scratch that a killed stage goes on from, and of the trained field."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

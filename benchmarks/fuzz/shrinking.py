@@ -1,7 +1,5 @@
 """Smaller inputs with the same finding."""
 
-from __future__ import annotations
-
 import copy
 import json
 import time

@@ -1,7 +1,5 @@
 """3D Gaussians that `inspect` describes: SPZ, SOG, and the PLY of 3DGS."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

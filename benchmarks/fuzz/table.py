@@ -1,7 +1,5 @@
 """Every reader by its name."""
 
-from __future__ import annotations
-
 from benchmarks.fuzz import assets, datasets, meshes, pictures, requests, runs, scratch, splats
 from benchmarks.fuzz.reader import Reader
 

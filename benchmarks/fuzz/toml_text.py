@@ -1,7 +1,5 @@
 """Mutation of TOML: values of settings, nesting, keys; the text at times."""
 
-from __future__ import annotations
-
 from random import Random
 
 from benchmarks.fuzz.binary import LARGEST, changed_bytes

@@ -1,7 +1,5 @@
 """Values that break readers: numbers beyond every type, text that is no text, wrong types, deep nesting."""
 
-from __future__ import annotations
-
 from random import Random
 from typing import Any
 

@@ -6,8 +6,6 @@ gives the same inputs. The input that is being tried is on
 disk before it is read, so that one that ends this process is known.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import json

@@ -10,8 +10,6 @@ Variants are the settings tried, so that a peer is tuned too: docs/experiments/p
 (--again). Then `python -m benchmarks.quality_over_minutes --minutes= ...` shows all rows together.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

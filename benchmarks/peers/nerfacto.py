@@ -5,8 +5,6 @@ nerfstudio's documentation gives for scenes made in Blender; the learning rate r
 nerfacto's configuration. Nothing is evaluated on the way, no viewer runs and no checkpoint is written. Setting up and reading images are not counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

@@ -6,8 +6,6 @@ Kinds: `benchmarks.scenes.catalogue`. FOLDER/KIND is a source for `enerf run`. T
 `enerf run FOLDER/window --as llff`; then every eighth image is a test view.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -8,8 +8,6 @@ has them where texture is: many on patterned walls, few on plain subjects, what 
 nothing near is found. The same arguments give the same files.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

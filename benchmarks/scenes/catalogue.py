@@ -8,8 +8,6 @@ thicket  a plant, a wire-frame ball, a fence and a word, with alpha: bounded
 garden   the same otherwise: for reports alone
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ distortion (SIMPLE_RADIAL, k1 -0.04), noise of 2 levels, exposures that differ b
 cameras, as `benchmarks/poses.py --truth` takes them. The same arguments give the same photographs.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 All values are linear light until `image` turns them into sRGB. R rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A room with patterned walls, as any lens sees it from inside: what a fisheye lens needs, whose picture holds half of all directions."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Shapes with closed-form ray intersections, and their materials. R rays; lengths in world units, z up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

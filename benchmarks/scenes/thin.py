@@ -1,7 +1,5 @@
 """Scenes of thin things: a plant, a wire-frame ball, a fence of bars, a word of bars. Two layouts, one for choosing constants and one for reports."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

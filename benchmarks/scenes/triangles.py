@@ -1,7 +1,5 @@
 """Triangle meshes of the shapes of a scene: the truth that surfaces are measured against."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

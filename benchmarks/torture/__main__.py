@@ -3,8 +3,6 @@
 python -m benchmarks.torture [--kills 30] [--jobs 1] [--sources photographs,blender,llff] [--json FILE]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

@@ -3,8 +3,6 @@
 Opening, renaming, making and removing are seen by an audit hook; writing and syncing by functions that take the place of Python's.
 """
 
-from __future__ import annotations
-
 import builtins
 import io
 import mmap

@@ -1,7 +1,5 @@
 """One failing operation: the run that meets it, what it leaves, and the next run."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

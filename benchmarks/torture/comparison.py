@@ -1,7 +1,5 @@
 """What a run has to have in the end: the artifacts of the undisturbed run, and nothing else."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -18,8 +18,6 @@ met where it occurs first; their later stages do the same as those of the Blende
 operation in every stage.
 """
 
-from __future__ import annotations
-
 import argparse
 import errno
 import itertools

@@ -10,8 +10,6 @@ time followed by the same command, until it is done; then its artifacts are comp
 Only SIGKILL counts as a kill; every fourth hit is another signal, of a stage that was killed before.
 """
 
-from __future__ import annotations
-
 import json
 import random
 import shutil

@@ -1,7 +1,5 @@
 """What comes before the first disturbance: sources, undisturbed runs, and a process that has everything imported."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -4,8 +4,6 @@ Most are forked from a process that has imported everything and loaded the compi
 command in a fresh process. Nothing here starts a thread: a fork of a process with threads may hang.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import importlib

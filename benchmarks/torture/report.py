@@ -1,7 +1,5 @@
 """The circumstances of a result: machine, versions, date."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

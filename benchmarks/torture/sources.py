@@ -1,7 +1,5 @@
 """The sources of the runs, as small as every stage can bear."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

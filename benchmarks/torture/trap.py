@@ -9,8 +9,6 @@ Without one, `audit` sees those of Python alone. Kinds of operations:
     rename, mkdir, unlink, rmdir
 """
 
-from __future__ import annotations
-
 import mmap
 import os
 import shutil

@@ -9,8 +9,6 @@
 B coarse cells, N voxels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -39,14 +37,10 @@ def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int,
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The greatest weight of each voxel in training pixels.
+    """The greatest weight of each voxel in training pixels."""
 
-    cells     (B,) int64 flat coarse cells (x slowest) that hold any sample, ascending
-    greatest  (B, brick^3) float32, each voxel's greatest weight
-    """
-
-    cells: np.ndarray
-    greatest: np.ndarray
+    cells: np.ndarray  # (B,) int64 flat coarse cells (x slowest) that hold any sample, ascending
+    greatest: np.ndarray  # (B, brick^3) float32, each voxel's greatest weight
 
 
 @torch.no_grad()

@@ -4,8 +4,6 @@ Where an asset has a foreground region that is its subject: paths have all of it
 part of the sphere that these cover, at their distance.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

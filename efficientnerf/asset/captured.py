@@ -1,7 +1,5 @@
 """The captured cameras as an asset keeps them (metadata `captured_path`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,17 +21,13 @@ class MetadataError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class CapturedPath:
-    """Some of the cameras of a capture, in the order of their files.
+    """Some of the cameras of a capture, in the order of their files."""
 
-    poses          (C, 4, 4) training frame
-    width, height  of the median photograph, pixels
-    focal          pixels
-    """
-
-    poses: np.ndarray
+    poses: np.ndarray  # (C, 4, 4) training frame
+    # width, height: of the median photograph, pixels
     width: float
     height: float
-    focal: float
+    focal: float  # pixels
 
     @property
     def centres(self) -> np.ndarray:

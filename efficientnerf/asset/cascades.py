@@ -9,8 +9,6 @@ Voxels of a cascade may be stored inside of the box before: values just outside 
 B bricks, N stored voxels of all cascades, R rays, L cascades.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

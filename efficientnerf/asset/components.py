@@ -1,7 +1,5 @@
 """Small connected components of a tree: parts that the box cuts off from the scene, and floaters. N voxels."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -1,9 +1,4 @@
-"""Smaller trees: fewer harmonics, larger voxels, or without voxels that cannot be seen.
-
-N voxels, K harmonics, M samples along each side of a new voxel.
-"""
-
-from __future__ import annotations
+"""Smaller trees: fewer harmonics, larger voxels, or without voxels that cannot be seen. N voxels, K harmonics, M samples along each side of a new voxel."""
 
 import math
 from dataclasses import replace

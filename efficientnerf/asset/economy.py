@@ -7,8 +7,6 @@ same tree gives the same codes.
 N voxels, K harmonics, P entries of a palette.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -34,18 +32,14 @@ COST_PRIOR = 8.0  # symbols of all contexts together that each context is begun 
 
 @dataclass(frozen=True, eq=False)
 class _Voxels:
-    """The values of a tree's voxels in the order of the file.
-
-    worth       (N,) float32: what a squared error of the colour counts
-    neighbours  (3 N,) int32 and first (S + 1,), see `packed.neighbours_of`
-    """
+    """The values of a tree's voxels in the order of the file."""
 
     density: np.ndarray
     opacity: np.ndarray
     sh: np.ndarray
-    worth: np.ndarray
-    neighbours: np.ndarray
-    first: np.ndarray
+    worth: np.ndarray  # (N,) float32: what a squared error of the colour counts
+    neighbours: np.ndarray  # (3 N,) int32, see `packed.neighbours_of`
+    first: np.ndarray  # (S + 1,), likewise
     side: Any
 
     def pieces(self) -> Any:
@@ -55,16 +49,12 @@ class _Voxels:
 
 @dataclass(frozen=True, eq=False)
 class Economy:
-    """A tree with the candidates for its codes at any rate: the nearest codes and the palettes that the passes begin with.
-
-    order     (N,) voxels in the order of the file
-    clusters  (codes (N,) uint8, palette (P, 3)) of each harmonic above the base
-    """
+    """A tree with the candidates for its codes at any rate: the nearest codes and the palettes that the passes begin with."""
 
     tree: NerfTree
-    order: np.ndarray
+    order: np.ndarray  # (N,) voxels in the order of the file
     voxels: _Voxels
-    clusters: list[tuple[np.ndarray, np.ndarray]]
+    clusters: list[tuple[np.ndarray, np.ndarray]]  # (codes (N,) uint8, palette (P, 3)) of each harmonic above the base
 
     def at(self, rate: float) -> NerfTree:
         """The tree with codes for `packed`.

@@ -4,8 +4,6 @@ beyond all grids, and which rays should be opaque. The field is rendered once; t
 P rays, M samples, C views, L cascades.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,31 +28,23 @@ Grid = tuple[tuple[int, int, int], float, np.ndarray]  # coarse cells along x, y
 
 @dataclass(frozen=True, eq=False)
 class FieldSamples:
-    """Fine samples of a field along training rays: those that weigh more than a threshold.
+    """Fine samples of a field along training rays: those that weigh more than a threshold."""
 
-    pixel, view  (P,) int64 and int32: which training pixel of which view
-    origin       (C, 3) float32 centres of the views
-    direction    (P, 3) float32 unit directions
-    opacity      (P,) float32 of all samples, those left out too
-    behind       (P, 3) float16 the field's colour beyond all samples
-    first        (P + 1,) int64: ray r owns samples first[r] to first[r + 1]
-    start, extent  (M,) float32 along the ray, world units
-    weight, thickness  (M,) float32: contribution to the ray's colour, and optical thickness
-    colour       (M, 3) uint8
-    """
-
+    # pixel, view: (P,) int64 and int32: which training pixel of which view
     pixel: np.ndarray
     view: np.ndarray
-    origin: np.ndarray
-    direction: np.ndarray
-    opacity: np.ndarray
-    behind: np.ndarray
-    first: np.ndarray
+    origin: np.ndarray  # (C, 3) float32 centres of the views
+    direction: np.ndarray  # (P, 3) float32 unit directions
+    opacity: np.ndarray  # (P,) float32 of all samples, those left out too
+    behind: np.ndarray  # (P, 3) float16 the field's colour beyond all samples
+    first: np.ndarray  # (P + 1,) int64: ray r owns samples first[r] to first[r + 1]
+    # start, extent: (M,) float32 along the ray, world units
     start: np.ndarray
     extent: np.ndarray
+    # weight, thickness: (M,) float32: contribution to the ray's colour, and optical thickness
     weight: np.ndarray
     thickness: np.ndarray
-    colour: np.ndarray
+    colour: np.ndarray  # (M, 3) uint8
 
     def points(self, samples: np.ndarray, ray: np.ndarray) -> np.ndarray:
         """World points (n, 3) in the middle of some samples, of which the rays are given."""
@@ -74,10 +64,7 @@ class FieldSamples:
 
 @torch.no_grad()
 def field_samples(m: Model, pixels: Pixels, count: int, threshold: float, done: Callable[[int, int], None]) -> FieldSamples:
-    """The samples of about `count` training pixels, evenly spread, that weigh more than `threshold`.
-
-    done  called with the number of pixels done and of all
-    """
+    """The samples of about `count` training pixels, evenly spread, that weigh more than `threshold`."""
     chosen = spread_pixels(pixels, count)
     rays: list[tuple[np.ndarray, ...]] = []
     samples: list[tuple[np.ndarray, ...]] = []

@@ -4,8 +4,6 @@ A safetensors container (`container.py`) of a few tensors (`layouts.py`) and one
 file states is checked against the file's size and against the other tensors before memory for it is allocated.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -175,10 +173,7 @@ def _held(header: Header) -> tuple[dict[str, tuple[int, ...]], dict[str, np.dtyp
 
 
 def load(path: str | Path) -> NerfTree:
-    """Read and verify an asset.
-
-    Raises FormatError, naming the file, what was found and what was expected.
-    """
+    """Read and verify an asset. Raises FormatError, naming the file, what was found and what was expected."""
     header = _open(path)
     name, meta = header.name, header.meta
     layout = LAYOUTS[layout_of(meta)]

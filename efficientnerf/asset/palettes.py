@@ -24,20 +24,14 @@ class PaletteHarmonics:
         coefficient[n, 0, c] = base_table[base[n, c], c]
         coefficient[n, k, c] = palette[codes[n, group_of[k - 1]], k - 1, c]     for k = 1 ... K - 1
 
-    base        (N, 3) uint8
-    base_table  (T, 3) float32, T at most 256
-    codes       (N, G) uint8, or uint16 where P exceeds 256
-    palette     (P, K - 1, 3) float32; with 256 entries and nine harmonics 24 KiB, which a core's nearest cache holds
-    groups      harmonics in each of the G groups; their sum is K - 1
-
     Every code is below T or P; readers of untrusted files check that.
     """
 
-    base: np.ndarray
-    base_table: np.ndarray
-    codes: np.ndarray
-    palette: np.ndarray
-    groups: tuple[int, ...]
+    base: np.ndarray  # (N, 3) uint8
+    base_table: np.ndarray  # (T, 3) float32, T at most 256
+    codes: np.ndarray  # (N, G) uint8, or uint16 where P exceeds 256
+    palette: np.ndarray  # (P, K - 1, 3) float32; with 256 entries and nine harmonics 24 KiB, which a core's nearest cache holds
+    groups: tuple[int, ...]  # harmonics in each of the G groups; their sum is K - 1
 
     def __len__(self) -> int:
         return len(self.base)

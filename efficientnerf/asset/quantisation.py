@@ -7,8 +7,6 @@ Vectors few enough for an entry each keep their values, apart from the palette's
 N voxels, K harmonics, G groups, P entries.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

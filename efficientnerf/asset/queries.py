@@ -1,9 +1,4 @@
-"""Density, normal and colour of a NerfTree at points, of the cascade that each belongs to.
-
-N points.
-"""
-
-from __future__ import annotations
+"""Density, normal and colour of a NerfTree at points, of the cascade that each belongs to. N points."""
 
 import numpy as np
 
@@ -23,10 +18,7 @@ def normal_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
 
 
 def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
-    """sRGB colour at points (N, 3), seen along unit directions (N, 3), or its view-independent part: (N, 3) float32, 0 to 1.
-
-    Grey where no voxel is stored.
-    """
+    """sRGB colour at points (N, 3), seen along unit directions (N, 3), or its view-independent part: (N, 3) float32, 0 to 1. Grey where no voxel is stored."""
     return queries.colour_at(tree, tree.frame.points(np.asarray(points, np.float64)), directions)
 
 

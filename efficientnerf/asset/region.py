@@ -5,8 +5,6 @@
 B bricks, N stored voxels.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

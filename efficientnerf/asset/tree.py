@@ -32,18 +32,12 @@ STEP_SIZE, MIN_STEP, MAX_STEP = 0.5, 0.25, 1.0  # voxels: where nothing else is 
 
 @dataclass(frozen=True, eq=False)
 class Cascade:
-    """A grid of a tree, in the tree's frame.
+    """A grid of a tree, in the tree's frame."""
 
-    shape        coarse cells along x, y, z
-    voxel        side of a voxel
-    bounds_min   (3,) float64 corner
-    brick_index  shape int32: rows of the tree's `voxel_index`, -1 where a cell is empty
-    """
-
-    shape: tuple[int, int, int]
-    voxel: float
-    bounds_min: np.ndarray
-    brick_index: np.ndarray
+    shape: tuple[int, int, int]  # coarse cells along x, y, z
+    voxel: float  # side of a voxel
+    bounds_min: np.ndarray  # (3,) float64 corner
+    brick_index: np.ndarray  # shape int32: rows of the tree's `voxel_index`, -1 where a cell is empty
 
     def bounds(self, brick: int) -> np.ndarray:
         """(2, 3) corners, for so many voxels along a coarse cell."""
@@ -52,18 +46,12 @@ class Cascade:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The foreground region, in the tree's frame, z up.
+    """The foreground region, in the tree's frame, z up."""
 
-    bounds         (2, 3) least and greatest corner
-    corner_radius  of the four vertical edges: 0 is a box, half of the shorter side a disc in plan
-    fade           width of the band inside of its sides in which opacity fades to nothing
-    bricks         (B,) bool, the bricks that belong to it; None: all
-    """
-
-    bounds: np.ndarray
-    corner_radius: float = 0.0
-    fade: float = 0.0
-    bricks: np.ndarray | None = None
+    bounds: np.ndarray  # (2, 3) least and greatest corner
+    corner_radius: float = 0.0  # of the four vertical edges: 0 is a box, half of the shorter side a disc in plan
+    fade: float = 0.0  # width of the band inside of its sides in which opacity fades to nothing
+    bricks: np.ndarray | None = None  # (B,) bool, the bricks that belong to it; None: all
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,9 @@
     triton  float32 on CUDA, where its kernels can be built
 
 An operation that has no kernel in the backend of its tensors is done by torch. Rays of trees are chosen by the tree's device; their torch reference,
-of colour and opacity alone, is `efficientnerf.asset.rendering.render_reference`. A new operation is a function of the same name in a module of each
+of colour and opacity alone, is `tests.efficientnerf.tree_reference`. A new operation is a function of the same name in a module of each
 backend, a line of OPERATIONS, a function here, and a case in tests/efficientnerf/backends/test_operations.py.
 """
-
-from __future__ import annotations
 
 import functools
 import importlib

@@ -17,8 +17,6 @@ The first of these that can be written by the user alone is taken:
 numba unpickles what it finds, so a folder that others could write to is never used.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

@@ -3,8 +3,6 @@
 A field that says Any is an array on the CPU, a tensor on a device.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 EARLY_STOP = 1e-3  # transmittance at which a ray may end
@@ -36,19 +34,13 @@ class RayTargets(NamedTuple):
     """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
 
         sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
-
-    colour          (R, 3) of the photograph, less the colour of what lies in front of the box
-    background      (R, 3) colour of what lies behind the box
-    transmittance   (R,)   of what lies in front of the box
-    opacity         (R,)   of the photograph
-    opacity_weight  of the opacity's error
     """
 
-    colour: Any
-    background: Any
-    transmittance: Any
-    opacity: Any
-    opacity_weight: float
+    colour: Any  # (R, 3) of the photograph, less the colour of what lies in front of the box
+    background: Any  # (R, 3) colour of what lies behind the box
+    transmittance: Any  # (R,)   of what lies in front of the box
+    opacity: Any  # (R,)   of the photograph
+    opacity_weight: float  # of the opacity's error
 
 
 class Moments(NamedTuple):
@@ -61,19 +53,11 @@ class Moments(NamedTuple):
 
 
 class Hyperparameters(NamedTuple):
-    """Of a step.
+    """Of a step."""
 
-    density_rate     learning rate of the logarithm of the optical thickness
-    sh_rate          learning rate of the harmonics
-    view_share       of that for harmonics of degree 1 and above
-    decay            of the running mean of the squared gradient
-    epsilon          added to its root
-    total_variation  weight of this term of `efficientnerf.backends.numba.tree_training.steps`
-    """
-
-    density_rate: float
-    sh_rate: float
-    view_share: float
-    decay: float = 0.99
-    epsilon: float = 1e-10
-    total_variation: float = 0.0
+    density_rate: float  # learning rate of the logarithm of the optical thickness
+    sh_rate: float  # learning rate of the harmonics
+    view_share: float  # of that for harmonics of degree 1 and above
+    decay: float = 0.99  # of the running mean of the squared gradient
+    epsilon: float = 1e-10  # added to its root
+    total_variation: float = 0.0  # weight of this term of `efficientnerf.backends.numba.tree_training.steps`

@@ -1,7 +1,5 @@
 """Long work in pieces, so that Python answers to signals between kernel calls."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 

@@ -3,8 +3,6 @@
 Imports are read from the syntax trees, those within functions too. Names that are computed (`importlib.import_module`) are not found: no kernel has any.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Copies between the host and a device that do not make the host wait."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

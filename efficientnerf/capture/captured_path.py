@@ -6,8 +6,6 @@ Centres and rotations are smoothed a little, thinned, and joined by a centripeta
 C cameras, K key poses of the spline, F frames. Speed and distances count turning as well as moving: see `_rows`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

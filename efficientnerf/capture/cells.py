@@ -1,9 +1,4 @@
-"""Cells of a coarse grid in which the rays of photographs end, with statistics of each.
-
-P points, M cells.
-"""
-
-from __future__ import annotations
+"""Cells of a coarse grid in which the rays of photographs end, with statistics of each. P points, M cells."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,30 +19,18 @@ INNER = 0.9  # of half the image: not at its border
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of the grid in which rays end.
+    """Cells of the grid in which rays end."""
 
-    side      of a cell
-    centres   (M, 3) mean of the points in each
-    agree     (M,) views whose rays end there
-    against   (M,) views that see through it
-    in_view   (M,) views that have it in view, hidden or not
-    distance  (M,) mean distance of the views that agree
-    nearest   (M,) least distance from a camera
-    central   (M,) weight of the central rays that end there
-    middling  (M,) how near the middle of the pictures it is, from 0 to 1: the mean over the views that agree
-    inner     (M,) views that agree and show it off their border
-    """
-
-    side: float
-    centres: np.ndarray
-    agree: np.ndarray
-    against: np.ndarray
-    in_view: np.ndarray
-    distance: np.ndarray
-    nearest: np.ndarray
-    central: np.ndarray
-    middling: np.ndarray
-    inner: np.ndarray
+    side: float  # of a cell
+    centres: np.ndarray  # (M, 3) mean of the points in each
+    agree: np.ndarray  # (M,) views whose rays end there
+    against: np.ndarray  # (M,) views that see through it
+    in_view: np.ndarray  # (M,) views that have it in view, hidden or not
+    distance: np.ndarray  # (M,) mean distance of the views that agree
+    nearest: np.ndarray  # (M,) least distance from a camera
+    central: np.ndarray  # (M,) weight of the central rays that end there
+    middling: np.ndarray  # (M,) how near the middle of the pictures it is, from 0 to 1: the mean over the views that agree
+    inner: np.ndarray  # (M,) views that agree and show it off their border
 
     @property
     def trusted(self) -> np.ndarray:

@@ -2,8 +2,6 @@
 docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 BLOCK = 8  # px, side of JPEG's blocks

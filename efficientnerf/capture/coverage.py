@@ -1,7 +1,5 @@
 """How a capture's cameras stand: where their axes meet, and the part of the sphere round a subject that they cover."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,20 +13,13 @@ WIDEST_GAP, GAP_STEPS = 75.0, 2.5  # degrees between neighbouring cameras, or so
 
 @dataclass(frozen=True)
 class Coverage:
-    """How a capture's cameras stand round a point; angles in degrees.
+    """How a capture's cameras stand round a point; angles in degrees."""
 
-    distance   median, world units
-    elevation  median angle above the horizon
-    heights    half of the range of elevations, without the tenth at each end
-    heading    azimuth of the middle of the cameras, anticlockwise from +x
-    arc        range of azimuths that they cover, without the twentieth at each end; 360 where they go round
-    """
-
-    distance: float
-    elevation: float
-    heights: float
-    heading: float
-    arc: float
+    distance: float  # median, world units
+    elevation: float  # median angle above the horizon
+    heights: float  # half of the range of elevations, without the tenth at each end
+    heading: float  # azimuth of the middle of the cameras, anticlockwise from +x
+    arc: float  # range of azimuths that they cover, without the twentieth at each end; 360 where they go round
 
 
 def coverage(centres: np.ndarray, target: np.ndarray) -> Coverage:

@@ -8,8 +8,6 @@ planes are clipped around it. Without such a subject (a street, a facade) the re
 P points, M cells, C cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,17 +37,12 @@ MIN_MIDDLING, MAX_BESIDE = 0.1, 1.8  # about a third of the way from the middle 
 
 @dataclass(frozen=True, eq=False)
 class Foreground:
-    """The foreground region and what it was made of.
-
-    side     of the cells
-    subject  (N, 3) centres of the cells of a subject, its feet on its supports included; none where the region is all that is well observed
-    planes   that support the subject: unit normals towards the cameras, and offsets
-    """
+    """The foreground region and what it was made of."""
 
     region: Region
-    side: float
-    subject: np.ndarray
-    planes: tuple[Plane, ...] = ()
+    side: float  # of the cells
+    subject: np.ndarray  # (N, 3) centres of the cells of a subject, its feet on its supports included; none where the region is all that is well observed
+    planes: tuple[Plane, ...] = ()  # that support the subject: unit normals towards the cameras, and offsets
 
 
 NO_POINTS = np.zeros((0, 3))

@@ -5,8 +5,6 @@ in front of all content. Its intrinsics are a scale alone, chosen so that equal 
 with n the near plane and B the extent of the camera centres, so that cubic voxels fit. The constants are ratios of measured lengths.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,22 +25,14 @@ FAR_PLANE_RATIO = 1.2  # far plane over the depth of the farthest content; what 
 
 @dataclass(frozen=True, eq=False)
 class ForwardFacing:
-    """A forward-facing scene in the training frame.
+    """A forward-facing scene in the training frame."""
 
-    ndc       the reference camera
-    bounds    (2, 3) of all rays of the cameras in NDC
-    far       depth from the reference camera beyond which nothing is exported, world units
-    radii     (3,) ninth deciles of the cameras' distances from the reference camera along its axes, world units
-    focus     depth of the point that a spiral's cameras look at, world units
-    tangents  (2,) of half the horizontal and vertical field of view that all images share
-    """
-
-    ndc: Ndc
-    bounds: np.ndarray
-    far: float
-    radii: tuple[float, float, float]
-    focus: float
-    tangents: tuple[float, float]
+    ndc: Ndc  # the reference camera
+    bounds: np.ndarray  # (2, 3) of all rays of the cameras in NDC
+    far: float  # depth from the reference camera beyond which nothing is exported, world units
+    radii: tuple[float, float, float]  # (3,) ninth deciles of the cameras' distances from the reference camera along its axes, world units
+    focus: float  # depth of the point that a spiral's cameras look at, world units
+    tangents: tuple[float, float]  # (2,) of half the horizontal and vertical field of view that all images share
 
 
 def detect_forward_facing(cameras: Sequence[Camera], depths: np.ndarray) -> ForwardFacing | str:

@@ -1,7 +1,5 @@
 """Which frames of a video are chosen: the sharpest of windows of equal motion, no two alike, none that is blurred. docs/experiments/video.md"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

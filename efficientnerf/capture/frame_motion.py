@@ -1,7 +1,5 @@
 """How sharp a frame is, and how far the picture has moved since the first; frames are chosen by both. docs/experiments/video.md"""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -4,8 +4,6 @@ The screen's colour is followed across the photograph by a polynomial, for no la
 pixel is object. Shadows on a coloured screen change its lightness more than its hue, so lightness counts little there. (h, w) of a photograph.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -22,18 +20,12 @@ ROUNDS, FITTED = 4, 20_000  # of the fit; pixels of it
 
 @dataclass(frozen=True)
 class Key:
-    """A colour to key by.
+    """A colour to key by."""
 
-    lightness   weight of differences in lightness
-    from_border the screen is what the border touches: white parts of an object are no screen
-    colour      (L, a, b), or None: `chroma` decides
-    chroma      "green": any screen green as lamps and cloth make it; "white": any bright grey
-    """
-
-    lightness: float
-    from_border: bool = False
-    colour: tuple[float, float, float] | None = None
-    chroma: str = ""
+    lightness: float  # weight of differences in lightness
+    from_border: bool = False  # the screen is what the border touches: white parts of an object are no screen
+    colour: tuple[float, float, float] | None = None  # (L, a, b), or None: `chroma` decides
+    chroma: str = ""  # "green": any screen green as lamps and cloth make it; "white": any bright grey
 
 
 def key_of(name: str) -> Key:

@@ -4,8 +4,6 @@ Letters: V views, M markers, s the length of an edge, u = log s. A marker is a p
 corners: offsets from the rays, in pixels of the middle of each picture, as in bundle adjustment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,18 +23,12 @@ ROUNDS = 30
 
 @dataclass(frozen=True, eq=False)
 class SquareFit:
-    """A marker in the cameras' world.
+    """A marker in the cameras' world."""
 
-    square   takes SQUARE to its corners; its scale is the length of an edge
-    spread   standard deviation of the logarithm of that length
-    agrees   (V,) the views that agree
-    shift    standard deviation of its place that the cameras cause, by how far they miss it; they shift other markers, too
-    """
-
-    square: Similarity
-    spread: float
-    agrees: np.ndarray
-    shift: float = 0.0
+    square: Similarity  # takes SQUARE to its corners; its scale is the length of an edge
+    spread: float  # standard deviation of the logarithm of that length
+    agrees: np.ndarray  # (V,) the views that agree
+    shift: float = 0.0  # standard deviation of its place that the cameras cause, by how far they miss it; they shift other markers, too
 
     @property
     def still(self) -> bool:

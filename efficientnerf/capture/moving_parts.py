@@ -8,8 +8,6 @@ move: a carpet or knitted cloth, whose pattern is matched with itself a stitch a
 Two kinds are not seen: parts that are gone in other photographs have no matches, and motion along epipolar lines alone contradicts nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 import cv2

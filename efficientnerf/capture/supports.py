@@ -6,8 +6,6 @@ rays pass between and past them, and the head lies next to the plane of the ches
 M cells, R rays, C cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,15 +35,12 @@ Plane = tuple[np.ndarray, float]
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of photographs and where they end.
+    """Rays of photographs and where they end."""
 
-    origins, directions  (R, 3), directions of unit length
-    ends                 (R,) distance at which each ends; infinite where it ends nowhere
-    """
-
+    # origins, directions: (R, 3), directions of unit length
     origins: np.ndarray
     directions: np.ndarray
-    ends: np.ndarray
+    ends: np.ndarray  # (R,) distance at which each ends; infinite where it ends nowhere
 
 
 def rays_that_end(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> Rays:

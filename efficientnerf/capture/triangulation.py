@@ -3,8 +3,6 @@
 Letters: V views, N points. Offsets from rays are in pixels of the middle of each picture, as in bundle adjustment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,18 +16,12 @@ ROUNDS = 20
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A point of the cameras' world.
+    """A point of the cameras' world."""
 
-    position    (3,)
-    covariance  (3, 3) of it
-    views       photographs that it was triangulated from; 0: it was given
-    miss        root mean square distance from its rays, px
-    """
-
-    position: np.ndarray
-    covariance: np.ndarray
-    views: int = 0
-    miss: float = 0.0
+    position: np.ndarray  # (3,)
+    covariance: np.ndarray  # (3, 3) of it
+    views: int = 0  # photographs that it was triangulated from; 0: it was given
+    miss: float = 0.0  # root mean square distance from its rays, px
 
     @property
     def spread(self) -> float:

@@ -8,8 +8,6 @@ are torchvision's and the heads LPIPS 0.1's; both come as files (`stages.evaluat
 here, so that torchvision itself, which does not work with every build of torch, is not needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 

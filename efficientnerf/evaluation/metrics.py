@@ -3,8 +3,6 @@
 Images are floating point, sRGB, 0 to 1, not rounded to 8 bits; callers clip values outside 0 to 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor

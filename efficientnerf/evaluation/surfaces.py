@@ -7,8 +7,6 @@ network absorbs less than half.
 R rays.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

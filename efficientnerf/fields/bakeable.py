@@ -1,7 +1,5 @@
 """The base of fields whose values depend on the position alone, so that they can be baked."""
 
-from __future__ import annotations
-
 from torch import Tensor, nn
 
 from efficientnerf.fields.gradient_buffer import GradientBuffer

@@ -5,8 +5,6 @@ hash  multiresolution hash grid        mlp  the paper's networks        nerf  th
 `train.field` names the module, whose coarse_and_fine(settings, generator) makes both fields of a model, untrained.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, Protocol
 

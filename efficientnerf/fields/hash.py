@@ -4,8 +4,6 @@ L levels of lattices between `coarsest` and `finest` points a side, two features
 fits is dense, one that does not is hashed); then a small ReLU network. The outputs do not see the direction, so the field bakes.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

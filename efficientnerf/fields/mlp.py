@@ -4,8 +4,6 @@ With 10 frequencies, 63 numbers in, and degree 3, 49 out, the standard network (
 lightweight one (4 of 128) has 72,113 and serves the coarse stage (EfficientNeRF, section 3.2).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@ The trunk is that of `efficientnerf.fields.mlp`. From it come the density and a 
 frequencies, 27 numbers) goes through one layer of half the width to the colour. With 8 layers of 256: 595,844 parameters.
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch

@@ -30,16 +30,13 @@ BEYOND = 3.0  # z' from which a ray that never enters the box starts, leaving it
 
 
 class NdcRays(NamedTuple):
-    """Rays in normalised device coordinates, and the way back to distances of the world.
+    """Rays in normalised device coordinates, and the way back to distances of the world."""
 
-    origins, directions  (R, 3) where the rays begin, and unit directions
-    begin                (R,) world distance along the ray at which it begins (t0)
-    ds_dt, dlogz_dt      (R,) g and k of the module
-    """
-
+    # origins, directions: (R, 3) where the rays begin, and unit directions
     origins: Any
     directions: Any
-    begin: Any
+    begin: Any  # (R,) world distance along the ray at which it begins (t0)
+    # ds_dt, dlogz_dt: (R,) g and k of the module
     ds_dt: Any
     dlogz_dt: Any
 
@@ -59,19 +56,14 @@ def ndc_distance(distance: Any, begin: Any, ds_dt: Any, dlogz_dt: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Ndc:
-    """The reference camera.
+    """The reference camera."""
 
-    world_from_camera  (4, 4) its pose, the project's axes
-    focal              pixels
-    width, height      pixels; x' and y' are -1 and 1 at the borders of an image of this size
-    near               distance of the near plane from the camera, world units
-    """
-
-    world_from_camera: np.ndarray
-    focal: float
+    world_from_camera: np.ndarray  # (4, 4) its pose, the project's axes
+    focal: float  # pixels
+    # width, height: pixels; x' and y' are -1 and 1 at the borders of an image of this size
     width: float
     height: float
-    near: float
+    near: float  # distance of the near plane from the camera, world units
 
     @cached_property
     def slopes(self) -> tuple[float, float]:

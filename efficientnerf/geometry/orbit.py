@@ -1,7 +1,5 @@
 """The orbit of a capture's cameras, as scenes and assets keep it, and up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -17,20 +15,13 @@ Vector = tuple[Number, Number, Number]
 
 @dataclass(frozen=True)
 class Orbit:
-    """The orbit of the capture's cameras round the subject, for turntables; in the training frame.
+    """The orbit of the capture's cameras round the subject, for turntables; in the training frame."""
 
-    centre          point that the cameras look at
-    radius          median distance of the cameras from it, world units
-    elevation       median angle above the horizon, degrees
-    forward_facing  whether the cameras are on one side of the subject
-    heading         azimuth of the mean camera seen from the centre, degrees, anticlockwise from +x
-    """
-
-    centre: Vector
-    radius: Number
-    elevation: Number
-    forward_facing: bool
-    heading: Number
+    centre: Vector  # point that the cameras look at
+    radius: Number  # median distance of the cameras from it, world units
+    elevation: Number  # median angle above the horizon, degrees
+    forward_facing: bool  # whether the cameras are on one side of the subject
+    heading: Number  # azimuth of the mean camera seen from the centre, degrees, anticlockwise from +x
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:

@@ -33,17 +33,14 @@ FARTHEST = 1.0 / 64  # 1 / |u|_inf at which a ray in contracted space ends
 
 
 class RayBundle(NamedTuple):
-    """Rays in a space's frame.
+    """Rays in a space's frame."""
 
-    origins, directions, near, far  (R, 3), (R, 3) unit, (R,), (R,) in units of the frame
-    warp                            begin, ds_dt, dlogz_dt of `efficientnerf.geometry.ndc`, (R,) each; None where the frame is the world
-    """
-
+    # origins, directions, near, far: (R, 3), (R, 3) unit, (R,), (R,) in units of the frame
     origins: Tensor
     directions: Tensor
     near: Tensor
     far: Tensor
-    warp: tuple[Tensor, Tensor, Tensor] | None
+    warp: tuple[Tensor, Tensor, Tensor] | None  # begin, ds_dt, dlogz_dt of `efficientnerf.geometry.ndc`, (R,) each; None where the frame is the world
 
     def last(self, count: int) -> RayBundle:
         """The last of the rays."""
@@ -96,19 +93,13 @@ class BoundedSpace(Box):
 
     Defaults, of settings left to be chosen: num_coarse_samples (N_c), occupancy_resolution, occupancy_alpha_threshold, distortion_loss_weight;
     voxel_depth, depth over width of a baked voxel.
-
-    contracted              whether space beyond the box is contracted into a shell
-    unbounded               whether the space has no end, so that densities spread along rays and the distortion loss is needed
-    reaches_infinity        whether the box itself reaches to infinity, so that nothing can lie behind it
-    scales_near_gradients   whether rays crowd together before the cameras, so that gradients there are scaled by the distance
-    reach                   the largest contracted coordinate
     """
 
-    contracted: ClassVar[bool] = False
-    unbounded: ClassVar[bool] = False
-    reaches_infinity: ClassVar[bool] = False
-    scales_near_gradients: ClassVar[bool] = False
-    reach: ClassVar[float] = 1.0
+    contracted: ClassVar[bool] = False  # whether space beyond the box is contracted into a shell
+    unbounded: ClassVar[bool] = False  # whether the space has no end, so that densities spread along rays and the distortion loss is needed
+    reaches_infinity: ClassVar[bool] = False  # whether the box itself reaches to infinity, so that nothing can lie behind it
+    scales_near_gradients: ClassVar[bool] = False  # whether rays crowd together before the cameras, so that gradients there are scaled by the distance
+    reach: ClassVar[float] = 1.0  # the largest contracted coordinate
     num_coarse_samples: ClassVar[int] = 128
     occupancy_resolution: ClassVar[int] = 128
     occupancy_alpha_threshold: ClassVar[float] = 0.01

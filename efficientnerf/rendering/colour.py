@@ -1,7 +1,5 @@
 """sRGB and linear light (IEC 61966-2-1), and premultiplication: images are sRGB unless their name says linear."""
 
-from __future__ import annotations
-
 import numpy as np
 
 _LARGEST_EXPONENT = {4: 88.0, 8: 709.0}  # of exp, by the bytes of a number

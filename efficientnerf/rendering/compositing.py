@@ -4,8 +4,6 @@ Samples of all rays lie end to end, those of one ray together and in order of di
 R rays, N samples, K harmonics.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -8,8 +8,6 @@ Texels have their centres at halves; values between them are interpolated linear
 H, W rows and columns, R rays.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter

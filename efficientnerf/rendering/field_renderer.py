@@ -1,7 +1,4 @@
-"""Images of trained fields: cameras to rays to pixels.
-
-R rays, H, W height and width of an image.
-"""
+"""Images of trained fields: cameras to rays to pixels. R rays, H, W height and width of an image."""
 
 from __future__ import annotations
 
@@ -48,28 +45,17 @@ class SampleCounts:
 
 @dataclass(frozen=True)
 class FieldRendering:
-    """The image that a camera takes of a field, split by where the density lies: before, in or behind the box.
+    """The image that a camera takes of a field, split by where the density lies: before, in or behind the box."""
 
-    colour          (H, W, 3) sRGB with all that lies behind
-    opacity         (H, W) of all samples
-    depth           (H, W) along the view axis, world units; infinity where the opacity stays below one half
-    before          (H, W, 4) premultiplied colour and opacity of what lies between the camera and the box
-    behind          (H, W, 3) colour of what lies beyond the box, as if the box were empty
-    inside_opacity  (H, W) of what lies in the box, of the light that reaches it
-    counts          of the samples that it took
-    within          (H, W) opacity of all that lies before the ray leaves the box `reach` of the render; 0 where it misses that
-    nearer          (H, W) opacity of what lies nearer than the limits that the render was given; None without
-    """
-
-    colour: np.ndarray
-    opacity: np.ndarray
-    depth: np.ndarray
-    before: np.ndarray
-    behind: np.ndarray
-    inside_opacity: np.ndarray
-    counts: SampleCounts
-    within: np.ndarray
-    nearer: np.ndarray | None = None
+    colour: np.ndarray  # (H, W, 3) sRGB with all that lies behind
+    opacity: np.ndarray  # (H, W) of all samples
+    depth: np.ndarray  # (H, W) along the view axis, world units; infinity where the opacity stays below one half
+    before: np.ndarray  # (H, W, 4) premultiplied colour and opacity of what lies between the camera and the box
+    behind: np.ndarray  # (H, W, 3) colour of what lies beyond the box, as if the box were empty
+    inside_opacity: np.ndarray  # (H, W) of what lies in the box, of the light that reaches it
+    counts: SampleCounts  # of the samples that it took
+    within: np.ndarray  # (H, W) opacity of all that lies before the ray leaves the box `reach` of the render; 0 where it misses that
+    nearer: np.ndarray | None = None  # (H, W) opacity of what lies nearer than the limits that the render was given; None without
 
 
 def valid_count(m: Model, outputs: RayOutputs) -> int:

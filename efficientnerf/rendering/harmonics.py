@@ -5,8 +5,6 @@ With them the basis is orthonormal over the unit sphere. Colour = sigmoid(sum_k 
 K harmonics = (degree + 1)^2.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Importance samples: drawn in proportion to the weights of coarse samples (NeRF, section 5.2). R rays, F samples drawn on each, N coarse samples."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -13,8 +13,6 @@ while nothing is pruned. docs/experiments/occupancy.md
 D voxels a side, N samples.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

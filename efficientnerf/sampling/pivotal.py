@@ -1,7 +1,5 @@
 """Pivots and the fine samples in their intervals (EfficientNeRF, section 3.4), in plain torch. R rays, N samples."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -12,32 +12,21 @@ has more samples than fit its last rays lose theirs (`Samples.complete`).
 R rays, N samples.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from torch import Tensor
 
 
 class Samples(NamedTuple):
-    """Packed samples of a bundle of rays.
+    """Packed samples of a bundle of rays."""
 
-    first   (R + 1,) int64 offsets: ray r owns samples first[r] to first[r + 1]
-    start   (N,) where the sample's interval begins, distance along the ray
-    extent  (N,) its length, world units
-    length  (N,) its length in the field's units: the world's in the box, contracted beyond
-    point   (N, 3) grid coordinates of the sample
-    tried   how many samples there would have been without the density voxels
-    complete  (R,) bool, rays all of whose samples fit; None: all rays
-    """
-
-    first: Tensor
-    start: Tensor
-    extent: Tensor
-    length: Tensor
-    point: Tensor
-    tried: int
-    complete: Tensor | None = None
+    first: Tensor  # (R + 1,) int64 offsets: ray r owns samples first[r] to first[r + 1]
+    start: Tensor  # (N,) where the sample's interval begins, distance along the ray
+    extent: Tensor  # (N,) its length, world units
+    length: Tensor  # (N,) its length in the field's units: the world's in the box, contracted beyond
+    point: Tensor  # (N, 3) grid coordinates of the sample
+    tried: int  # how many samples there would have been without the density voxels
+    complete: Tensor | None = None  # (R,) bool, rays all of whose samples fit; None: all rays
 
 
 class SampleCapacity(NamedTuple):

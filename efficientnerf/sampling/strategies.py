@@ -8,8 +8,6 @@
 R rays, N coarse samples.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
@@ -29,22 +27,14 @@ from efficientnerf.sampling.stratified import stratified_samples
 
 
 class SamplingRequest(NamedTuple):
-    """A bundle of rays to be sampled.
+    """A bundle of rays to be sampled."""
 
-    rays               in the frame of the space
-    offset             (R,) in [0, 1): where in its interval a sample lies
-    samples_per_pivot  N_s
-    prune              whether the density voxels are used (not in the warm-up)
-    rng                in training: for jitter, exploration and rays that are not pruned; None: nothing is random
-    capacity           on CUDA: samples are padded to this many, and their number is not waited for; None: no padding
-    """
-
-    rays: RayBundle
-    offset: Tensor
-    samples_per_pivot: int
-    prune: bool = True
-    rng: np.random.Generator | None = None
-    capacity: SampleCapacity | None = None
+    rays: RayBundle  # in the frame of the space
+    offset: Tensor  # (R,) in [0, 1): where in its interval a sample lies
+    samples_per_pivot: int  # N_s
+    prune: bool = True  # whether the density voxels are used (not in the warm-up)
+    rng: np.random.Generator | None = None  # in training: for jitter, exploration and rays that are not pruned; None: nothing is random
+    capacity: SampleCapacity | None = None  # on CUDA: samples are padded to this many, and their number is not waited for; None: no padding
 
 
 class CoarseStage(NamedTuple):
@@ -71,22 +61,15 @@ class Strategy(Protocol):
 
 @dataclass(frozen=True)
 class Intervals:
-    """How rays are cut into coarse intervals.
-
-    step           length of an interval in the box, units of the frame
-    max_intervals  intervals on a ray at most
-    count          N_c
-    within_planes  whether they run from near to far plane instead of through the box
-    keep_outside   whether samples outside of the space are kept: a network can be evaluated there, a hash grid cannot
-    """
+    """How rays are cut into coarse intervals."""
 
     space: Space
     voxels: DensityVoxels
-    step: float
-    max_intervals: int
-    count: int
-    within_planes: bool
-    keep_outside: bool
+    step: float  # length of an interval in the box, units of the frame
+    max_intervals: int  # intervals on a ray at most
+    count: int  # N_c
+    within_planes: bool  # whether they run from near to far plane instead of through the box
+    keep_outside: bool  # whether samples outside of the space are kept: a network can be evaluated there, a hash grid cannot
 
     def valid(self, request: SamplingRequest, unpruned_fraction: float) -> Samples:
         """Coarse samples in valid voxels; in training, all samples of a fraction of the rays: the first ones, which are as random as any."""
@@ -114,19 +97,16 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Efficient:
-    """Valid, then pivotal samples (EfficientNeRF, sections 3.3 and 3.4).
-
-    exploration_fraction  in training: of the valid intervals without a pivot, these get fine samples too. Otherwise the fine field would be free to place
-                          density where this ray has no pivot and another has one, and the baked asset, which has no coarse field, would show it.
-    unpruned_fraction     in training: of the rays, these are sampled in invalid voxels too
-    """
+    """Valid, then pivotal samples (EfficientNeRF, sections 3.3 and 3.4)."""
 
     prunes: ClassVar[bool] = True
     intervals: Intervals
     pivotal_threshold: float
     max_pivots: int
+    # in training: of the valid intervals without a pivot, these get fine samples too. Otherwise the fine field would be free to place density where this ray
+    # has no pivot and another has one, and the baked asset, which has no coarse field, would show it.
     exploration_fraction: float
-    unpruned_fraction: float
+    unpruned_fraction: float  # in training: of the rays, these are sampled in invalid voxels too
 
     def coarse(self, request: SamplingRequest) -> CoarseStage:
         return CoarseStage(self.intervals.valid(request, self.unpruned_fraction))

@@ -1,7 +1,5 @@
 """Stratified samples: one in each of equal intervals (Mildenhall et al. 2020, "NeRF", equation 2). R rays, S samples a ray, N samples."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

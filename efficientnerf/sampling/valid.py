@@ -1,7 +1,5 @@
 """Valid samples: coarse samples where the density voxels are above their threshold (EfficientNeRF, section 3.3), in plain torch. R rays, N samples."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

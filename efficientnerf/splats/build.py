@@ -1,7 +1,5 @@
 """From a tree and pictures to 3D Gaussians: its voxels merged, then fitted to the pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -19,16 +17,12 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Budget:
-    """count   Gaussians at most
-    degree  of their harmonics, 0 to 3; at most the asset's
-    steps   of the refit, each of a picture or of rows of a large one; 0: the voxels merged, as they are
-    seed    of the order of the pictures
-    """
+    """Size of what is made, and the work of its refit."""
 
-    count: int = 200_000
-    degree: int = 2
-    steps: int = 300
-    seed: int = 0
+    count: int = 200_000  # Gaussians at most
+    degree: int = 2  # of their harmonics, 0 to 3; at most the asset's
+    steps: int = 300  # of the refit, each of a picture or of rows of a large one; 0: the voxels merged, as they are
+    seed: int = 0  # of the order of the pictures
 
     def __post_init__(self) -> None:
         if self.count < 1 or self.steps < 0 or not 0 <= self.degree <= MAX_DEGREE:
@@ -43,7 +37,6 @@ def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, pr
     """Gaussians that show what the tree shows.
 
     views     what they are fitted to, and whose cameras say which voxels show
-    progress  called with the work done, the total, and a text
 
     Raises NothingToShow, and ValueError without views.
     """

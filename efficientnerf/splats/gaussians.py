@@ -17,22 +17,13 @@ MAX_DEGREE = 3  # the most in formats and programs of 3DGS
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """3D Gaussians.
+    """3D Gaussians. Raises ValueError for arrays of other shapes or types, and for values outside of these ranges."""
 
-    means      (N, 3) float32  in the asset's scene frame
-    scales     (N, 3) float32  standard deviations along the own axes, above 0
-    rotations  (N, 4) float32  unit quaternions w x y z: own axes to the scene's
-    opacities  (N,)   float32  between 0 and 1, both excluded
-    harmonics  (N, K, 3) float32
-
-    Raises ValueError for arrays of other shapes or types, and for values outside of these ranges.
-    """
-
-    means: np.ndarray
-    scales: np.ndarray
-    rotations: np.ndarray
-    opacities: np.ndarray
-    harmonics: np.ndarray
+    means: np.ndarray  # (N, 3) float32  in the asset's scene frame
+    scales: np.ndarray  # (N, 3) float32  standard deviations along the own axes, above 0
+    rotations: np.ndarray  # (N, 4) float32  unit quaternions w x y z: own axes to the scene's
+    opacities: np.ndarray  # (N,)   float32  between 0 and 1, both excluded
+    harmonics: np.ndarray  # (N, K, 3) float32
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -95,9 +86,3 @@ def quaternions_from(matrices: np.ndarray) -> np.ndarray:
     chosen = products[np.arange(len(m)), greatest]
     chosen = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
     return np.where(chosen[:, :1] < 0, -chosen, chosen)
-
-
-def covariances(gaussians: Gaussians) -> np.ndarray:
-    """(N, 3, 3) float64."""
-    axes = rotation_matrices(gaussians.rotations) * gaussians.scales[:, None, :].astype(np.float64)
-    return np.asarray(np.einsum("nij,nkj->nik", axes, axes))

@@ -11,8 +11,6 @@ a Gaussian's the sum itself.
 N voxels, C cells or Gaussians, K harmonics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,21 +45,14 @@ VIEWS = 32  # that the size of voxels in pixels is taken from
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """The voxels that show, in Morton order within their cascade.
+    """The voxels that show, in Morton order within their cascade."""
 
-    voxels   (N,) their numbers
-    keys     (N,) int64: cascade, then Morton code
-    centres  (N, 3) and sides (N,), the tree's frame
-    pixels   (N,) of the views, about, that show each
-    width    (N,) of each in pixels
-    """
-
-    voxels: np.ndarray
-    keys: np.ndarray
-    centres: np.ndarray
-    sides: np.ndarray
-    pixels: np.ndarray
-    width: np.ndarray
+    voxels: np.ndarray  # (N,) their numbers
+    keys: np.ndarray  # (N,) int64: cascade, then Morton code
+    centres: np.ndarray  # (N, 3), the tree's frame
+    sides: np.ndarray  # (N,)
+    pixels: np.ndarray  # (N,) of the views, about, that show each
+    width: np.ndarray  # (N,) of each in pixels
 
 
 def greatest_weights(tree: NerfTree, cameras: Sequence[Camera], count: int = RAYS) -> np.ndarray:

@@ -4,8 +4,6 @@ A step takes a picture, or rows of a large one with about PIXELS. It minimises t
 backgrounds at once. The order of the pictures and the rows are drawn by (seed, step). The same pictures give the same bytes on any number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Images of Gaussians, for any camera of the project."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +19,10 @@ LANES = 16
 
 
 class SplatImage(NamedTuple):
-    """colour   (H, W, 3) float32, sRGB, over a background; without one, premultiplied by the opacity
-    opacity  (H, W) float32, 0 to 1
-    """
+    """The image of Gaussians that a camera takes."""
 
-    colour: np.ndarray
-    opacity: np.ndarray
+    colour: np.ndarray  # (H, W, 3) float32, sRGB, over a background; without one, premultiplied by the opacity
+    opacity: np.ndarray  # (H, W) float32, 0 to 1
 
 
 def render(gaussians: Gaussians, camera: Camera, background: tuple[float, float, float] | None = None) -> SplatImage:

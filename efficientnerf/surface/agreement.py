@@ -3,8 +3,6 @@
 H x W pixels, V vertices, F faces, C components.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -31,16 +29,12 @@ class AssetView:
 
 @dataclass(frozen=True)
 class Agreement:
-    """iou     intersection over union of the surface's silhouettes and those of the asset, all views' pixels together
-    missed  share of the asset's opaque pixels that the surface does not cover
-    added   share of the surface's pixels that are beyond the asset's silhouettes
-    depth   median difference of the depths where both are, over the depth
-    """
+    """How far a surface and the asset show the same."""
 
-    iou: float
-    missed: float
-    added: float
-    depth: float
+    iou: float  # intersection over union of the surface's silhouettes and those of the asset, all views' pixels together
+    missed: float  # share of the asset's opaque pixels that the surface does not cover
+    added: float  # share of the surface's pixels that are beyond the asset's silhouettes
+    depth: float  # median difference of the depths where both are, over the depth
 
 
 def asset_view(tree: NerfTree, camera: Camera) -> AssetView:

@@ -1,9 +1,4 @@
-"""Colours of surface points, as seen from outside.
-
-K directions, S samples.
-"""
-
-from __future__ import annotations
+"""Colours of surface points, as seen from outside. K directions, S samples."""
 
 from collections.abc import Callable
 

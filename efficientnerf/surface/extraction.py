@@ -3,8 +3,6 @@
 V vertices, F faces. Everything is in the frame of the volume (`efficientnerf.surface.volume`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

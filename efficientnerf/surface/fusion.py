@@ -7,8 +7,6 @@ method for building complex models from range images", SIGGRAPH 1996; Newcombe e
 C cameras, H x W pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -39,16 +37,11 @@ MARGIN = 4  # voxels that a block's values depend on beyond it
 
 @dataclass(frozen=True, eq=False)
 class Fusion:
-    """Views as `efficientnerf.backends.numba.mesh.fusion` reads them.
+    """Views as `efficientnerf.backends.numba.mesh.fusion` reads them."""
 
-    planes   (C, H, W, CHANNELS) float32
-    cameras  (C, 3, 4) float64 camera_from_world
-    lenses   (C, 4) float64 fx, fy, cx, cy
-    """
-
-    planes: np.ndarray
-    cameras: np.ndarray
-    lenses: np.ndarray
+    planes: np.ndarray  # (C, H, W, CHANNELS) float32
+    cameras: np.ndarray  # (C, 3, 4) float64 camera_from_world
+    lenses: np.ndarray  # (C, 4) float64 fx, fy, cx, cy
 
 
 def front_depth(tree: NerfTree, view: AssetView) -> np.ndarray:

@@ -4,8 +4,6 @@ Letters: sigma density per world unit, tau the level of the surface, s the voxel
 Everything is in the frame of the volume (`efficientnerf.surface.volume`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -13,10 +11,9 @@ from scipy.ndimage import binary_dilation, label
 from skimage.measure import marching_cubes
 
 from efficientnerf.asset.region import inside_distance
-from efficientnerf.surface.filled import dense_voxels, filled_blocks, filled_parts
 from efficientnerf.surface.fusion import MARGIN, Fusion, fused_opacity
 from efficientnerf.surface.mesh import compact
-from efficientnerf.surface.volume import Volume, WorldVolume
+from efficientnerf.surface.volume import Volume
 
 Progress = Callable[[int, int, str], None]
 LARGEST_SIDE = 4096  # voxels along a side of a grid that is baked
@@ -70,7 +67,7 @@ def automatic_threshold(volume: Volume) -> float:
                 low, high = np.zeros(3, np.int64), grid.copy()
                 low[first], low[second] = i * brick, j * brick
                 high[first], high[second] = low[first] + brick, low[second] + brick
-                blocks = [np.asarray(volume.density_block(*part)) for part in filled_parts(volume, axis, low, high)]
+                blocks = [np.asarray(volume.density_block(*part)) for part in volume.filled_parts(axis, low, high)]
                 if not blocks:
                     continue
                 block = np.concatenate(blocks, axis)
@@ -106,7 +103,7 @@ def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> 
     grid, pool = _grid(volume), pool_of(volume)
     cells = -(-grid // pool)
     dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
-    for voxels in dense_voxels(volume, threshold):
+    for voxels in volume.dense_voxels(threshold):
         dense[tuple((voxels // pool + 1).T)] = True
     region = np.empty(dense.shape, np.int32)
     label(~dense, output=region)
@@ -151,7 +148,7 @@ def isosurface(
     """
     grid = _grid(volume)
     starts = [np.arange(-1, grid[axis], block) for axis in range(3)]
-    blocks = filled_blocks(volume, [len(each) for each in starts], block)
+    blocks = volume.filled_blocks([len(each) for each in starts], block)
     positions, faces, seams, joined, count = [], [], [], [], 0
     for done, number in enumerate(blocks):
         low = number * block - 1
@@ -191,7 +188,7 @@ def _opacity(sigma: np.ndarray, threshold: float) -> np.ndarray:
 
 def _clipped(volume: Volume, opacity: np.ndarray, low: np.ndarray) -> np.ndarray:
     """Opacities of voxels from `low` on without those outside of the volume's region."""
-    region = volume.region if isinstance(volume, WorldVolume) else None
+    region = volume.region
     if region is None:
         return opacity
 

@@ -6,8 +6,6 @@ more. So the pixels that a surface would cover are known without making it.
 R rays, S samples, L levels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 V vertices, F faces (counter-clockwise seen from outside), C connected components.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import fast_simplification
@@ -15,16 +13,11 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Pictures on the faces of a mesh.
+    """Pictures on the faces of a mesh."""
 
-    coordinates  (F, 3, 2) float64 of each face's corners, 0-1: u to the right, v up from the lower edge, as OBJ and USD count
-    colours      (S, S, 3) uint8 sRGB, the top row first
-    normals      (S, S, 3) uint8 normal map in tangent space, y up as glTF's, or None
-    """
-
-    coordinates: np.ndarray
-    colours: np.ndarray
-    normals: np.ndarray | None = None
+    coordinates: np.ndarray  # (F, 3, 2) float64 of each face's corners, 0-1: u to the right, v up from the lower edge, as OBJ and USD count
+    colours: np.ndarray  # (S, S, 3) uint8 sRGB, the top row first
+    normals: np.ndarray | None = None  # (S, S, 3) uint8 normal map in tangent space, y up as glTF's, or None
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,18 +51,12 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Topology:
-    """How the faces are connected.
+    """How the faces are connected."""
 
-    watertight          each edge belongs to exactly two faces that run along it in opposite directions
-    open_edges          edges with one face
-    non_manifold_edges  edges with more than two faces
-    components          connected by vertices
-    """
-
-    watertight: bool
-    open_edges: int
-    non_manifold_edges: int
-    components: int
+    watertight: bool  # each edge belongs to exactly two faces that run along it in opposite directions
+    open_edges: int  # edges with one face
+    non_manifold_edges: int  # edges with more than two faces
+    components: int  # connected by vertices
 
 
 def moved(mesh: Mesh, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Mesh:

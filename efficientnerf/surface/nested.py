@@ -6,8 +6,6 @@ voxels differ by a factor of two, there may be cracks of about a voxel.
 F faces.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -1,9 +1,4 @@
-"""Images of meshes: which face each pixel shows, and how deep it lies.
-
-H x W pixels, V vertices, F faces.
-"""
-
-from __future__ import annotations
+"""Images of meshes: which face each pixel shows, and how deep it lies. H x W pixels, V vertices, F faces."""
 
 from dataclasses import dataclass
 
@@ -19,14 +14,10 @@ FIRST = 4096  # faces in the first piece
 
 @dataclass(frozen=True, eq=False)
 class MeshImage:
-    """What a camera sees of a mesh.
+    """What a camera sees of a mesh."""
 
-    face   (H, W) int32, -1 where there is none
-    depth  (H, W) float32 along the view axis, infinite where there is no face
-    """
-
-    face: np.ndarray
-    depth: np.ndarray
+    face: np.ndarray  # (H, W) int32, -1 where there is none
+    depth: np.ndarray  # (H, W) float32 along the view axis, infinite where there is no face
 
     @property
     def covered(self) -> np.ndarray:

@@ -4,8 +4,6 @@ A wall that photographs leave open comes out as rags that show the right colours
 gravel); so only lines are compared along which the photograph changes nowhere. H x W pixels.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -3,8 +3,6 @@
 H x W pixels, s x s samples in each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -23,16 +21,11 @@ FIRST_ROWS = 16  # in the first piece
 
 @dataclass(frozen=True, eq=False)
 class ColouredImage:
-    """What a camera sees of a mesh.
+    """What a camera sees of a mesh."""
 
-    colour   (H, W, 3) float32 sRGB 0-1, premultiplied by the coverage
-    covered  (H, W) float32, share of each pixel's samples that show the mesh
-    depth    (H, W) float32 along the view axis of the nearest of them, infinite where there is none
-    """
-
-    colour: np.ndarray
-    covered: np.ndarray
-    depth: np.ndarray
+    colour: np.ndarray  # (H, W, 3) float32 sRGB 0-1, premultiplied by the coverage
+    covered: np.ndarray  # (H, W) float32, share of each pixel's samples that show the mesh
+    depth: np.ndarray  # (H, W) float32 along the view axis of the nearest of them, infinite where there is none
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,6 @@
 V vertices, F faces (counter-clockwise seen from outside).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

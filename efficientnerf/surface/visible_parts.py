@@ -1,9 +1,4 @@
-"""Parts of a surface that can be seen.
-
-V vertices, F faces, C components.
-"""
-
-from __future__ import annotations
+"""Parts of a surface that can be seen. V vertices, F faces, C components."""
 
 from collections.abc import Callable
 

@@ -1,16 +1,14 @@
 """The input of surface extraction: a grid of densities with colours, in a frame of its own.
 
-`WorldVolume` is a tree in the world. `NdcVolume` is a forward-facing tree: its surface is found in normalised device coordinates and handed out in the
+`Volume` is a tree in the world. `NdcVolume` is a forward-facing tree: its surface is found in normalised device coordinates and handed out in the
 world. There a voxel is about a pixel wide at any depth, so that marching cubes, smoothing and decimation treat near and far as images do. Space
 beyond the far limit is left out, for it reaches to infinity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -24,38 +22,12 @@ VOXELS_AT_ONCE = 2**20  # of bricks, while dense voxels are found
 FARTHEST = 50.0  # times the near plane's depth: the far limit where the asset does not say
 
 
-class Volume(Protocol):
-    """Densities on a grid.
-
-    shape, brick, voxel, bounds_min  as in NerfTree
-    density_block(low, high)         density at the voxel centres low <= (i, j, k) < high, zero outside of the grid
-    density(points)                  at points (N, 3) of the frame
-    colour(points, directions)       sRGB (N, 3) at points of the frame, along unit directions of the world
-    """
-
-    @property
-    def shape(self) -> tuple[int, int, int]: ...
-    @property
-    def brick(self) -> int: ...
-    @property
-    def voxel(self) -> float: ...
-    @property
-    def bounds_min(self) -> np.ndarray: ...
-
-    def density_block(self, low: Any, high: Any) -> np.ndarray: ...
-    def density(self, points: np.ndarray) -> np.ndarray: ...
-    def colour(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray: ...
-
-
 @dataclass(frozen=True, eq=False)
-class WorldVolume:
-    """A tree, its points in its own frame; see `Volume`.
-
-    region  that surfaces are clipped to, half way into the band in which opacity fades; None: not at all
-    """
+class Volume:
+    """A tree, its points in its own frame."""
 
     tree: NerfTree
-    region: Region | None = field(default=None, kw_only=True)
+    region: Region | None = field(default=None, kw_only=True)  # that surfaces are clipped to, half way into the band in which opacity fades; None: not at all
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -74,6 +46,7 @@ class WorldVolume:
         return np.asarray(self.tree.bounds_min)
 
     def density_block(self, low: Any, high: Any) -> np.ndarray:
+        """Density at the voxel centres low <= (i, j, k) < high, zero outside of the grid."""
         return queries.density_block(self.tree, low, high)
 
     @cached_property
@@ -92,15 +65,37 @@ class WorldVolume:
             brick, local = np.nonzero(dense)
             yield self.cells[begin + brick] * self.brick + np.stack(np.unravel_index(local, (self.brick,) * 3), axis=1)
 
+    def filled_parts(self, axis: int, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Corners of the parts of a column of bricks along `axis` that may have density; gaps do not count in its rays' depth."""
+        others = [other for other in range(3) if other != axis]
+        at = np.unique(self.cells[(self.cells[:, others] == low[others] // self.brick).all(axis=1), axis])
+        for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(at) else ():
+            begin, end = low.copy(), high.copy()
+            begin[axis], end[axis] = run[0] * self.brick, (run[-1] + 1) * self.brick
+            yield begin, end
+
+    def filled_blocks(self, counts: list[int], block: int) -> np.ndarray:
+        """(n, 3) numbers of the blocks that may hold a part of the surface, in order: those with a brick, and those next to them, where enclosed space may
+        end."""
+        at = np.unique(self.cells * self.brick // block, axis=0)
+        flat = np.zeros(0, np.int64)
+        for offset in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
+            beside = at + offset
+            beside = beside[((beside >= 0) & (beside < counts)).all(axis=1)]
+            flat = np.union1d(flat, np.ravel_multi_index(tuple(beside.T), counts))
+        return np.stack(np.unravel_index(flat, counts), axis=1)
+
     def density(self, points: np.ndarray) -> np.ndarray:
+        """At points (N, 3) of the frame."""
         return frame_queries.density_at(self.tree, points)
 
     def colour(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """sRGB (N, 3) at points of the frame, along unit directions of the world."""
         return frame_queries.colour_at(self.tree, points, directions)
 
 
 @dataclass(frozen=True, eq=False)
-class NdcVolume(WorldVolume):
+class NdcVolume(Volume):
     """A tree in normalised device coordinates; see `Volume`."""
 
     ndc: Ndc
@@ -140,8 +135,8 @@ class NdcVolume(WorldVolume):
         return replace(cloud, positions=self.ndc.world(cloud.positions), normals=self.ndc.world_normals(cloud.positions, cloud.normals))
 
 
-def volume_of(tree: NerfTree, region: Region | None = None) -> WorldVolume:
+def volume_of(tree: NerfTree, region: Region | None = None) -> Volume:
     """The tree as a volume that is clipped to a region. It is interpolated: a surface lies between voxels, where those that hold its points may not be stored
     and have no colour."""
     tree = replace(tree, lookup="trilinear") if tree.lookup != "trilinear" else tree
-    return WorldVolume(tree, region=region) if tree.ndc is None else NdcVolume(tree, tree.ndc)
+    return Volume(tree, region=region) if tree.ndc is None else NdcVolume(tree, tree.ndc)

@@ -1,7 +1,5 @@
 """Renders of the field at some pixels of every photograph, for the refinement of the cameras. C views, N pixels of a view, R = C N rays."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The rays of a step, and the colours that they are to have. R rays."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -18,21 +16,17 @@ MIN_RAYS = 64
 
 
 class RayBatch(NamedTuple):
-    """The first six fields are the arguments of `render_rays`.
+    """The first six fields are the arguments of `render_rays`."""
 
-    origins, directions, near, far, offset, behind  (R, 3), (R, 3), (R,), (R,), (R,), (R, 3)
-    colour                                          (R, 3) of the photographs, over `behind` where they have alpha
-    pixel                                           (R,) indices of the pixels
-    """
-
+    # origins, directions, near, far, offset, behind: (R, 3), (R, 3), (R,), (R,), (R,), (R, 3)
     origins: Tensor
     directions: Tensor
     near: Tensor
     far: Tensor
     offset: Tensor
     behind: Tensor
-    colour: Tensor
-    pixel: np.ndarray
+    colour: Tensor  # (R, 3) of the photographs, over `behind` where they have alpha
+    pixel: np.ndarray  # (R,) indices of the pixels
 
 
 def ray_count(settings: TrainSettings, samples_per_ray: float) -> int:

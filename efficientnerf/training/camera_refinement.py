@@ -37,36 +37,24 @@ FAR = 1e4  # world units: where points are put that lie beyond all samples
 
 @dataclass
 class Alignment:
-    """Pixels of one photograph and what the field shows there.
+    """Pixels of one photograph and what the field shows there."""
 
-    pixels    (N, 2) x, y
-    residual  (N, 3) photograph minus render
-    gradient  (N, 3, 2) of the photograph, per pixel along x and y
-    points    (N, 3) in the world; FAR away where nothing is
-    """
-
-    pixels: np.ndarray
-    residual: np.ndarray
-    gradient: np.ndarray
-    points: np.ndarray
+    pixels: np.ndarray  # (N, 2) x, y
+    residual: np.ndarray  # (N, 3) photograph minus render
+    gradient: np.ndarray  # (N, 3, 2) of the photograph, per pixel along x and y
+    points: np.ndarray  # (N, 3) in the world; FAR away where nothing is
 
 
 @dataclass
 class CameraCorrections:
-    """The corrections that are learned.
+    """The corrections that are learned."""
 
-    given    as they came
-    depth    (C,) median depth of what each one shows, the unit of its translation; 0: not known yet
-    pose     (C, 6), focal (1,): corrections, float64
-    normal   (C, 7, 7) and right (C, 7): the equations so far, of pose and focal; both sides at the present corrections
-    """
-
-    given: tuple[Camera, ...]
-    depth: np.ndarray
-    pose: np.ndarray
-    focal: np.ndarray
-    normal: np.ndarray
-    right: np.ndarray
+    given: tuple[Camera, ...]  # as they came
+    depth: np.ndarray  # (C,) median depth of what each one shows, the unit of its translation; 0: not known yet
+    pose: np.ndarray  # (C, 6) float64 corrections
+    focal: np.ndarray  # (1,) float64 correction
+    normal: np.ndarray  # (C, 7, 7) the equations so far, of pose and focal, at the present corrections
+    right: np.ndarray  # (C, 7) their right side
 
     @staticmethod
     def none(cameras: Sequence[Camera]) -> CameraCorrections:

@@ -1,7 +1,5 @@
 """Training pixels on a device: `efficientnerf.training.pixels` without looking them up on the host. R rays, C views, P pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

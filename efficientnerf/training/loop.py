@@ -10,8 +10,6 @@ processor supports it, so that another machine's result differs, at the same qua
 R rays, A rays to sparse points, C views.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -44,24 +42,17 @@ MAX_STEPS = 2**40  # of a run: beyond any practical one
 
 @dataclass
 class Progress:
-    """Statistics of one step.
+    """Statistics of one step."""
 
-    step        from 1
-    loss        mean squared error of the fine colours; this and the counts are those of some steps before on CUDA (`efficientnerf.training.readback`)
-    rays        in the step
-    tried       coarse intervals, valid or not
-    valid, pivotal, fine   how many samples of each kind
-    left_out    rays whose samples did not fit, and that the loss leaves out; on CUDA alone
-    """
-
-    step: int
-    loss: float
-    rays: int
-    tried: int
+    step: int  # from 1
+    loss: float  # mean squared error of the fine colours; this and the counts are those of some steps before on CUDA (`efficientnerf.training.readback`)
+    rays: int  # in the step
+    tried: int  # coarse intervals, valid or not
+    # valid, pivotal, fine: how many samples of each kind
     valid: int
     pivotal: int
     fine: int
-    left_out: int = 0
+    left_out: int = 0  # rays whose samples did not fit, and that the loss leaves out; on CUDA alone
 
     @property
     def psnr(self) -> float:
@@ -70,23 +61,16 @@ class Progress:
 
 @dataclass
 class Trainer:
-    """The state of a training run.
-
-    schedule         the one that the next step follows; another may take its place between steps
-    samples_per_ray  the running average that sets the number of rays
-    exposure         of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
-    cameras          corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
-    checks           of the training views (`efficientnerf.training.view_checks.checks`), or None
-    """
+    """The state of a training run."""
 
     model: Model
     adam: Adam
-    schedule: Schedule
+    schedule: Schedule  # the one that the next step follows; another may take its place between steps
     step: int = 0
-    samples_per_ray: float = 0.0
-    exposure: Exposure | None = None
-    cameras: CameraCorrections | None = None
-    checks: ViewChecks | None = None
+    samples_per_ray: float = 0.0  # the running average that sets the number of rays
+    exposure: Exposure | None = None  # of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
+    cameras: CameraCorrections | None = None  # corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
+    checks: ViewChecks | None = None  # of the training views (`efficientnerf.training.view_checks.checks`), or None
 
 
 def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | None = None, cameras: Sequence[Camera] = ()) -> Trainer:

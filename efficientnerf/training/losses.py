@@ -1,7 +1,5 @@
 """The losses of a step. R rays, N samples."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

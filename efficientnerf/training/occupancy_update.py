@@ -1,7 +1,5 @@
 """Updates of the density voxels in training: with the coarse field's densities on the rays of a step, and at random voxels now and then."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Adam over the parameters of a model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -17,15 +15,11 @@ BETA1 = 0.9
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters, by name, that are treated alike.
-
-    sparse   entries whose gradient is zero are left alone, their moments too, as in hash tables (Mueller et al. 2022)
-    buffers  where the gradients of some of them are summed instead of in `grad`
-    """
+    """Parameters, by name, that are treated alike."""
 
     parameters: Mapping[str, nn.Parameter]
-    sparse: bool = False
-    buffers: Mapping[str, GradientBuffer] = field(default_factory=dict)
+    sparse: bool = False  # entries whose gradient is zero are left alone, their moments too, as in hash tables (Mueller et al. 2022)
+    buffers: Mapping[str, GradientBuffer] = field(default_factory=dict)  # where the gradients of some of them are summed instead of in `grad`
 
     def gradient(self, name: str) -> Tensor | None:
         """The gradient of this step; None where no backward pass has reached the parameter."""

@@ -1,7 +1,5 @@
 """Patches of neighbouring pixels, whose rays meet the same voxels. T tiles, P patches, R pixels."""
 
-from __future__ import annotations
-
 import itertools
 from typing import NamedTuple
 

@@ -1,9 +1,4 @@
-"""The pixels that a field is trained on, in little memory: bytes, and directions by lookup.
-
-R rays, C views, P pixels of all views.
-"""
-
-from __future__ import annotations
+"""The pixels that a field is trained on, in little memory: bytes, and directions by lookup. R rays, C views, P pixels of all views."""
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence

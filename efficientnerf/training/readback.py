@@ -6,8 +6,6 @@ steps before (those of unpruned rays among them, `train.occupancy_update_ray_fra
 are left out of the loss and counted, which is rare. The counts and losses of a step are read LAG steps after it.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Any, NamedTuple
 

@@ -13,28 +13,17 @@ RAMP_STEPS = 100  # steps in which the learning rate rises, or the first tenth o
 
 @dataclass(frozen=True)
 class Schedule:
-    """A schedule never changes: `with_iterations` makes another one. Steps count from 1.
+    """A schedule never changes: `with_iterations` makes another one. Steps count from 1."""
 
-    iterations               steps in all
-    hold                     first steps in which the learning rate does not fall, so that nothing in them depends on `iterations`
-    aims                     (iterations, step) in order: up to `step` the schedule was one of so many iterations
-    learning_rate            peak of the learning rate
-    lr_final_ratio           what is left of it after the last step, or after each `lr_decay_steps`
-    lr_decay_steps           steps in which it falls by `lr_final_ratio`; 0: all of them
-    samples_per_pivot        N_s
-    early_samples_per_pivot  N_s in the first half; 0: the same
-    ramp_steps               first steps in which the learning rate rises, at most
-    """
-
-    iterations: int
-    hold: int = 0
-    aims: tuple[tuple[int, int], ...] = ()
-    learning_rate: float = 2e-2
-    lr_final_ratio: float = 0.05
-    lr_decay_steps: int = 0
-    samples_per_pivot: int = 4
-    early_samples_per_pivot: int = 0
-    ramp_steps: int = RAMP_STEPS
+    iterations: int  # steps in all
+    hold: int = 0  # first steps in which the learning rate does not fall, so that nothing in them depends on `iterations`
+    aims: tuple[tuple[int, int], ...] = ()  # (iterations, step) in order: up to `step` the schedule was one of so many iterations
+    learning_rate: float = 2e-2  # peak of the learning rate
+    lr_final_ratio: float = 0.05  # what is left of it after the last step, or after each `lr_decay_steps`
+    lr_decay_steps: int = 0  # steps in which it falls by `lr_final_ratio`; 0: all of them
+    samples_per_pivot: int = 4  # N_s
+    early_samples_per_pivot: int = 0  # N_s in the first half; 0: the same
+    ramp_steps: int = RAMP_STEPS  # first steps in which the learning rate rises, at most
 
     def fraction(self, step: int) -> float:
         """The fraction of the way from the end of the hold to the last step that is done after `step`: 0 to 1."""

@@ -1,7 +1,5 @@
 """Settings of training; imports nothing heavy, so that they can be listed at once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

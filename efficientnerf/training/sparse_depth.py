@@ -1,7 +1,5 @@
 """Supervision by the sparse points of structure from motion (Deng et al. 2022, "Depth-supervised NeRF", DS-NeRF). A rays to points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,15 +21,12 @@ WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as a
 
 @dataclass(frozen=True)
 class SparseDepthRays:
-    """Rays from training cameras to sparse points that are registered in their images.
+    """Rays from training cameras to sparse points that are registered in their images."""
 
-    origins, directions  (A, 3) float32, unit directions
-    distance             (A,) float32, to the point
-    """
-
+    # origins, directions: (A, 3) float32, unit directions
     origins: np.ndarray
     directions: np.ndarray
-    distance: np.ndarray
+    distance: np.ndarray  # (A,) float32, to the point
 
     def __len__(self) -> int:
         return len(self.distance)

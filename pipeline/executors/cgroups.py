@@ -1,7 +1,5 @@
 """Control groups of Linux, by which containers and batch systems limit processes."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath

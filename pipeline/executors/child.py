@@ -10,8 +10,6 @@ Parent and child speak lines of JSON:
 Each child leads a group of processes. It ends with its parent, and whatever it has started ends with it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import itertools
@@ -61,13 +59,10 @@ def command_for(module: str) -> list[str]:
 
 
 class _Child:
-    """One process and its pipes. Its result is {"ok": False, "kind": "died", "signal", "text"} where it ended without one.
-
-    kind  cores that it computes on, and CUDA devices that it sees
-    """
+    """One process and its pipes. Its result is {"ok": False, "kind": "died", "signal", "text"} where it ended without one."""
 
     def __init__(self, module: str, kind: Kind) -> None:
-        self.kind = kind
+        self.kind = kind  # cores that it computes on, and CUDA devices that it sees
         self.process = subprocess.Popen(
             command_for(module), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, env=_environment(*kind)
         )
@@ -171,15 +166,11 @@ class _Child:
 
 
 class Children:
-    """The children of a worker, by run. Used from any number of threads; one works for a run at a time.
-
-    module  what a child runs: it calls `serving.serve`
-    most    children with a run that are kept at a time, with those that have no work
-    """
+    """The children of a worker, by run. Used from any number of threads; one works for a run at a time."""
 
     def __init__(self, module: str, most: int) -> None:
-        self.module = module
-        self.most = most
+        self.module = module  # what a child runs: it calls `serving.serve`
+        self.most = most  # children with a run that are kept at a time, with those that have no work
         self._children: dict[str, _Child] = {}
         self._working: set[str] = set()
         self._stopped: set[str] = set()
@@ -193,8 +184,6 @@ class Children:
 
         request  {"kind": "prepare" | "stage" | "finish", "run": path, ...}; "prepare" with "scene" and "memory" (bytes or None), "stage" with "stage",
                  "device" and "memory"; or {"kind": "job", ...}, see `side_by_side`: "run" is any name of the child then
-        cores    that it computes on
-        gpus     CUDA devices that it sees
         """
         run = self._name(request)
         try:

@@ -1,7 +1,5 @@
 """How many cores this process may use, and the number of threads of libraries that do not look at all of its limits."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import MutableMapping
@@ -19,10 +17,7 @@ def affinity() -> int:
 
 
 def cores(root: Path = Path("/")) -> int:
-    """Those, or as many as the quotas of the control groups allow where that is fewer, rounded up.
-
-    root  where /proc and /sys lie, for tests
-    """
+    """Those, or as many as the quotas of the control groups allow where that is fewer, rounded up."""
     found = affinity()
     for folder, _ in cgroup_folders(root, "cpu"):
         quota, period = _quota(folder)

@@ -4,8 +4,6 @@ The scheduler of the fleet admits stages; Dask carries them to the worker that w
 worker while a child runs the stage. Devices are the resource GPU of Dask's workers (`dask worker --resources GPU=2`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import queue

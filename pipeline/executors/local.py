@@ -4,8 +4,6 @@ An executor is a function (Stage, Job) -> Usage. It returns when job.out is comp
 (requests, publishing, locks, signals). An executor that sends stages elsewhere needs only the job's paths and its two callables.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os
@@ -22,18 +20,12 @@ from pipeline.stage import Job, Stage
 
 @dataclass(frozen=True)
 class Usage:
-    """What a stage cost.
+    """What a stage cost."""
 
-    seconds      wall clock
-    peak_memory  resident memory of the process, bytes; or of a child that has ended meanwhile, if it took more
-    cpu_seconds  processor time of the process and of its children that have ended; 0 where it is not known
-    cores        that the process may use; 0 where it is not known
-    """
-
-    seconds: float
-    peak_memory: int
-    cpu_seconds: float = 0.0
-    cores: int = 0
+    seconds: float  # wall clock
+    peak_memory: int  # resident memory of the process, bytes; or of a child that has ended meanwhile, if it took more
+    cpu_seconds: float = 0.0  # processor time of the process and of its children that have ended; 0 where it is not known
+    cores: int = 0  # that the process may use; 0 where it is not known
 
 
 def execute(stage: Stage, job: Job) -> Usage:

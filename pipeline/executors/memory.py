@@ -7,8 +7,6 @@ Only `available_now` depends on the memory that other programs take: the same li
     rlimit    RLIMIT_AS and RLIMIT_DATA, less the addresses that libraries and threads reserve and never use
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc
@@ -68,10 +66,7 @@ def size_text(count: float) -> str:
 
 
 def usable_memory(root: Path = Path("/")) -> Limit | None:
-    """The smallest limit on this process, less what is kept back; None where the system states none.
-
-    root  where /proc and /sys lie, for tests
-    """
+    """The smallest limit on this process, less what is kept back; None where the system states none."""
     limits = [Limit(int((1 - KEPT_BACK) * limit.bytes), limit.whose) for limit in (*_machine(root), *_cgroups(root))]
     limits += _rlimits(affinity())
     return min(limits, key=lambda limit: limit.bytes, default=None)

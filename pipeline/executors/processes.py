@@ -1,7 +1,5 @@
 """Workers of a fleet on this machine: children of this process, and a thread for each task."""
 
-from __future__ import annotations
-
 import queue
 import threading
 import time

@@ -1,7 +1,5 @@
 """The child's side of `pipeline.executors.child`: it reads requests from standard input, and answers on standard output."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any
 
 from pipeline import errors
@@ -41,7 +40,7 @@ class SideBySide:
     def __enter__(self) -> SideBySide:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self._children.close()
 
     def execute(self, stage: Stage, job: Job) -> Usage:

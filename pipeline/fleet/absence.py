@@ -1,7 +1,5 @@
 """A fleet without workers: how long it waits, and the messages about it."""
 
-from __future__ import annotations
-
 LONGEST = 300.0  # seconds that a fleet waits while it has no worker; for jobs of a queue as long as it takes
 REPORT_SECONDS = 30.0  # seconds before that is reported
 

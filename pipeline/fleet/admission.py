@@ -5,8 +5,6 @@
     what fits nowhere           gets the largest worker alone; the caller lowers its demand to that
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -18,16 +16,11 @@ Place = tuple[Worker, int | None, int | None]  # with the bytes and the device t
 
 @dataclass
 class _Kept:
-    """A worker that is kept for a scene.
+    """A worker that is kept for a scene."""
 
-    who     its number
-    memory  bytes that it waits for
-    since   the number of the first task that may have begun after this
-    """
-
-    who: int
-    memory: int
-    since: int
+    who: int  # its number
+    memory: int  # bytes that it waits for
+    since: int  # the number of the first task that may have begun after this
 
 
 class Admission:

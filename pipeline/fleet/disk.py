@@ -1,7 +1,5 @@
 """Free space on a fleet's disk: stages are admitted by what they will write, so that concurrent stages do not fill it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterable

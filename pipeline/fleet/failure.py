@@ -10,8 +10,6 @@ the disk is full, its run stayed locked       failed: by circumstances; the flee
 anything else, or the same once more          quarantined: by itself; only `retry` tries it again
 """
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,20 +27,15 @@ _MOST_ENLARGED = 3  # times that a stage may find that it needs more than it has
 
 @dataclass
 class Attempts:
-    """Failures so far of the stage that a scene is at.
-
-    lost_on  the workers on which it was lost
-    memory   bytes that it is to run in, where they are not those of its estimate or the worker's share
-    alone    whether it had a worker for itself after memory ran out
-    """
+    """Failures so far of the stage that a scene is at."""
 
     crashes: int = 0
     out_of_memory: int = 0
     enlarged: int = 0
     locked_since: float | None = None
-    lost_on: tuple[str, ...] = ()
-    memory: int | None = None
-    alone: bool = False
+    lost_on: tuple[str, ...] = ()  # the workers on which it was lost
+    memory: int | None = None  # bytes that it is to run in, where they are not those of its estimate or the worker's share
+    alone: bool = False  # whether it had a worker for itself after memory ran out
 
     @property
     def count(self) -> int:

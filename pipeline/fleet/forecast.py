@@ -1,7 +1,5 @@
 """How long a fleet will go on, by the stages that have been done."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from statistics import fmean
 

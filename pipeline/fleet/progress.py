@@ -1,7 +1,5 @@
 """A scene of a fleet while it is run: the stages that are left, and what is known of what they take."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,27 +15,20 @@ BESIDE_STAGES = 512 * 2**20  # bytes that preparing a run takes at most, and wri
 
 @dataclass
 class Progress:
-    """A scene of a fleet while it is run.
-
-    number    its place in the manifest
-    todo      stages that are not up to date, in order; None before its run is prepared
-    finished  whether its pages are written
-    space     bytes that its stages write, by name
-    memory    bytes that they take, of those for which that is known
-    """
+    """A scene of a fleet while it is run."""
 
     state: SceneState
-    number: int
-    todo: list[str] | None = None
-    finished: bool = False
+    number: int  # its place in the manifest
+    todo: list[str] | None = None  # stages that are not up to date, in order; None before its run is prepared
+    finished: bool = False  # whether its pages are written
     task: Task | None = None
     stop_reason: str | None = None
     not_before: float = 0.0
     last_worker: str | None = None
     attempts: Attempts = field(default_factory=Attempts)
     lines: list[str] = field(default_factory=list)
-    space: Mapping[str, int] = field(default_factory=dict)
-    memory: Mapping[str, int] = field(default_factory=dict)
+    space: Mapping[str, int] = field(default_factory=dict)  # bytes that its stages write, by name
+    memory: Mapping[str, int] = field(default_factory=dict)  # bytes that they take, of those for which that is known
 
     @property
     def what(self) -> str:

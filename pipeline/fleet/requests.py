@@ -1,7 +1,5 @@
 """Requests of `enerf fleet retry` and `cancel` to the process that runs the fleet, on any machine: files in FLEET/.requests, taken in order."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Sequence

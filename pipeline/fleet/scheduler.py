@@ -3,8 +3,6 @@
 A scene's run is authoritative: published stages are never done again, whatever happens to this process. fleet.json reports the state to others.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

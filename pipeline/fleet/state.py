@@ -54,36 +54,25 @@ def is_scene_name(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene of a fleet, as the manifest has it.
+    """A scene of a fleet, as the manifest has it."""
 
-    name      unique whatever its case, see `is_scene_name`
-    sources   absolute paths of its folders and videos
-    settings  stage -> setting -> value, where they are not the preset's
-    sweep     "stage.setting" -> value for a scene that a sweep made
-    shares    stage -> the scene before it that makes the same artifact: this one waits for it and adopts it
-    """
-
-    name: str
-    sources: tuple[str, ...]
-    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    name: str  # unique whatever its case, see `is_scene_name`
+    sources: tuple[str, ...]  # absolute paths of its folders and videos
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # stage -> setting -> value, where they are not the preset's
     preset: str | None = None
     seed: int | None = None
-    sweep: Mapping[str, Any] | None = None
-    shares: Mapping[str, str] = field(default_factory=dict)
+    sweep: Mapping[str, Any] | None = None  # "stage.setting" -> value for a scene that a sweep made
+    shares: Mapping[str, str] = field(default_factory=dict)  # stage -> the scene before it that makes the same artifact: this one waits for it and adopts it
 
 
 @dataclass
 class StageState:
-    """One stage of a scene.
-
-    seconds      wall clock, of its last attempt; 0 while it waits
-    peak_memory  bytes
-    """
+    """One stage of a scene."""
 
     state: StageWord = "waiting"
-    seconds: _Seconds = 0.0
+    seconds: _Seconds = 0.0  # wall clock, of its last attempt; 0 while it waits
     cpu_seconds: _Seconds = 0.0
-    peak_memory: _Count = 0
+    peak_memory: _Count = 0  # bytes
     worker: _Name | None = None
 
 
@@ -97,35 +86,24 @@ class Verdict:
 
 @dataclass
 class SceneState:
-    """What became of one scene.
-
-    state       failed: by circumstances, the same command tries it again; quarantined: by itself, `retry` tries it again
-    reason      of a failed or quarantined scene, a sentence
-    metrics     what its evaluation measured, as the workflow has it
-    seconds     wall clock of its stages together
-    bytes       of its asset
-    verdict     on its cameras; result: on what was made of them
-    stage       that runs now
-    last_lines  of a failed or quarantined scene: the last lines of its stage's output
-    attempts    failures so far of the stage that it is at
-    run         its folder, relative to the fleet's
-    """
+    """What became of one scene."""
 
     name: _Name
-    state: SceneWord = "waiting"
-    reason: _Text | None = None
-    metrics: dict[_Name, Any] = field(default_factory=dict)
-    seconds: _Seconds = 0.0
-    bytes: _Count = 0
-    stage: _Name | None = None
+    state: SceneWord = "waiting"  # failed: by circumstances, the same command tries it again; quarantined: by itself, `retry` tries it again
+    reason: _Text | None = None  # of a failed or quarantined scene, a sentence
+    metrics: dict[_Name, Any] = field(default_factory=dict)  # what its evaluation measured, as the workflow has it
+    seconds: _Seconds = 0.0  # wall clock of its stages together
+    bytes: _Count = 0  # of its asset
+    stage: _Name | None = None  # that runs now
     stages: dict[_Name, StageState] = field(default_factory=dict)
-    verdict: Verdict | None = None
+    verdict: Verdict | None = None  # on its cameras; result: on what was made of them
     result: Verdict | None = None
     warnings: Annotated[list[_Text], msgspec.Meta(max_length=MOST_LINES)] = field(default_factory=list)
+    # of a failed or quarantined scene: the last lines of its stage's output
     last_lines: Annotated[list[_Text], msgspec.Meta(max_length=MOST_LINES)] = field(default_factory=list)
-    attempts: Annotated[int, msgspec.Meta(ge=0, le=10**6)] = 0
+    attempts: Annotated[int, msgspec.Meta(ge=0, le=10**6)] = 0  # failures so far of the stage that it is at
     worker: _Name | None = None
-    run: _Path = ""
+    run: _Path = ""  # its folder, relative to the fleet's
     sources: Annotated[list[_Path], msgspec.Meta(max_length=100)] = field(default_factory=list)
     settings: _Table = field(default_factory=dict)
     preset: _Name | None = None
@@ -166,22 +144,16 @@ class Totals:
 
 @dataclass
 class FleetState:
-    """A fleet.
-
-    started, updated  ISO 8601, UTC
-    forecast_seconds  until its end, None where nothing is known yet
-    executor          "local" or "dask"
-    slots             stages that may run at a time
-    note              what it waits for, or why it ended with scenes that wait
-    """
+    """A fleet."""
 
     state: FleetWord = "running"
+    # started, updated: ISO 8601, UTC
     started: _Name = ""
     updated: _Name = ""
-    forecast_seconds: _Seconds | None = None
-    executor: _Name = "local"
-    slots: _Count = 1
-    note: _Text | None = None
+    forecast_seconds: _Seconds | None = None  # until its end, None where nothing is known yet
+    executor: _Name = "local"  # "local" or "dask"
+    slots: _Count = 1  # stages that may run at a time
+    note: _Text | None = None  # what it waits for, or why it ended with scenes that wait
     totals: Totals = field(default_factory=Totals)
     scenes: Annotated[list[SceneState], msgspec.Meta(max_length=MOST_SCENES)] = field(default_factory=list)
 

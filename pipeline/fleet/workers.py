@@ -1,7 +1,5 @@
 """The scheduler's view of its executor: workers with their capacity, tasks, and results."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -9,19 +7,13 @@ from typing import Any, Literal, Protocol
 
 @dataclass(frozen=True)
 class Worker:
-    """A process, here or elsewhere, that runs stages in children of its own.
-
-    cores   that its stages share
-    memory  bytes that its stages share; None: no limit is known
-    gpus    numbers of its CUDA devices; a stage has one to itself
-    slots   stages without a device that run at a time
-    """
+    """A process, here or elsewhere, that runs stages in children of its own."""
 
     name: str
-    cores: int
-    memory: int | None = None
-    gpus: tuple[int, ...] = ()
-    slots: int = 1
+    cores: int  # that its stages share
+    memory: int | None = None  # bytes that its stages share; None: no limit is known
+    gpus: tuple[int, ...] = ()  # numbers of its CUDA devices; a stage has one to itself
+    slots: int = 1  # stages without a device that run at a time
 
     @property
     def capacity(self) -> int:
@@ -41,13 +33,10 @@ class Worker:
 
 @dataclass(frozen=True)
 class Demand:
-    """What a stage takes of a worker.
-
-    memory  bytes; None: the worker's share
-    """
+    """What a stage takes of a worker."""
 
     uses_gpu: bool = False
-    memory: int | None = None
+    memory: int | None = None  # bytes; None: the worker's share
 
 
 @dataclass(frozen=True)
@@ -72,13 +61,10 @@ class Message:
 
 
 class Workers(Protocol):
-    """An executor of fleets. Its methods are called by one thread.
-
-    queued  whether its workers are jobs of a queue: the first may be hours in coming
-    """
+    """An executor of fleets. Its methods are called by one thread."""
 
     executor: str
-    queued: bool
+    queued: bool  # whether its workers are jobs of a queue: the first may be hours in coming
 
     def alive(self) -> Sequence[Worker]:
         """Those that take tasks now."""

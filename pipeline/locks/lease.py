@@ -10,8 +10,6 @@ that finds a higher number than its own, or could not renew its own for EXPIRY s
 Within one machine an operating system's lock decides (`pipeline.locks.lock`): its holder may take over at once from a process of the same machine.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json
@@ -37,14 +35,11 @@ _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EOPNOTSUPP, errno.E
 
 
 class Held(Exception):
-    """Another holds the lease.
-
-    age  seconds since it was last renewed
-    """
+    """Another holds the lease."""
 
     def __init__(self, age: float) -> None:
         super().__init__(f"renewed {age:.0f} s ago")
-        self.age = age
+        self.age = age  # seconds since it was last renewed
 
 
 class Lease:

@@ -3,8 +3,6 @@
 The lock ends with its process: a killed process never blocks a run on its own machine. On another the run is free once the lease has expired.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

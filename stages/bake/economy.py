@@ -5,8 +5,6 @@ it is nearly filled. Where even the coarsest codes are too large, the voxels tha
 are fitted to the images, which changes no file's size. An attempt that was stopped begins here again: its refinement is done.
 """
 
-from __future__ import annotations
-
 import math
 
 from efficientnerf.asset import economy

@@ -3,8 +3,6 @@
 N voxels, P rays.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.asset.cascades import voxels_around

@@ -1,7 +1,5 @@
 """Memory of baking: at most, before it begins; and once its voxels are known. docs/experiments/memory.md"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

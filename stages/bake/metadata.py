@@ -1,7 +1,5 @@
 """The metadata that the bake stage writes into an asset: frame, orbit, licence and provenance; see FORMAT.md."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any

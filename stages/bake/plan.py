@@ -7,8 +7,6 @@
 What comes after takes this plan, and compares no setting with "auto".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ demands. In unbounded scenes, voxels stay without which a ray would end in a hol
 N voxels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

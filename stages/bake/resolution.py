@@ -5,8 +5,6 @@ counted on coarser grids: first on two cheap ones, which give the exponent of gr
 from it. Nothing depends on the clock or on free memory.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -11,8 +11,6 @@
 The scratch folder keeps what takes long: the visibility of the voxels or the field's samples, each block of baked values, and the state of the refinement.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from typing import Any

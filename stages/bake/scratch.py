@@ -1,7 +1,5 @@
 """Arrays in the scratch folder: an interrupted bake goes on from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import BinaryIO, TypeVar

@@ -3,8 +3,6 @@
 N voxels, K harmonics.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -3,8 +3,6 @@
 All voxels compete for the asset's size by the weight that they have in some pixel, wherever they are. N voxels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

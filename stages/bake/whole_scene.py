@@ -6,8 +6,6 @@ cascade covers; the cascades around it hold nearly all that the photographs show
 N voxels, P rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

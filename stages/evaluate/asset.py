@@ -1,7 +1,5 @@
 """A baked asset as the evaluate stage measures it: what it shows by itself, and where its density lies."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -13,8 +13,6 @@ learned but predicted by those of its neighbours (`efficientnerf.training.exposu
 render's colours, twelve numbers a view, that fits the photograph best (`metrics.colour_fitted`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial

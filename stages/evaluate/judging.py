@@ -1,7 +1,5 @@
 """The verdict of the evaluate stage: its inputs besides the held-out views, its file and picture, and its message."""
 
-from __future__ import annotations
-
 import json
 import math
 import statistics

@@ -1,7 +1,5 @@
 """Finding the weights of LPIPS: in a given folder, in torch's cache of downloads, and, for the heads, in the package torchmetrics."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """Memory of comparing renders with photographs, one view at a time. docs/experiments/memory.md"""
 
-from __future__ import annotations
-
 import math
 
 from efficientnerf.asset.tree import NerfTree

@@ -9,8 +9,6 @@ roughness           `efficientnerf.surface.roughness`
 ..._vertex_colours  the same of the mesh in the colours of its vertices
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

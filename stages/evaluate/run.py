@@ -18,8 +18,6 @@ behind that box, as was measured before there were cascades. An asset of one box
 the pixels where less than half of the field's opacity lies in the box; on a constant background they are over the pixels that the photograph's alpha covers.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache, partial

@@ -7,8 +7,6 @@ nearer, agreeing, farther  shares of the points; subject_farther: the same of th
                            TOLERANCE of its own in a pixel or in one next to it: points are found at edges
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The 3D Gaussians of a run against the photographs: drawn from the held-back cameras before what is behind the asset in its own figures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ The network renders every pixel of these views, or every n-th along both sides o
 pixels. The figures of a strip are those of what it shows.
 """
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence

@@ -14,8 +14,6 @@ strips          the views that have picture strips, with their figures
 views           the metrics of each view
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -4,8 +4,6 @@ A PSNR by itself says little: 22 dB are good for leaves, and fog for a bare tabl
 docs/experiments/verdict.md.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The video of the captured path: the asset alone, as seen along the photographs' cameras."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

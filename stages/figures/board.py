@@ -1,7 +1,5 @@
 """A sheet of markers to print and lay next to the subject, with a ruler that shows whether the printer scaled it."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

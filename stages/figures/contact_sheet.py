@@ -1,7 +1,5 @@
 """Contact sheet of a scene: thumbnails of all images by split, and of the rejected ones."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """matplotlib as all figures import it: it writes into our cache folder alone, and its settings are its own defaults."""
 
-from __future__ import annotations
-
 import atexit
 import functools
 import os
@@ -16,8 +14,7 @@ from efficientnerf.backends.kernel_cache import cache_folder, first_private
 
 @functools.cache
 def matplotlib() -> Any:
-    """The package. On first import its list of fonts goes into `matplotlib` of our cache folder, and a `matplotlibrc`, as of the working folder, is
-    ignored."""
+    """The package. On first import its list of fonts goes into `matplotlib` of our cache folder, and a `matplotlibrc`, as of the working folder, is ignored."""
     first = "matplotlib" not in sys.modules
     if first:
         os.environ["MPLCONFIGDIR"] = _folder()

@@ -1,7 +1,5 @@
 """Rendering a camera path: PNG and EXR frames, and the video of them."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -26,24 +24,17 @@ AHEAD = 2  # frames that are rendered and not written yet
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a camera path is rendered.
+    """How a camera path is rendered."""
 
-    background      white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white; auto: the asset's environment, white where it has
-                    none
-    supersample     rays along each side of a pixel
-    exr             "off", "first" or "all": which frames are written as EXR too
-    video           name of the MP4 in the output folder, or None
-    fps, crf        of the video
-    compress_level  of the PNGs
-    """
-
+    # white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white; auto: the asset's environment, white where it has none
     background: str = "auto"
-    supersample: int = 1
-    exr: str = "first"
-    video: str | None = "turntable.mp4"
+    supersample: int = 1  # rays along each side of a pixel
+    exr: str = "first"  # "off", "first" or "all": which frames are written as EXR too
+    video: str | None = "turntable.mp4"  # name of the MP4 in the output folder, or None
+    # fps, crf: of the video
     fps: int = 30
     crf: int = 18
-    compress_level: int = USUAL
+    compress_level: int = USUAL  # of the PNGs
 
 
 Progress = Callable[[int, int], None]
@@ -65,7 +56,6 @@ def render_frames(
     progress  called with (frames done, frames) before each and at the end; may raise to stop
     reuse     keep frames that are complete by their note: only for a scratch folder of this very request
     draw      `efficientnerf.asset.rendering.render`, unless another is given
-    warn      reports frames that can't be kept
     """
     background, similarity = frame_background(options.background), similarity_of(tree)
     surrounded = options.background == "auto" and tree.environment is not None

@@ -1,7 +1,5 @@
 """Quality over cost: which choices no other beats in both, and a plot of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

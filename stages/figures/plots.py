@@ -1,7 +1,5 @@
 """Contact sheets, error maps and curves; the same bytes for the same input."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Preview of a mesh: orthographic views from four sides, coloured above, shaded grey below. And where it differs from the asset."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small pictures of runs, for pages that show many."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where the README of 0.1.0 had `turntable_cameras`: `efficientnerf.turntable_cameras` since 0.2. Goes with 0.3."""
 
-from __future__ import annotations
-
 import warnings
 
 import efficientnerf

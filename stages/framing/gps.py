@@ -5,8 +5,6 @@ The cameras are aligned to the positions by a robust similarity (of least square
 positions are metres off, which says nothing of a capture two metres wide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

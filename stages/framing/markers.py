@@ -4,8 +4,6 @@ OpenCV finds them; its corners are up to two pixels off where a picture is blurr
 where half of the light between inside and outside is reached, of light that is linear, so that blur does not move it.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ views of one thing, so that the visual hull projects onto them. Masks that leave
 See docs/experiments/silhouettes.md.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -11,8 +11,6 @@ its walls. Farther out, a plain sky is learned in patches. docs/experiments/near
 C photos, P points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The part of an asset to show or export: its foreground, all of it, or a box of the capture's frame."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Scene bounds of a capture: of its sparse points, of its visual hull, or of the volume that its cameras' frusta share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

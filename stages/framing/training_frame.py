@@ -4,8 +4,6 @@ All of it is estimated from the cameras, and from the sparse points or alpha cha
 lengths.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,8 +1,6 @@
 """Which way is up: what the source states, GPS, markers or the accelerometers of phones say, in this order, and whether they agree with each other and with the
 floor or table that the sparse points show."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -15,8 +15,6 @@ See docs/experiments/near-cameras.md.
 Reliable sparse points are evidence that space is filled: what would mask more than MAX_CONTRADICTED of them is refuted, and masks nothing. See docs/priors.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """nerfstudio's camera_path.json: the cameras of a video, one for each frame."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The trained field on disk: field.safetensors, read strictly and written whole or not at all."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Reading JSON files from anybody: bounded in size; errors name the file and the place."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Contents of sources without cameras: photographs and their masks by name, and frames of videos, which become photographs here."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -30,16 +28,11 @@ DECODERS = 16  # threads at most: each holds frames
 
 @dataclass
 class Material:
-    """Files by the name that they have from here on.
+    """Files by the name that they have from here on."""
 
-    paths   photographs
-    masks   by the name of the photograph
-    videos  videos whose frames are to be chosen
-    """
-
-    paths: dict[str, Path] = field(default_factory=dict)
-    masks: dict[str, Path] = field(default_factory=dict)
-    videos: dict[str, Path] = field(default_factory=dict)
+    paths: dict[str, Path] = field(default_factory=dict)  # photographs
+    masks: dict[str, Path] = field(default_factory=dict)  # by the name of the photograph
+    videos: dict[str, Path] = field(default_factory=dict)  # videos whose frames are to be chosen
 
 
 def photographs_of(job: Job, warn: Warn) -> Material:
@@ -81,10 +74,7 @@ def _material_of(path: Path, allow_outside: bool, warn: Warn) -> Material:
 
 
 def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Material:
-    """The material with frames of its videos among the photographs; writes which were chosen, and why, into the artifact. Raises BadInput.
-
-    max_side  longest side of the frames, pixels
-    """
+    """The material with frames of its videos among the photographs; writes which were chosen, and why, into the artifact. Raises BadInput."""
     if not found.videos:
         return found
     sizes = []
@@ -109,10 +99,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
 
 
 def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material:
-    """The material with views of its panoramas in their place. Raises BadInput.
-
-    max_side  longest side of the views, pixels
-    """
+    """The material with views of its panoramas in their place. Raises BadInput."""
     if job.settings.lens in ("perspective", "fisheye"):
         return found
     panoramas: dict[str, Path] = {}

@@ -4,8 +4,6 @@ A pixel of a photograph at an edge shows C = a F + (1 - a) B: a part a of the ob
 a fringe of B, another one in each photograph.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

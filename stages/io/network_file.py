@@ -1,7 +1,5 @@
 """Networks that the user has: ONNX files, run by onnxruntime on the CPU. Nothing is downloaded."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,6 @@ def open_network(path: Path, option: str, threads: int, refused: Refused) -> Any
     """The session of onnxruntime.
 
     option   of the command line, by which the file was given
-    threads  of one run
     Raises UsageError where onnxruntime or the file is missing, what `refused` makes where the file holds no network.
     """
     data = _bytes_of(path, option)

@@ -1,7 +1,5 @@
 """Reading photographs: after EXIF rotation, 8 bits sRGB, at a working size."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,36 +23,26 @@ _FISHEYE = ("fisheye", "fish-eye", "fish eye")  # in names of lenses; rectilinea
 
 @dataclass(frozen=True)
 class PhotoDetails:
-    """What is known of a photograph besides its pixels.
+    """What is known of a photograph besides its pixels."""
 
-    width, height            of the source after EXIF rotation, pixels
-    work_width, work_height  at working size
-    orientation              EXIF's number, 1 where there is none
-    focal                    pixels of the source, from EXIF, or None
-    maker                    make and model
-    fisheye                  whether EXIF names a fisheye lens
-    """
-
+    # width, height: of the source after EXIF rotation, pixels
     width: int
     height: int
+    # work_width, work_height: at working size
     work_width: int
     work_height: int
-    orientation: int
-    focal: float | None
-    maker: str
-    fisheye: bool
+    orientation: int  # EXIF's number, 1 where there is none
+    focal: float | None  # pixels of the source, from EXIF, or None
+    maker: str  # make and model
+    fisheye: bool  # whether EXIF names a fisheye lens
 
 
 @dataclass(frozen=True)
 class DecodedPhoto(PhotoDetails):
-    """A photograph after EXIF rotation.
+    """A photograph after EXIF rotation."""
 
-    rgb     (h, w, 3) uint8 sRGB at working size
-    opaque  (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
-    """
-
-    rgb: np.ndarray
-    opaque: np.ndarray | None
+    rgb: np.ndarray  # (h, w, 3) uint8 sRGB at working size
+    opaque: np.ndarray | None  # (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
 
 
 def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
@@ -127,8 +115,7 @@ def upright_mask(mask: np.ndarray, orientation: int, width: int, height: int) ->
 
 
 def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
-    """Whether two sizes (both (width, height), or both (height, width)) have the same aspect: within 1 %, or within the rounding of a
-    side by one pixel."""
+    """Whether two sizes (both (width, height), or both (height, width)) have the same aspect: within 1 %, or within the rounding of a side by one pixel."""
     (w, h), (width, height) = size, other
     if min(w, h, width, height) <= 0:
         return False

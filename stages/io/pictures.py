@@ -13,8 +13,6 @@ raises becomes UnreadableImage, so that one bad picture is left out and ends not
 What is not sRGB by the picture's ICC profile is converted to it then (`decoders/colour_profile.py`); a profile that is damaged is left aside.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os
@@ -61,17 +59,13 @@ class UnreadableImage(Exception):
 
 @dataclass(frozen=True)
 class Header:
-    """The header of a picture.
+    """The header of a picture."""
 
-    stored_width, stored_height  of the pixels as stored
-    orientation                  EXIF's number, 1-8, of the pixels as they are decoded
-    alpha                        whether the format holds an alpha channel
-    """
-
+    # stored_width, stored_height: of the pixels as stored
     stored_width: int
     stored_height: int
-    orientation: int
-    alpha: bool
+    orientation: int  # EXIF's number, 1-8, of the pixels as they are decoded
+    alpha: bool  # whether the format holds an alpha channel
 
     @property
     def size(self) -> tuple[int, int]:

@@ -1,7 +1,5 @@
 """PNG files: the same pixels are the same bytes, and a file that is there is whole."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a stage reads of photographs, each decoded once for a size: the photographs at working sizes, their alpha channels and masks at a small one."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from dataclasses import dataclass, field, fields, replace
@@ -23,17 +21,12 @@ SMALL = 160  # px, longest side
 
 @dataclass(frozen=True, eq=False)
 class KeptPhoto:
-    """A photograph in the scratch folder.
-
-    image   PNG of its pixels, 8 bits sRGB, after EXIF rotation, at working size
-    opaque  PNG that is black where the file's alpha is below one half; None without transparent pixels
-    decoded its pixels, where it has just been decoded
-    """
+    """A photograph in the scratch folder."""
 
     details: PhotoDetails
-    image: Path
-    opaque: Path | None
-    decoded: np.ndarray | None = None
+    image: Path  # PNG of its pixels, 8 bits sRGB, after EXIF rotation, at working size
+    opaque: Path | None  # PNG that is black where the file's alpha is below one half; None without transparent pixels
+    decoded: np.ndarray | None = None  # its pixels, where it has just been decoded
 
     def rgb(self) -> np.ndarray:
         """(h, w, 3) uint8 sRGB."""
@@ -43,13 +36,11 @@ class KeptPhoto:
 @dataclass
 class PhotoReader:
     """
-    folder  in the stage's scratch, for photographs at working sizes; None where masks alone are read
-
     Alpha channels and masks are (h, w) uint8, upright, longest side at most `SMALL`, the highest of each block; pixels up to `TRANSPARENT` are 0. None where
     a photograph has none, or it cannot be read, which is reported where it is needed.
     """
 
-    folder: Path | None = None
+    folder: Path | None = None  # in the stage's scratch, for photographs at working sizes; None where masks alone are read
     _alpha: dict[Path, np.ndarray | None] = field(default_factory=dict)
     _masks: dict[tuple[Path, str, str], np.ndarray | None] = field(default_factory=dict)
 

@@ -3,8 +3,6 @@
 This is the one place that says what views, with what cameras, a field was trained on: what comes after uses `load_scene`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

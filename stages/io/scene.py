@@ -9,8 +9,6 @@ Format 2 adds the space of the field and the forward-facing scene; format 1 is r
 Training frame: right-handed, z up, origin at the centre of the box, the largest half extent of the box 1.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 from dataclasses import asdict, dataclass
@@ -67,27 +65,18 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """All views of a capture in the training frame.
+    """All views of a capture in the training frame."""
 
-    kind        the kind of the capture ("photographs", "blender", ...)
-    bounds      (2, 3) scene bounds
-    background  constant sRGB colour (0-1) that the RGBA images are composited on, in bounded scenes; None: unbounded
-    points      whether points.safetensors lies next to scene.json
-    metric      whether a unit of the capture's frame is a metre
-    space       of the field: "box" (bounded), "contracted", "ndc", or "auto": contracted without a background, else box
-    forward     the forward-facing scene, for ndc alone
-    """
-
-    kind: str
+    kind: str  # the kind of the capture ("photographs", "blender", ...)
     views: tuple[View, ...]
-    bounds: np.ndarray
-    background: tuple[float, float, float] | None
+    bounds: np.ndarray  # (2, 3) scene bounds
+    background: tuple[float, float, float] | None  # constant sRGB colour (0-1) that the RGBA images are composited on, in bounded scenes; None: unbounded
     world_from_capture: Similarity
     orbit: Orbit
-    points: bool = False
-    metric: bool = False
-    space: str = "auto"
-    forward: ForwardFacing | None = None
+    points: bool = False  # whether points.safetensors lies next to scene.json
+    metric: bool = False  # whether a unit of the capture's frame is a metre
+    space: str = "auto"  # of the field: "box" (bounded), "contracted", "ndc", or "auto": contracted without a background, else box
+    forward: ForwardFacing | None = None  # the forward-facing scene, for ndc alone
 
     def __post_init__(self) -> None:
         if self.space not in SPACES or (self.space == "ndc") != (self.forward is not None):

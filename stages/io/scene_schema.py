@@ -1,7 +1,5 @@
 """What scene.json may hold, by msgspec: types, shapes and bounds of every number. `stages.io.scene` gives it its meaning."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 

@@ -1,7 +1,5 @@
 """The images that later stages read: after EXIF rotation, 8 bits sRGB, at working size, with masks."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from dataclasses import dataclass
@@ -30,20 +28,13 @@ NEITHER = Silhouettes()
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A source image after EXIF rotation.
+    """A source image after EXIF rotation."""
 
-    pixels       (H, W, 3 or 4) uint8 sRGB, straight alpha
-    verbatim     whether the file itself holds exactly these pixels in a form that later stages read
-    orientation  EXIF's number, 1-8
-    lossy        whether the format keeps pixels only about as they were
-    fault        why the file's colour profile is not used, if it has one and it is not
-    """
-
-    pixels: np.ndarray
-    verbatim: bool
-    orientation: int
-    lossy: bool
-    fault: str | None = None
+    pixels: np.ndarray  # (H, W, 3 or 4) uint8 sRGB, straight alpha
+    verbatim: bool  # whether the file itself holds exactly these pixels in a form that later stages read
+    orientation: int  # EXIF's number, 1-8
+    lossy: bool  # whether the format keeps pixels only about as they were
+    fault: str | None = None  # why the file's colour profile is not used, if it has one and it is not
 
 
 @dataclass(frozen=True)
@@ -58,10 +49,7 @@ class Written:
 
 
 def decode(path: Path, as_stored: bool = False) -> Decoded:
-    """Every pixel of an image file; raises UnreadableImage, also where the file ends early.
-
-    as_stored  without the picture's colour profile
-    """
+    """Every pixel of an image file; raises UnreadableImage, also where the file ends early."""
     with opened(path) as image:
         orientation, profile = orientation_of(image), profile_of(image)
         verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image) and profile.transform is None
@@ -75,7 +63,6 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouett
     """Write the working image of a photo, and its mask if it has one.
 
     relative      path of the image below folder/images, with its source's extension
-    max_side      longest side of the working image, pixels
     silhouettes   what becomes the alpha channel of the working image: the photo's own, the levels of its mask, or where both are silhouettes the lower of
                   the two. Else pixels with alpha below one half, and those that the mask leaves out, go into the mask of the working image
     may_be_empty  whether a silhouette may leave nothing

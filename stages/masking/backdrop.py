@@ -6,8 +6,6 @@ than a few of them lie in the white, there is something, and nothing is masked. 
 of a turntable, is not in that hull, and left out too. docs/experiments/silhouettes.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -36,10 +34,7 @@ LEAST_POINTS = 300  # reliable sparse points, without which nothing refutes
 
 
 def without_white_backdrop(job: Job, capture: Capture, paths: Mapping[str, Path], reader: PhotoReader, warn: Any) -> Capture:
-    """The capture with silhouettes of its subject as masks, where it stands before such a backdrop; else as it is.
-
-    paths  photographs by name
-    """
+    """The capture with silhouettes of its subject as masks, where it stands before such a backdrop; else as it is."""
     points = capture.points
     reliable = np.zeros(0, int) if points is None else np.flatnonzero(reliable_points(points, len(capture.photos)))
     if points is None or len(reliable) < LEAST_POINTS or not _white_at_borders(job, capture, reader):

@@ -4,8 +4,6 @@ Where the camera goes round an object, its surroundings give features, and the o
 the background shows no motion. docs/experiments/silhouettes.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -32,7 +30,6 @@ def silhouettes_with_surroundings(
     were left below what is transparent.
 
     paths, masks  file of each photograph, and of its mask, by name
-    choice        `poses.masks`
     """
     photos = [photo for name in sorted(paths) if (photo := photo_without_camera(name, paths[name], masks.get(name))) is not None]
     kind = Silhouettes(alpha=not masks, masks=bool(masks))

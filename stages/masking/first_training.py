@@ -3,8 +3,6 @@
 It is small and always on the CPU: a scene has the same bytes whatever its later stages compute on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,18 +35,14 @@ FIRST = TrainSettings(iterations=1200, log2_hashmap_size=17, finest_resolution=1
 
 @dataclass(frozen=True, eq=False)
 class FirstField:
-    """A trained field of a whole scene.
-
-    near, far  of all views, along their axes
-    cameras    of the photographs, in the training frame, at the size that was trained on
-    pixels     that it was trained on
-    """
+    """A trained field of a whole scene."""
 
     model: Model
+    # near, far: of all views, along their axes
     near: float
     far: float
-    cameras: tuple[Camera, ...]
-    pixels: Pixels
+    cameras: tuple[Camera, ...]  # of the photographs, in the training frame, at the size that was trained on
+    pixels: Pixels  # that it was trained on
 
 
 def first_training_needed(count: int) -> Need:

@@ -5,8 +5,6 @@
 Nothing is masked on a guess: where no subject stands out, or its silhouettes are not those of one compact thing, this is refused.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

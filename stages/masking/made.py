@@ -1,7 +1,5 @@
 """Masks as files, for photographs that have none."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -29,7 +27,6 @@ def made_masks(
 ) -> dict[str, Path]:
     """Name -> mask, written to a folder, of the photographs whose background is found.
 
-    paths  photograph by name
     how    static, green, white or #rrggbb
     Raises BadInput where no photograph has one.
     """

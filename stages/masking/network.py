@@ -4,8 +4,6 @@ A network takes (1, 3, h, w) RGB, normalised, and gives (1, 1, h, w) of how much
 follows rembg for the networks that it knows: U2-Net, silueta and BiRefNet are normalised by ImageNet's mean and deviation, IS-Net (DIS) by its own.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Cameras of photographs that state none: found by what masks keep, or by all that the photographs show, whichever the camera moved past."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ Masks that are white but for one compact thing in nearly all photographs either 
 black shapes are views of one thing: these fit its visual hull, and shapes of moving things do not. docs/experiments/silhouettes.md
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,13 +26,10 @@ INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white reverses this"
 
 @dataclass(frozen=True)
 class Kept:
-    """Masks by name of the photograph.
+    """Masks by name of the photograph."""
 
-    masks      that keep what is white, as far as is known
-    inverted   the same with black and white exchanged, where cameras have yet to show whether that is right; else none
-    """
-
-    masks: dict[str, Path]
+    masks: dict[str, Path]  # that keep what is white, as far as is known
+    # the same with black and white exchanged, where cameras have yet to show whether that is right; else none
     inverted: dict[str, Path] = field(default_factory=dict)
 
 

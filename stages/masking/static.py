@@ -4,8 +4,6 @@ A pixel that shows the background shows the same colour again and again; the obj
 photographs. N photographs of (h, w).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

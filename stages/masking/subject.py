@@ -6,8 +6,6 @@ to them.
 N points, M cells, R rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,16 +32,11 @@ LEAST_WEIGHT = 1e-3  # of a sample
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A part of space.
+    """A part of space."""
 
-    cells   (M, 3) centres of the cells that hold the subject
-    reach   how far from one of these it may be
-    planes  that support it, and how far above each it begins
-    """
-
-    cells: np.ndarray
-    reach: float
-    planes: tuple[tuple[Plane, float], ...]
+    cells: np.ndarray  # (M, 3) centres of the cells that hold the subject
+    reach: float  # how far from one of these it may be
+    planes: tuple[tuple[Plane, float], ...]  # that support it, and how far above each it begins
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool."""

@@ -6,8 +6,6 @@ cameras found by the subject alone look at it from sides from which no camera co
 docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -8,8 +8,6 @@
 docs/experiments/memory.md, fleet.md
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,18 +26,13 @@ PREVIEWS = 6  # pictures of a stage, as large as a working image
 
 @dataclass(frozen=True)
 class Known:
-    """What is known before a stage begins.
-
-    settings  of each stage by its name, dataclasses
-    device    that it computes on
-    memory    bytes that it may take: what does not fit there is written; None: no limit
-    """
+    """What is known before a stage begins."""
 
     run: Path
     sources: Sequence[Path]
-    settings: Mapping[str, Any]
-    device: str = "cpu"
-    memory: int | None = None
+    settings: Mapping[str, Any]  # of each stage by its name, dataclasses
+    device: str = "cpu"  # that it computes on
+    memory: int | None = None  # bytes that it may take: what does not fit there is written; None: no limit
 
     def inputs(self, kind: type[T]) -> T:
         """The inputs of a stage."""

@@ -4,8 +4,6 @@ Memory decides where data lie and in how large pieces they are worked on, and ne
 setting that would make it smaller. So an artifact has the same bytes whatever memory it was made in, and memory is no part of its request.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -72,7 +70,6 @@ def refuse_more_than(limit: Limit | None, what: str, need: Need, remedy: str) ->
     """TooLittleMemory where a need is more than the limit; None: no limit is known.
 
     what    has the need, the beginning of the sentence
-    remedy  as for `refuse_what_does_not_fit`
     """
     if limit is not None and need.total > limit.bytes:
         text = f"{what}: needs {need.text()}; {size_text(limit.bytes)} may be taken ({limit.whose}). {remedy} Or give more by --memory."

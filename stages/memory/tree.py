@@ -1,7 +1,5 @@
 """Memory of an asset."""
 
-from __future__ import annotations
-
 from efficientnerf.asset.format import outline
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree

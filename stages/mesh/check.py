@@ -1,7 +1,5 @@
 """The check of a mesh against the asset that it was made of: from captured cameras and from a turntable's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from typing import Any

@@ -1,8 +1,6 @@
 """The mesh that the stage `mesh` has written, read again: the file of shared vertices, where the GLB has them in the texture, and that. And files of a mesh
 without faces, which exporters refuse."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Memory of extracting a surface. docs/experiments/memory.md"""
 
-from __future__ import annotations
-
 import math
 
 from efficientnerf.asset.tree import NerfTree

@@ -1,7 +1,5 @@
 """The surface of a mesh fitted to the training photographs, where the cameras are good enough for that."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

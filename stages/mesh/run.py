@@ -1,7 +1,5 @@
 """The mesh stage: the asset's surface with a texture, as PLY and OBJ in the capture's frame and as GLB, a report, and a preview."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """How the surface is meshed and textured."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

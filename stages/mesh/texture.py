@@ -1,7 +1,5 @@
 """The texture of a mesh: from the training photographs, one in memory at a time, or from the asset. Test and validation views are left for scores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial

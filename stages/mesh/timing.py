@@ -1,7 +1,5 @@
 """How long the parts of meshing take."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

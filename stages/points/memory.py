@@ -1,7 +1,5 @@
 """Memory of spreading points over the surface."""
 
-from __future__ import annotations
-
 from stages.memory.forecast import Known
 from stages.memory.need import Need
 from stages.memory.tree import asset_of

@@ -1,7 +1,5 @@
 """The points stage: points spread evenly over the asset's surface, with normals and colours, as PLY in the capture's frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from efficientnerf.asset.format import load

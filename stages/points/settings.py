@@ -1,7 +1,5 @@
 """How points are spread over the surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Memory of reading photographs and finding their cameras. docs/experiments/memory.md"""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from functools import partial

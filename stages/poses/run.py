@@ -5,8 +5,6 @@
 Images are not undistorted: later stages trace the distorted rays.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace

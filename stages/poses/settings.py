@@ -1,7 +1,5 @@
 """How a source is read and framed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Attempts that match again work in scratch folders of their own, made anew: lefto
 docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -117,19 +115,13 @@ class Search:
 
 @dataclass(frozen=True)
 class Attempt:
-    """
-    name    in reports
-    when    whether it is made
-    run     its sub-models; None where nothing was tried
-    least   share of the matches that has to agree with the result, for it to be kept
-    better  times the best score, that it has to have
-    """
+    """One way to better the result so far."""
 
-    name: str
-    when: Callable[[Search], object]
-    run: Callable[[Search], Models | None]
-    least: Callable[[Search], float] = lambda search: 0.0
-    better: Callable[[Search, Models], float] = lambda search, models: BETTER
+    name: str  # in reports
+    when: Callable[[Search], object]  # whether it is made
+    run: Callable[[Search], Models | None]  # its sub-models; None where nothing was tried
+    least: Callable[[Search], float] = lambda search: 0.0  # share of the matches that has to agree with the result, for it to be kept
+    better: Callable[[Search, Models], float] = lambda search, models: BETTER  # times the best score, that it has to have
 
 
 def anew(name: str, when: Callable[[Search], bool], options: mapping.Options) -> Attempt:

@@ -1,7 +1,5 @@
 """The process that structure from motion runs in; `stages.sfm.process` starts it and states the protocol."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue

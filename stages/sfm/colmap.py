@@ -1,7 +1,5 @@
 """pycolmap, imported without harm and without its log."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import importlib.util

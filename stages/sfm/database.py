@@ -5,8 +5,6 @@ COLMAP writes without syncing, and the folder may come from someone else: a run 
 old one are copied that are as a note says they were written (`stages.scratch`), and that COLMAP can read without reaching beyond them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import sqlite3
@@ -41,26 +39,19 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class WorkImage:
-    """The copy of one photograph after EXIF rotation.
+    """The copy of one photograph after EXIF rotation."""
 
-    name            of the photograph
-    file            of the copy: numbers in sorted order of name
-    width, height   of the photograph after EXIF rotation, pixels
-    work_width, work_height  of the copy
-    focal           pixels of the photograph, from its EXIF data, or None
-    camera_key      photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
-    fisheye         whether it was taken through a fisheye lens
-    """
-
-    name: str
-    file: str
+    name: str  # of the photograph
+    file: str  # of the copy: numbers in sorted order of name
+    # width, height: of the photograph after EXIF rotation, pixels
     width: int
     height: int
+    # work_width, work_height: of the copy
     work_width: int
     work_height: int
-    focal: float | None
-    camera_key: str
-    fisheye: bool = False
+    focal: float | None  # pixels of the photograph, from its EXIF data, or None
+    camera_key: str  # photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
+    fisheye: bool = False  # whether it was taken through a fisheye lens
 
 
 def images_of(work: Path) -> Path:
@@ -180,8 +171,7 @@ def copy_database(work: Path, place: Path) -> None:
 
 
 def copy_with_own_cameras(work: Path, place: Path, images: Sequence[WorkImage]) -> None:
-    """Replace the database of another scratch folder by one of the same images, features and matches, but with a camera for each image, of the first
-    guess."""
+    """Replace the database of another scratch folder by one of the same images, features and matches, but with a camera for each image, of the first guess."""
     remove_database(database_path(place))
     _list_images(database_path(place), place, [replace(image, camera_key=image.file) for image in images])
     with contextlib.closing(attached(place, work)) as connection, connection:

@@ -5,8 +5,6 @@ rest, and the rows of COLMAP's database without the image's number, as MessagePa
 without; 0 keeps none. Features are detected where there can be no such folder, or a file of it is damaged.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib
@@ -50,7 +48,6 @@ def keys_of(place: Path, files: Sequence[str], asked: Mapping[str, object]) -> d
     """The key of each copy.
 
     place  that `images` and `masks` are in
-    asked  COLMAP's options that features depend on
     """
     wanted = repr(sorted(asked.items())).encode()
     keys = {}

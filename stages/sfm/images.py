@@ -1,7 +1,5 @@
 """Copies of the photographs that COLMAP reads: after EXIF rotation, at working size, with their masks; decoded once for all searches of a stage."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
@@ -61,10 +59,7 @@ def prepare_images(
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
     """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
-    paths    the file of each photograph, by name
     masks    of some or all names; None: the photograph as a whole, whatever its alpha channel says
-    lens     "fisheye", "perspective", or "auto": fisheye where EXIF data say so
-    threads  on which photographs are read
     copies   folder that others read photographs of the stage from (`PhotoReader`); None: one in the work folder
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 

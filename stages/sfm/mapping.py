@@ -3,8 +3,6 @@
 See docs/experiments/sfm.md.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -96,10 +94,7 @@ def _incremental_mapping(
     refine_camera: bool = True,
     start: Any = None,
 ) -> list[Any]:
-    """All sub-models, by the number of registered photographs, then of points. On one thread: with two the results vary.
-
-    start  a model to go on from
-    """
+    """All sub-models, by the number of registered photographs, then of points. On one thread: with two the results vary."""
     with quiet_pycolmap() as pycolmap:
         options = pipeline_options(pycolmap, seed, options_of_attempt)
         options.ba_refine_focal_length = options.ba_refine_extra_params = refine_camera

@@ -1,7 +1,5 @@
 """Features of the photographs' copies and verified matches between them, in COLMAP's database, resumable."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -30,16 +30,13 @@ ROUNDS = 2  # of triangulating and adjusting: the second finds more points that 
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """Points of a model and the rays by which a photograph each saw them, in the model's frame.
+    """Points of a model and the rays by which a photograph each saw them, in the model's frame."""
 
-    xyz, centre, direction  (N, 3)
-    focal                   (N,) px
-    """
-
+    # xyz, centre, direction: (N, 3)
     xyz: np.ndarray
     centre: np.ndarray
     direction: np.ndarray
-    focal: np.ndarray
+    focal: np.ndarray  # (N,) px
 
     def only(self, which: np.ndarray) -> Sights:
         return Sights(self.xyz[which], self.centre[which], self.direction[which], self.focal[which])

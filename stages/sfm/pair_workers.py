@@ -4,8 +4,6 @@ A worker is a child as that of structure from motion (`stages.sfm.process`), sta
 into its database, matches, and reports; one process copies the rows into the database of all.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -93,10 +91,7 @@ def match_for(arguments: Mapping[str, Any], *, progress: Callable[..., None], sa
 
 
 def match_block(database: Path, listed: Path, block: Block, names: Mapping[int, str], seed: int, guided: bool = False) -> None:
-    """Match pairs of images on one thread.
-
-    listed  scratch file
-    """
+    """Match pairs of images on one thread."""
     with quiet_pycolmap() as pycolmap:
         matching = pycolmap.FeatureMatchingOptions()
         matching.use_gpu = False

@@ -9,8 +9,6 @@ photographs' own SIFT features, over words that are found in them by k-means: no
 whole numbers are exact, so that the pairs are the same on any machine. docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -62,10 +60,7 @@ def sequential_pairs(count: int) -> set[Pair]:
 
 
 def retrieved_pairs(likeness: np.ndarray) -> set[Pair]:
-    """Each image with the MOST_LIKE that are most like it, with those of the ranks LESS_LIKE, and with some that follow it.
-
-    likeness  (n, n), larger is more alike
-    """
+    """Each image with the MOST_LIKE that are most like it, with those of the ranks LESS_LIKE, and with some that follow it."""
     count = len(likeness)
     ranked = ranks(likeness)
     wanted = {ordered(i, int(ranked[i, rank])) for i in range(count) for rank in (*range(MOST_LIKE), *LESS_LIKE) if rank < count - 1}

@@ -10,8 +10,6 @@ At each safe point the child waits for the answer, so that signals are the paren
 A child that comes to no safe point, as within one bundle adjustment, is killed soon after it was asked to stop: what it has written is used again.
 """
 
-from __future__ import annotations
-
 import builtins
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """A model of COLMAP as a capture: cameras at the photographs' own size, points, facts, and the reasons why photographs have none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

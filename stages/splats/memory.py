@@ -1,7 +1,5 @@
 """Memory of making 3D Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Targets of 3D Gaussians: training photographs, or the asset's own renders."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

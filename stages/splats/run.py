@@ -3,8 +3,6 @@
 Where splats.make is off, or auto and none can be made, the report says so, and there is no more.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

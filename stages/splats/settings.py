@@ -1,7 +1,5 @@
 """How the asset becomes 3D Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Photographs of a scene as if all had been exposed alike: what an asset, its Gaussians and the texture of its mesh are made of."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

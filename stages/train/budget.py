@@ -7,8 +7,6 @@ written down each time: a resumed run reads it, and the schedule that a run ende
 `efficientnerf.training.loop.train` is given it, on any machine with the same number of threads.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Checkpoints in the stage's scratch folder, which belongs to the request; the last two are kept."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

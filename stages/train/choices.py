@@ -3,8 +3,6 @@
 What comes after reads the settings among them from the field, and the scene as training used it by `stages.io.refined_cameras.load_scene`.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """The training data of a scene: pixels with their rays, near and far planes, and sparse depth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

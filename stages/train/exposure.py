@@ -1,7 +1,5 @@
 """Whether the photographs of a scene differ in exposure, and what their learning begins with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

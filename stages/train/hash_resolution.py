@@ -5,8 +5,6 @@ pixel, and the number of entries follows the number of pixels. Elsewhere surface
 pixels. docs/experiments/hash-grid.md
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

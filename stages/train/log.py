@@ -1,7 +1,5 @@
 """The log of a training run, and the curve that is drawn of it."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """Memory of training. docs/experiments/memory.md"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

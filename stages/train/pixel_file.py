@@ -1,7 +1,5 @@
 """Training pixels in a file, for images that take more memory than there is. The same bytes come out as of an array."""
 
-from __future__ import annotations
-
 import errno
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """Renders of one view now and then, next to its photograph."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Callable

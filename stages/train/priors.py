@@ -8,8 +8,6 @@ Reliable sparse points (`stages.framing.near_planes`) are evidence that space is
 MAX_CONTRADICTED of them; masks are given by the user, or by a stage that has checked them. All rules of the program: docs/priors.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

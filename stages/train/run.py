@@ -10,8 +10,6 @@ curve.png          PSNR over steps
 previews/          renders of a validation view
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

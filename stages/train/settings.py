@@ -1,7 +1,5 @@
 """How the field is trained (`efficientnerf.training.settings`), and what is refused before."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Memory of rendering and writing frames of an asset, one at a time. docs/experiments/memory.md"""
 
-from __future__ import annotations
-
 from efficientnerf.asset.tree import NerfTree
 from stages.memory.forecast import Known
 from stages.memory.need import MIB, Need, libraries

@@ -1,7 +1,5 @@
 """The turntable stage: PNG frames, MP4 and EXR of the baked asset along an orbit."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """What the turntable shows and how it is written."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

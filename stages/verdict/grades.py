@@ -1,5 +1,3 @@
 """The grades of all verdicts, best first."""
 
-from __future__ import annotations
-
 GRADES = ("good", "usable", "poor", "failed")

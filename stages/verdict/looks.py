@@ -1,7 +1,5 @@
 """How each photograph of a capture looks: sharp or blurred, bright or dark, and which of them are the same picture twice."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ The subject is where the view axes meet. Points behind it say nothing of it: in 
 all cameras see from about one place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

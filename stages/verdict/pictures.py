@@ -1,7 +1,5 @@
 """Pictures of what structure from motion found: cameras from above and from the side, which photographs match, and photographs by sharpness."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

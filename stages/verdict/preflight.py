@@ -4,8 +4,6 @@ Overlap is checked on small pictures: SIFT features of each, compared with those
 one epipolar geometry that the matches fit. It is coarser than structure from motion, and quicker by far. docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 import contextlib
 import tempfile
 import time

@@ -9,8 +9,6 @@ The figures are those of metrics.json (`stages.evaluate.summary`) and the verdic
 give a better grade. Each threshold and its reason: docs/experiments/verdict.md.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Iterable, Mapping

@@ -4,8 +4,6 @@ Processor seconds of a stage are assumed proportional to its steps, pictures or 
 docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

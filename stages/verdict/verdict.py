@@ -6,8 +6,6 @@
     failed  no asset can be made of it
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any

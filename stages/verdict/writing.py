@@ -1,7 +1,5 @@
 """The verdict of the poses stage: found, written with its pictures, and reported."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 from typing import Any

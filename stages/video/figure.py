@@ -1,7 +1,5 @@
 """The sheet of chosen frames: sharpness and motion over time, and the frames themselves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

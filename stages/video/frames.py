@@ -6,8 +6,6 @@
 Memory does not grow with the length of a video but for three numbers a frame.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -32,11 +30,9 @@ Progress = Callable[..., None]
 
 @dataclass(frozen=True)
 class Looked:
-    """The result of the first reading of a video: number, time, sharpness and motion of each frame looked at.
+    """The result of the first reading of a video: number, time, sharpness and motion of each frame looked at."""
 
-    width, height  upright, pixels
-    """
-
+    # width, height: upright, pixels
     width: int
     height: int
     duration: float
@@ -51,28 +47,19 @@ class Looked:
 
 @dataclass(frozen=True)
 class Chosen:
-    """The frames of the videos.
+    """The frames of the videos."""
 
-    paths   name -> PNG, in order of time within each video; a name is that of the video, /, the frame's number
-    camera  name -> the camera that took it, in words; frames of one video have one
-    record  for frames.json
-    """
-
-    paths: dict[str, Path]
-    camera: dict[str, str]
-    record: list[dict[str, object]]
+    paths: dict[str, Path]  # name -> PNG, in order of time within each video; a name is that of the video, /, the frame's number
+    camera: dict[str, str]  # name -> the camera that took it, in words; frames of one video have one
+    record: list[dict[str, object]]  # for frames.json
 
 
 @dataclass(frozen=True)
 class Reader:
-    """What readers need of the stage.
+    """What readers need of the stage."""
 
-    threads  that decode
-    work     scratch folder
-    """
-
-    threads: int
-    work: Path
+    threads: int  # that decode
+    work: Path  # scratch folder
     progress: Progress
     safe_point: Callable[[], None]
     warn: Callable[[str], object]
@@ -81,9 +68,7 @@ class Reader:
 def frames_of(videos: Mapping[str, Path], *, count: int, max_side: int, reader: Reader) -> Chosen:
     """Choose frames of videos and write them. Raises UnreadableVideo, whose text names the video.
 
-    videos    file of each by name
     count     frames of all together, at most
-    max_side  longest side of what is written, pixels
     """
     looked = {name: _looked(name, path, place, reader) for place, (name, path) in enumerate(videos.items())}
     limits = choice.shares([found.motion[-1] for found in looked.values()], count)

@@ -4,8 +4,6 @@ The views of all pictures of one size have one lens, whose focal length is exact
 panorama shows who carries the camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -65,7 +63,6 @@ def views_of(
 ) -> dict[str, Path]:
     """PNGs of the views of panoramas by name: that of the panorama, /, degrees to the right; without panoramas that cannot be read.
 
-    max_side  of a view, pixels
     work      scratch folder; what an earlier call left in it is used again
     """
     found: dict[str, Path] = {}

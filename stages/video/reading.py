@@ -4,8 +4,6 @@ The demuxer is chosen by the file's first bytes and is handed the open file alon
 several threads, which changes no bit of an intact stream; where one is damaged, what its concealment gives may, and it is read on one thread again.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator
@@ -43,14 +41,10 @@ class UnreadableVideo(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame as it was decoded.
+    """A frame as it was decoded."""
 
-    index  of the frame in the file, from 0
-    time   seconds, as the file states it
-    """
-
-    index: int
-    time: float
+    index: int  # of the frame in the file, from 0
+    time: float  # seconds, as the file states it
     _decoded: Any
     _size: tuple[int, int]
     _matrix: tuple[int, int, int, int]

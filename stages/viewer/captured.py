@@ -1,7 +1,5 @@
 """The captured cameras of a run as the viewer takes them, and small photographs of them without distortion."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from pathlib import Path

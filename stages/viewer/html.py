@@ -1,7 +1,5 @@
 """What pages of assets and of fleets share: texts within HTML, and the size up to which an asset gets a page."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -4,8 +4,6 @@ The page holds the asset's own bytes in the layout `compact`, compressed, and ch
 Its scripts are the modules next to this one.
 """
 
-from __future__ import annotations
-
 import base64
 import functools
 import hashlib

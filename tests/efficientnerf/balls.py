@@ -1,7 +1,5 @@
 """A ball with a closed form as a scene to learn: cameras round it, its images, and its models."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ The first variant of a kernel is built for each generation, others for the last.
 (what does not fit the registers).
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import tempfile

@@ -1,7 +1,5 @@
 """Rays with random samples for compositing."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

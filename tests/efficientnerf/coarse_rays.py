@@ -1,7 +1,5 @@
 """Rays through density voxels, with coarse samples on them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

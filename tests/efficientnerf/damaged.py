@@ -1,7 +1,5 @@
 """Damaged asset files: the tiny file in each layout, its parts, and what puts them together again with something changed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Where the tests of the CUDA kernels run: on the device, or on the CPU through Triton's interpreter. Imported before the kernels are."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

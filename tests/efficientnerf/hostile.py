@@ -1,7 +1,5 @@
 """A hostile file for each rule of FORMAT.md, and its message."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A hostile file for each rule of FORMAT.md about whole scenes: nested grids, environment map, region."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

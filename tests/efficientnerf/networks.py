@@ -1,7 +1,5 @@
 """Random weights of a small network, and the passes of the CPU kernels through it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba import mlp

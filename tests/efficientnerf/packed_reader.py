@@ -1,7 +1,5 @@
 """The layout `packed` made `compact`, written from section 14 of efficientnerf/asset/FORMAT.md alone: plain numpy, checks no more than it needs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

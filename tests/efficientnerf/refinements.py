@@ -1,7 +1,5 @@
 """Gradients of a rendered tree's loss, by autograd and by the kernels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -12,7 +10,6 @@ import torch
 from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import RefinementState
-from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import EARLY_STOP, Hyperparameters, Moments, RayTargets
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
@@ -20,6 +17,7 @@ from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
 from efficientnerf.backends.numba.tree_training.steps import values_of
 from tests.efficientnerf.balls import BOUNDS
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
 

@@ -1,7 +1,5 @@
 """Three small views of different sizes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera

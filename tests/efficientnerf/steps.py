@@ -1,7 +1,5 @@
 """Learning rates and gradients of successive steps of an optimiser."""
 
-from __future__ import annotations
-
 import torch
 
 RATES = [0.01, 0.02, 0.015, 0.01]

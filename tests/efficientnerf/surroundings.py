@@ -1,7 +1,5 @@
 """A scene with surroundings as a field in closed form: a ball on the ground, a wall far round it, and the sky above that."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What `import efficientnerf` promises: names, types, an import that costs nothing, and names of earlier releases for a while."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """The model: both stages along rays, the counts of what is evaluated, sizes and states."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

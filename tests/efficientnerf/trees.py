@@ -1,7 +1,5 @@
 """Random sparse trees, and rays through and beside them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Slanted walls before a reference camera, as trees in normalised device coordinates."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels

@@ -1,7 +1,5 @@
 """A workflow in the shape of a diamond, whose stages of the middle run side by side; as a program, the child that they run in."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Children of a worker: what a child that dies has started ends with it, on systems without waitid too."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How a run ends: the error that ended it is the one that is reported, what it leaves is used or goes, and the advice leads on."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import itertools

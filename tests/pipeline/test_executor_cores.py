@@ -1,7 +1,5 @@
 """Cores by affinity and by the quotas of control groups, and threads of libraries that know nothing of the latter."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Sizes as text, and the smallest of the limits on a process."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

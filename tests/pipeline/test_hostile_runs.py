@@ -1,7 +1,5 @@
 """The JSON files of a run that anybody may have written: whatever they hold, an error of ours, one line, and never a traceback."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import itertools

@@ -1,7 +1,5 @@
 """A lease is held by one process at a time, whatever dies, sleeps or is slow; other machines are played by another name for this one."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """Runs that a stranger packed: links, pipes and devices in the places of the engine's files. Nothing outside changes, and nothing hangs."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

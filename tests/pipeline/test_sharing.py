@@ -1,7 +1,5 @@
 """Runs that share an artifact: each is whole by itself, whatever becomes of the other, and at whatever moment the sharing is killed."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stages that do not need each other run at the same time, each in a process of its own, and make what they make one after another."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Several sources of one run."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Untrusted text comes out on one line, without terminal escapes, and can be encoded."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

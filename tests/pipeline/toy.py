@@ -1,7 +1,5 @@
 """A workflow of four toy stages: photos are listed, counted slowly with checkpoints, doubled, and put into a report with a volatile log."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

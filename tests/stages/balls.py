@@ -1,7 +1,5 @@
 """The poses artifact of an analytic ball, and jobs over it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One small capture, written in each format that can be read: six cameras round the origin, images of 32 x 24."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct

@@ -1,7 +1,5 @@
 """Small videos made for tests: a textured picture that a camera moves over."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path

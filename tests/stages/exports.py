@@ -4,8 +4,6 @@ Each writer makes the files from known cameras and returns, beside the folder, w
 own documentation states, computed from the numbers in the files, so that no axis can be wrong in writer and reader alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Captures of cameras that all look the same way."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

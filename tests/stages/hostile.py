@@ -3,8 +3,6 @@
 tests/data/hostile/READER/FILE was found by `make fuzz` and made smaller; large ones are made here.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

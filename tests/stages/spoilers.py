@@ -1,7 +1,5 @@
 """Ways in which a file of a scratch folder may be found after a power cut, or from someone else."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Work in order on several threads."""
 
-from __future__ import annotations
-
 import threading
 import time
 

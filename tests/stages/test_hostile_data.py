@@ -1,7 +1,5 @@
 """Every hostile input of tests/stages/hostile.py is answered as stated there."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import warnings

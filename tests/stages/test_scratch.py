@@ -1,7 +1,5 @@
 """Notes of pieces of work: what counts is as it was written, whatever lies there."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

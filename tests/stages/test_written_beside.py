@@ -1,7 +1,5 @@
 """What libraries write beside the run: SECURITY.md lists it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

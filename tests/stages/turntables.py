@@ -1,7 +1,5 @@
 """A patterned cube that turns before a patterned wall, as a camera on a stand sees it: in the cube's frame the camera goes round."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """What a call of the command line gives."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Ways to call the command line in tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The process that toy stages of a fleet run in, and one that runs such a fleet. Presets lie where ENERF_TOY_PRESETS says."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The benchmark of scaling: Amdahl's law backwards, and which function of the project the main thread is in."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """--budget is shared by the stages that train, and --target-mib is the asset's size."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 It begins before other tests: on a new machine these load what was compiled for it, instead of each worker compiling the same again.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

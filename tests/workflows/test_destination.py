@@ -1,7 +1,5 @@
 """What export, convert and render may write: nothing in a run, nothing over what is there unless asked, no half files."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The pages made from the code are up to date, and what the README names exists."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """What `enerf doctor` shows, and what `enerf cache --clear` removes."""
 
-from __future__ import annotations
-
 import subprocess
 import tomllib
 from pathlib import Path

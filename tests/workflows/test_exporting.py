@@ -1,7 +1,5 @@
 """Exports of a run: what its stage `mesh` has made is taken, and made again only where something else is wanted."""
 
-from __future__ import annotations
-
 import base64
 import os
 import re

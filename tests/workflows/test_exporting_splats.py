@@ -1,7 +1,5 @@
 """3D Gaussians of a run: those of its stage `splats` are taken, and made again only where something else is wanted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

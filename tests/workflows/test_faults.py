@@ -1,7 +1,5 @@
 """A short form of `make faults`, of real stages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

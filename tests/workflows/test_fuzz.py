@@ -1,7 +1,5 @@
 """The short form of `make fuzz`: two hundred inputs to each reader, read or refused in the documented way."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from pathlib import Path

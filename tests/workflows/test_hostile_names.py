@@ -1,7 +1,5 @@
 """Pictures whose names are no text, through a run: cameras, training and the report."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

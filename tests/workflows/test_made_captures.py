@@ -1,7 +1,5 @@
 """benchmarks/scenes/captures and benchmarks/made_captures: captures that no rule was made on, and that nothing of their subjects is masked before training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

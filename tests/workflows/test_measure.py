@@ -1,7 +1,5 @@
 """`enerf measure`: lengths by places and pixels, metres by known lengths that exports follow; `enerf orient`: up by places; and one line for each mistake."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Measuring in the page of a run, in a real browser: places lie on the surface, and lengths are those of the command that it gives."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator
 from dataclasses import replace

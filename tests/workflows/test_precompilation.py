@@ -1,7 +1,5 @@
 """Kernels are compiled in the background: those of the run, by a process that ends with it and never disturbs it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import time

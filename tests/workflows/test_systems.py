@@ -1,7 +1,5 @@
 """What differs on macOS and Windows, with fakes: nothing here was run there."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Short forms of `make torture` and `make faults`: toy stages in a blink, real ones where there is time."""
 
-from __future__ import annotations
-
 import errno
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A program that torments runs, and what it found."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

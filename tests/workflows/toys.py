@@ -1,7 +1,5 @@
 """A workflow of toy stages, for testing the command line in a blink."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """`enerf diff`, `enerf convert` and `enerf view`: commands on assets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """Whether torch can use CUDA, found out without importing torch, which takes seconds."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib.util
 import os

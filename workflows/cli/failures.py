@@ -1,7 +1,5 @@
 """Errors for the user: one or two lines (a line for each of several mistakes), an exit code, and with --json an object as the last line."""
 
-from __future__ import annotations
-
 import os
 import sys
 import traceback

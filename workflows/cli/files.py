@@ -1,7 +1,5 @@
 """`enerf export`, `enerf render` and `enerf inspect`: commands on a run or an asset file."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -95,7 +93,7 @@ def export(
     exporting.check(asked)
     options = [] if faces is None else [f"mesh.max_faces={exporting.faces_from_text(faces)}"]
     options += [] if size is None else [f"mesh.texture_size={size}"]
-    with _shown(as_json, quiet) as show:
+    with display(as_json=as_json, quiet=quiet) as show:
         written = exporting.export_cameras(asked)
         settings = _settings_for(what, (*sets, *options), _surface_stages())
         written += exporting.export_viewers(asked)
@@ -178,7 +176,7 @@ def render(
         for kind in ("png", "exr"):
             check_free(out / f"frame_{k:04d}.{kind}", force=force, inputs=read)
     options = RenderOptions(background=settings.background, supersample=settings.supersample, exr=settings.exr, video=None, fps=fps, crf=settings.crf)
-    with _shown(as_json, quiet) as show:
+    with display(as_json=as_json, quiet=quiet) as show:
         progress = _progress("render", show)
         with writing(out / "frame_0000.png", force=force):
             written = render_frames(tree, cameras, out, options, lambda done, total: progress(done, total, "frames"))
@@ -215,10 +213,6 @@ def inspect(what: Path, as_json: bool) -> None:
         write_json(found, indent=1)
     else:
         listing(*in_words(found))
-
-
-def _shown(as_json: bool, quiet: bool) -> Any:
-    return display(as_json=as_json, quiet=quiet)
 
 
 def _progress(stage: str, show: Callable[[dict[str, Any]], None]) -> Callable[[int, int, str], None]:

@@ -1,9 +1,4 @@
-"""The command `enerf`.
-
-The module of a command is imported when the command is used, so that `--help` answers at once.
-"""
-
-from __future__ import annotations
+"""The command `enerf`. The module of a command is imported when the command is used, so that `--help` answers at once."""
 
 import signal
 import sys

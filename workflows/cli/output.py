@@ -5,8 +5,6 @@ command's output proper (a listing, anything with --json) fails, a command that 
 plain listing (`| head`) has had enough, which is no failure.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json
@@ -27,15 +25,13 @@ _LARGEST = 2**64  # readers of JSON know no larger integers
 class Stream:
     """A text stream that keeps its first failure instead of raising it.
 
-    failure  the error of a write that was missed, or None
-
     It shows no `buffer`: click and others would write past it.
     """
 
     def __init__(self, stream: TextIO | None, *, missed: bool) -> None:
         self.stream = stream
         self.missed = missed
-        self.failure: OSError | None = None
+        self.failure: OSError | None = None  # the error of a write that was missed, or None
 
     def write(self, text: str) -> int:
         if not isinstance(text, str):
@@ -114,10 +110,7 @@ class Stream:
 
 @contextmanager
 def watched(*, debug: bool = False) -> Iterator[Stream]:
-    """While open, standard output and standard error are Streams, and what libraries say goes into a log (`pipeline.library_output`); yields the first.
-
-    debug  whether to show the log in the end
-    """
+    """While open, standard output and standard error are Streams, and what libraries say goes into a log (`pipeline.library_output`); yields the first."""
     _fill_descriptors()
     former = sys.stdout, sys.stderr
     with libraries_apart(show=debug) as terminal:

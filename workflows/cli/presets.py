@@ -1,7 +1,5 @@
 """`enerf presets`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click

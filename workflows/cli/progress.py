@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
-from types import TracebackType
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 from pipeline.text import printable
@@ -92,12 +92,6 @@ class Lines:
         self.stream = stream or sys.stderr
         self.last: dict[str, tuple[float, float]] = {}  # of each stage the time of its last line, and the share that was done
 
-    def __enter__(self) -> Lines:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.stream.flush()
-
     def __call__(self, event: Event) -> None:
         stage = event.get("stage") or ""
         if event["event"] == "stage_started":
@@ -150,7 +144,7 @@ class Bars:
         self.progress.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.progress.stop()
 
     def __call__(self, event: Event) -> None:
@@ -184,12 +178,6 @@ class JsonLines:
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
 
-    def __enter__(self) -> JsonLines:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        sys.stdout.flush()
-
     def __call__(self, event: Event) -> None:
         if not (self.quiet and event["event"] == "progress"):
             write_json(event)
@@ -198,21 +186,20 @@ class JsonLines:
 class Quiet:
     """Warnings, and nothing else."""
 
-    def __enter__(self) -> Quiet:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        pass
-
     def __call__(self, event: Event) -> None:
         if event["event"] == "warning":
             print(_line(event.get("stage") or "", sentence(event)), file=sys.stderr, flush=True)
 
 
-def display(*, as_json: bool, quiet: bool) -> Lines | Bars | JsonLines | Quiet:
+@contextmanager
+def display(*, as_json: bool, quiet: bool) -> Iterator[Callable[[Event], None]]:
     """The display for the options and the kind of output."""
     if as_json:
-        return JsonLines(quiet)
-    if quiet:
-        return Quiet()
-    return Bars() if sys.stderr.isatty() else Lines()
+        yield JsonLines(quiet)
+    elif quiet:
+        yield Quiet()
+    elif sys.stderr.isatty():
+        with Bars() as bars:
+            yield bars
+    else:
+        yield Lines()

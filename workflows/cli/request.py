@@ -27,11 +27,7 @@ COMPILING, PAGES = 1600 * 2**20, 300 * 2**20
 
 @dataclass(frozen=True)
 class Options:
-    """The options of the command line; None or empty where not given.
-
-    table  settings of a fleet's scene, as its manifest has them
-    share  bytes of its worker's memory that the scene's stages have
-    """
+    """The options of the command line; None or empty where not given."""
 
     source: Path | None = None
     also: tuple[Path, ...] = ()
@@ -39,7 +35,7 @@ class Options:
     preset: str | None = None
     config: Path | None = None
     sets: tuple[str, ...] = ()
-    table: Table = field(default_factory=dict)
+    table: Table = field(default_factory=dict)  # settings of a fleet's scene, as its manifest has them
     seed: int | None = None
     budget: str | None = None
     target_mib: float | None = None
@@ -51,7 +47,7 @@ class Options:
     features_model: tuple[str, str] | None = None
     device: str | None = None
     memory: str | None = None
-    share: int | None = None
+    share: int | None = None  # bytes of its worker's memory that the scene's stages have
     viewer: str | None = None
     strict: bool = False
     allow_outside: bool = False
@@ -59,22 +55,14 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """A run before it is written.
+    """A run before it is written."""
 
-    run       a Run with the new settings
-    new       whether its folder has yet to be made
-    device    "auto", "cpu" or "cuda" as requested
-    memory    what stages may take
-    warnings  for the user
-    again     makes the plan anew, of what run.json holds then
-    """
-
-    run: Run
-    new: bool
-    device: str
-    memory: Limit | None
-    warnings: list[str]
-    again: Callable[[], Plan]
+    run: Run  # a Run with the new settings
+    new: bool  # whether its folder has yet to be made
+    device: str  # "auto", "cpu" or "cuda" as requested
+    memory: Limit | None  # what stages may take
+    warnings: list[str]  # for the user
+    again: Callable[[], Plan]  # makes the plan anew, of what run.json holds then
 
     @contextmanager
     def written(self) -> Iterator[Run]:

@@ -4,8 +4,6 @@ The order is: the defaults of the dataclasses, the preset, the configuration fil
 mapping `{stage: {setting: value}}`.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import tomllib
@@ -33,18 +31,13 @@ _LARGEST = 2**63
 
 @dataclass(frozen=True)
 class Preset:
-    """A preset, read.
-
-    inherits  the preset that it changes, or None
-    own       the table of its file
-    table     `own` over the table of the preset that it inherits from
-    """
+    """A preset, read."""
 
     name: str
     description: str
-    inherits: str | None
-    own: Table
-    table: Table
+    inherits: str | None  # the preset that it changes, or None
+    own: Table  # the table of its file
+    table: Table  # `own` over the table of the preset that it inherits from
 
 
 @dataclass(frozen=True)
@@ -177,13 +170,10 @@ FORMER = {("train", "near_plane"): 0.0}  # defaults of 0.1.0 that are no setting
 
 
 class Settings:
-    """Builder of the settings of all stages; every value is checked when it is put.
-
-    types   {stage: its settings dataclass}
-    """
+    """Builder of the settings of all stages; every value is checked when it is put."""
 
     def __init__(self, types: Mapping[str, type]) -> None:
-        self.types = dict(types)
+        self.types = dict(types)  # {stage: its settings dataclass}
         self.about: dict[str, dict[str, SettingInfo]] = {
             stage: {info.name: info for info in describe_settings(settings_type)} for stage, settings_type in types.items()
         }

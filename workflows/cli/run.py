@@ -1,7 +1,5 @@
 """`enerf run` and `enerf stage`."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from contextlib import AbstractContextManager, nullcontext

@@ -1,7 +1,5 @@
 """Kinds of paths on the command line: a run, an asset, a stage's folder, a file of a known kind, or a data set."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`enerf verify`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

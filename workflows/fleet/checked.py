@@ -102,25 +102,21 @@ class Checker:
             self._settings.put_seed(seed)
         return {stage: {name: self.value(stage, name, value, by_hand=True) for name, value in entries.items()} for stage, entries in table.items()}
 
-    def settings(self, table: Mapping[str, Any], where: Mapping[str, int | None], *, scene: str | None = None) -> Table:
-        """Stage -> setting -> value of the values that are right; the others are kept as mistakes.
-
-        where  "stage.setting", or "stage" -> line
-        """
+    def settings(self, table: Mapping[str, Any], line: int | None = None, scene: str | None = None) -> Table:
+        """Stage -> setting -> value of the values that are right; the others are kept as mistakes."""
         found: Table = {}
         for stage, entries in table.items():
             if not isinstance(entries, Mapping) or not entries:
-                self.unknown(stage, where.get(stage), scene)
+                self.unknown(stage, line, scene)
                 continue
             for name, value in entries.items():
                 try:
                     found.setdefault(stage, {})[name] = self.value(stage, name, value)
                 except UsageError as error:
-                    line = where.get(f"{stage}.{name}", where.get(stage))
                     self.mistake(str(error).removeprefix(": "), line=line, scene=scene)
         return found
 
-    def unknown(self, key: str, line: int | None, scene: str | None) -> None:
+    def unknown(self, key: str, line: int | None = None, scene: str | None = None) -> None:
         """A key that is neither an option nor a stage with settings."""
         if key in self._settings.types:
             self.mistake(f"{key}: found no table of settings, expected {key}.NAME = VALUE.", line=line, scene=scene)
@@ -129,14 +125,14 @@ class Checker:
         text = f"found {printable(key, 100)!r}, expected source, sources, {', '.join(OPTIONS)} or the settings of a stage.{nearest(key, known)}"
         self.mistake(text, line=line, scene=scene)
 
-    def options(self, values: Mapping[str, Any], where: Mapping[str, int | None], *, scene: str | None = None) -> Choice:
+    def options(self, values: Mapping[str, Any], line: int | None = None, scene: str | None = None) -> Choice:
         """Those of OPTIONS that are there; mistakes are kept."""
         found = Choice()
         for name, value in values.items():
             try:
                 self._option(found, name, value)
             except UsageError as error:
-                self.mistake(str(error).removeprefix(": ").removeprefix("--"), line=where.get(name), scene=scene)
+                self.mistake(str(error).removeprefix(": ").removeprefix("--"), line=line, scene=scene)
         return found
 
     def _option(self, found: Choice, name: str, value: Any) -> None:

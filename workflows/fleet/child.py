@@ -1,7 +1,5 @@
 """The process that stages of a fleet run in; `pipeline.executors.child` starts it."""
 
-from __future__ import annotations
-
 from pipeline.executors.serving import serve
 from workflows.asset import WORKFLOW
 from workflows.fleet.program import WorkflowProgram

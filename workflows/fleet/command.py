@@ -1,7 +1,5 @@
 """`enerf fleet`, and under it `status`, `retry` and `cancel`."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any

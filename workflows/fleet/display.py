@@ -1,7 +1,5 @@
 """Displays of a running fleet: a live table on a terminal, else a line for each stage that ends; JSON lines; or only what goes wrong."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

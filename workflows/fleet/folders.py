@@ -1,7 +1,5 @@
 """Scenes that no manifest lists: those of a folder, of a glob, or given one by one. Each is (name, source)."""
 
-from __future__ import annotations
-
 import glob
 import itertools
 import os

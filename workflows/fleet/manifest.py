@@ -14,8 +14,6 @@ A manifest may be untrusted. It is small, its names name folders, and its source
 All mistakes are reported at once, before anything runs.
 """
 
-from __future__ import annotations
-
 import csv
 import glob
 import io
@@ -34,7 +32,6 @@ from stages.formats.importers.photographs import is_video
 from workflows.cli.resolve import parse_toml
 from workflows.fleet.checked import OPTIONS, Checker, Choice, Text
 from workflows.fleet.folders import folder_entries, glob_entries, listed_entries
-from workflows.fleet.lines import lines_of
 from workflows.workflow import Workflow
 
 MAX_BYTES = 4 * 2**20
@@ -45,16 +42,12 @@ NAME_RULE = "letters, digits, '.', '_' and '-', a letter or digit first, at most
 
 @dataclass
 class Entry:
-    """A scene as it was written.
-
-    where  key -> line
-    """
+    """A scene as it was written."""
 
     name: str
     sources: list[Any]
     values: Mapping[str, Any] = field(default_factory=dict)
-    line: int | None = None
-    where: Mapping[str, int | None] = field(default_factory=dict)
+    line: int | None = None  # of a CSV
 
 
 def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over: Choice | None = None, roots: Sequence[Path] = ()) -> list[Scene]:
@@ -113,28 +106,20 @@ def _toml(text: str, checker: Checker) -> tuple[Choice, list[Entry]]:
         content = parse_toml(text, MAX_BYTES)
     except ValueError as error:
         raise UsageError(f"{checker.what}: not valid TOML: {printable(error, 300)}.") from None
-    lines = lines_of(text)
     tables = content.pop("scenes", {})
-    where = _where(lines, ())
     if not isinstance(tables, dict):
-        checker.mistake("scenes: found no tables, expected [scenes.NAME].", line=where.get("scenes"))
+        checker.mistake("scenes: found no tables, expected [scenes.NAME].")
         tables = {}
-    common = _choice(content, where, checker, None)
+    common = _choice(content, checker)
     entries = []
     for name, table in tables.items():
-        line = lines.get(("scenes", name))
         if not isinstance(table, dict):
-            checker.mistake(f"found {printable(repr(table), 100)}, expected a table with source = ...", line=line, scene=name)
+            checker.mistake(f"found {printable(repr(table), 100)}, expected a table with source = ...", scene=name)
             continue
         stated = [table.pop(key) for key in ("source", "sources") if key in table]
         listed = [each if isinstance(each, list) else [each] for each in stated]
-        entries.append(Entry(name, [source for each in listed for source in each], table, line, _where(lines, ("scenes", name))))
+        entries.append(Entry(name, [source for each in listed for source in each], table))
     return common, entries
-
-
-def _where(lines: Mapping[tuple[str, ...], int], path: tuple[str, ...]) -> dict[str, int | None]:
-    """Of the keys below a path, in the words of messages."""
-    return {".".join(key[len(path) :]): line for key, line in lines.items() if key[: len(path)] == path and len(path) < len(key) <= len(path) + 2}
 
 
 def _csv(text: str, checker: Checker) -> tuple[Choice, list[Entry]]:
@@ -171,7 +156,7 @@ def _check_columns(columns: list[str], checker: Checker) -> None:
             checker.mistake(f"found the column {printable(column, 100)!r} twice, expected it once.", line=1)
             return
         if "." not in column and column not in ("name", "source", *OPTIONS):
-            checker.unknown(column, 1, None)
+            checker.unknown(column, 1)
 
 
 def _row(columns: list[str], cells: list[str], line: int) -> Entry:
@@ -185,12 +170,12 @@ def _row(columns: list[str], cells: list[str], line: int) -> Entry:
             values.setdefault(stage, {})[name] = Text(cell)
     named = dict(zip(columns, cells, strict=False))
     sources = [cell for column, cell in zip(columns, cells, strict=False) if column == "source" and cell]
-    return Entry(named.get("name", ""), list(sources), values, line, dict.fromkeys(columns, line))
+    return Entry(named.get("name", ""), list(sources), values, line)
 
 
-def _choice(values: Mapping[str, Any], where: Mapping[str, int | None], checker: Checker, scene: str | None) -> Choice:
-    options = checker.options({key: value for key, value in values.items() if key in OPTIONS}, where, scene=scene)
-    settings = checker.settings({key: value for key, value in values.items() if key not in OPTIONS}, where, scene=scene)
+def _choice(values: Mapping[str, Any], checker: Checker, line: int | None = None, scene: str | None = None) -> Choice:
+    options = checker.options({key: value for key, value in values.items() if key in OPTIONS}, line, scene)
+    settings = checker.settings({key: value for key, value in values.items() if key not in OPTIONS}, line, scene)
     return Choice(settings).over(options)
 
 
@@ -210,15 +195,11 @@ def _check_names(entries: Sequence[Entry], checker: Checker) -> None:
 
 @dataclass
 class _Reader:
-    """Makes scenes of entries.
-
-    base    what relative sources are relative to
-    inside  folders that sources may lie in; None: anywhere, the operator gave each
-    """
+    """Makes scenes of entries."""
 
     checker: Checker
-    base: Path
-    inside: list[Path] | None
+    base: Path  # what relative sources are relative to
+    inside: list[Path] | None  # folders that sources may lie in; None: anywhere, the operator gave each
     fleet: Path
     common: Choice
     over: Choice
@@ -226,27 +207,26 @@ class _Reader:
     def scene(self, entry: Entry) -> Scene:
         """The scene of an entry; mistakes are kept."""
         sources = tuple(self._sources(entry))
-        own = _choice(entry.values, entry.where, self.checker, entry.name)
+        own = _choice(entry.values, self.checker, entry.line, entry.name)
         choice = self.over.over(own.over(self.common))
         settings = choice.with_budget(sources, self.checker.workflow)
         return Scene(entry.name, tuple(map(str, sources)), settings, choice.preset, choice.seed)
 
     def _sources(self, entry: Entry) -> Iterator[Path]:
-        line = entry.where.get("source", entry.where.get("sources", entry.line))
         if not 0 < len(entry.sources) <= MOST_SOURCES:
-            self.checker.mistake(f"found {len(entry.sources)} sources, expected 1 to {MOST_SOURCES}.", line=line, scene=entry.name)
+            self.checker.mistake(f"found {len(entry.sources)} sources, expected 1 to {MOST_SOURCES}.", line=entry.line, scene=entry.name)
             return
         real = []
         for source in entry.sources:
             why = self._wrong(entry, source)
             if why is not None:
-                self.checker.mistake(why, line=line, scene=entry.name)
+                self.checker.mistake(why, line=entry.line, scene=entry.name)
                 continue
             path = Path(os.path.abspath(self.base / source))
             real.append(os.path.realpath(path))
             yield path
         if len(set(real)) < len(real):
-            self.checker.mistake("found a source twice, expected each once.", line=line, scene=entry.name)
+            self.checker.mistake("found a source twice, expected each once.", line=entry.line, scene=entry.name)
 
     def _wrong(self, entry: Entry, source: Any) -> str | None:
         """What is wrong with a source, or None."""

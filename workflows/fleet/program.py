@@ -1,7 +1,5 @@
 """The workflow's part of a fleet, unknown to the engine: how a scene becomes a run, what is shown of it, its pages."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

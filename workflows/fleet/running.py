@@ -1,7 +1,5 @@
 """A fleet from its scenes to its end: the folder and its lock, the workers, the scheduler, and what is written next to fleet.json."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,22 +32,14 @@ _OWN = (NAME, LOCK, HOLDER, LEASE, requests.FOLDER)
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the stages of a fleet run.
+    """Where the stages of a fleet run."""
 
-    jobs             stages at a time on each worker, besides those that have a device
-    scheduler        address of a Dask scheduler; None and no cluster: this machine, without Dask
-    cluster          kind of the Dask cluster to start
-    cluster_options  of the cluster's class
-    device           "cpu" or "cuda"
-    memory           what stages on this machine may take together
-    """
-
-    jobs: int = 1
-    scheduler: str | None = None
-    cluster: str | None = None
-    cluster_options: Mapping[str, Any] = field(default_factory=dict)
-    device: str = "cpu"
-    memory: Limit | None = None
+    jobs: int = 1  # stages at a time on each worker, besides those that have a device
+    scheduler: str | None = None  # address of a Dask scheduler; None and no cluster: this machine, without Dask
+    cluster: str | None = None  # kind of the Dask cluster to start
+    cluster_options: Mapping[str, Any] = field(default_factory=dict)  # of the cluster's class
+    device: str = "cpu"  # "cpu" or "cuda"
+    memory: Limit | None = None  # what stages on this machine may take together
 
 
 def check_fleet_folder(fleet: Path) -> None:

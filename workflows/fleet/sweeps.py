@@ -4,8 +4,6 @@ Scenes share common stages: a stage whose settings, and those of all before it, 
 same artifact (`pipeline.sharing`). `shared` says of which scene each stage is taken.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import math

@@ -1,7 +1,5 @@
 """`enerf check`: the verdict on photographs before a run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,7 +29,6 @@ STANDING = {  # of a video of which a run would keep hardly a frame
 def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflow: Workflow) -> dict[str, Any]:
     """The verdict on a source as a document.
 
-    sets   as of --set
     limit  of memory, that what is needed is compared with
     Raises BadInput, UsageError.
     """

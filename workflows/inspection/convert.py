@@ -1,7 +1,5 @@
 """Conversion of asset files."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Facts about a path for `enerf inspect`, and their text."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

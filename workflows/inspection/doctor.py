@@ -1,7 +1,5 @@
 """`enerf doctor` and `enerf cache`."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

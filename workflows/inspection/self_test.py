@@ -1,7 +1,5 @@
 """`python -m workflows.inspection.self_test FOLDER`: cameras, field and asset of a small made scene, written into an empty folder."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

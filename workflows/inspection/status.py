@@ -1,7 +1,5 @@
 """The states of a run's stages, as `enerf status --json` and the live page report them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

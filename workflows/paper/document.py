@@ -8,13 +8,10 @@ A row is a mapping from column to value; a column that ends in PAPER holds what 
 from a Request to a Result, and TABLES says which; what trains keeps its runs under OUT/runs, so that a table that was interrupted goes on where it was.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +20,7 @@ import torch
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.cores import affinity
 from pipeline.files import write_atomically
+from pipeline.manifest import tool_versions
 from stages.figures.plots import curve, with_palette
 from workflows.paper import tables
 from workflows.paper.result import PAPER, Request, Result, Table
@@ -114,13 +112,7 @@ def hardware(device: str) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    found = {}
-    for name in ("efficientnerf", "torch", "numba"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
+    return {name: version for name, version in tool_versions() if name in ("efficientnerf", "torch", "numba")}
 
 
 def _write(path: Path, text: str) -> None:

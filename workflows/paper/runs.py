@@ -3,8 +3,6 @@
 A row's run is an ordinary run folder, OUT/runs/<scene>/<row>: it resumes after an interruption, and `enerf status` and the rest work on it.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import statistics
@@ -43,43 +41,30 @@ SCENES_OF = {"transforms_train.json", "transforms.json", "poses_bounds.npy"}
 
 @dataclass(frozen=True)
 class Row:
-    """One training to be measured.
+    """One training to be measured."""
 
-    name     of its run folder
-    changes  to the train settings of PRESET, as they are in the paper; `scaled` shrinks them like the rest
-    bakes    whether its tree is baked and measured too
-    """
-
-    name: str
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    bakes: bool = False
+    name: str  # of its run folder
+    changes: Mapping[str, Any] = field(default_factory=dict)  # to the train settings of PRESET, as they are in the paper; `scaled` shrinks them like the rest
+    bakes: bool = False  # whether its tree is baked and measured too
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Results of a row's run; seconds are of training steps alone, evaluation excluded, as in the paper.
+    """Results of a row's run; seconds are of training steps alone, evaluation excluded, as in the paper."""
 
-    psnr             of the network, mean over the test views that were rendered, decibels; ssim likewise
-    step             seconds of a step, mean over the run
-    steady           seconds of a step, median over the last fifth of the run
-    hours            of all steps
-    coarse, fine     samples of a training ray that went through the coarse and the fine network, over the last fifth
-    valid, pivotal   shares over rays x N_c of the test views (equations 5 and 12)
-    curve            (seconds of training, PSNR of a validation view)
-    tree             figures of the baked tree, where baked: psnr, ssim, frames a second, size of a frame
-    """
-
-    psnr: float
+    psnr: float  # of the network, mean over the test views that were rendered, decibels; ssim likewise
     ssim: float | None
-    step: float
-    steady: float
-    hours: float
+    step: float  # seconds of a step, mean over the run
+    steady: float  # seconds of a step, median over the last fifth of the run
+    hours: float  # of all steps
+    # coarse, fine: samples of a training ray that went through the coarse and the fine network, over the last fifth
     coarse: float
     fine: float
+    # valid, pivotal: shares over rays x N_c of the test views (equations 5 and 12)
     valid: float
     pivotal: float
-    curve: tuple[list[float], list[float]]
-    tree: Mapping[str, Any] | None = None
+    curve: tuple[list[float], list[float]]  # (seconds of training, PSNR of a validation view)
+    tree: Mapping[str, Any] | None = None  # figures of the baked tree, where baked: psnr, ssim, frames a second, size of a frame
 
     @property
     def converged(self) -> bool:
@@ -238,8 +223,7 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
 
 
 def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
-    """PSNR and SSIM of the baked tree on the test views of the network (`wanted` of them, None: all), and frames a second at
-    their size."""
+    """PSNR and SSIM of the baked tree on the test views of the network (`wanted` of them, None: all), and frames a second at their size."""
     tree = format.load(BakeOutputs.of_run(run.path).asset).to(device)
     s = scene.load(run.folder("poses"))
     views, _ = evaluation_views(s)

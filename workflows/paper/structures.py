@@ -11,8 +11,6 @@ All are built by gathers, scatters and scans from one list of voxels (`workflows
 N voxels, M points.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self

@@ -3,8 +3,6 @@
 The structures take turns within each repetition, so that other load on the machine affects all of them equally.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

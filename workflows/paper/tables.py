@@ -1,7 +1,5 @@
 """Tables 1 to 6 of the paper: the trainings that each compares, the figures printed in the paper, and the columns of ours."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

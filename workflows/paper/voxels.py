@@ -9,8 +9,6 @@ are occupied until the share is reached. Scattered: independent random voxels.
 N voxels, M points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,16 +20,11 @@ CAMERAS, WIDTH = 8, 800  # of the rays
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """A list of occupied voxels.
+    """A list of occupied voxels."""
 
-    side         voxels along each side of the grid
-    coordinates  (N, 3) int32, each once, in any order
-    packed       (N,) int64 values, none zero
-    """
-
-    side: int
-    coordinates: np.ndarray
-    packed: np.ndarray
+    side: int  # voxels along each side of the grid
+    coordinates: np.ndarray  # (N, 3) int32, each once, in any order
+    packed: np.ndarray  # (N,) int64 values, none zero
 
 
 def _voxels_of_lowest_score(score: np.ndarray, share: float) -> Voxels:

@@ -1,7 +1,5 @@
 """The process that `start` begins: it takes the made scene through all stages, so that their kernels are compiled."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

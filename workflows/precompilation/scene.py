@@ -1,7 +1,5 @@
 """A patterned ball before patterned surroundings, as a COLMAP text model: the smallest scene that every stage makes something of."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Begins the compilation of kernels in the background where it is worth it. Imports little: `enerf run` calls it at once."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

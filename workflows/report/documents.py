@@ -3,8 +3,6 @@
 A run may be untrusted or damaged: a document that does not follow its schema is left out, and reported.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, TypeVar
 

@@ -4,8 +4,6 @@ It refers to the images of the run by relative paths, so that the run may be mov
 nothing from the network. The template is report.html.j2.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import stat

@@ -1,7 +1,5 @@
 """The pages about a run: its report and its viewer, written once its stages are done."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 

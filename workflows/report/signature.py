@@ -4,8 +4,6 @@ A page's last line is a comment with the SHA-256 of all before it, and with an H
 finds a page that was altered; by the second a page is known, before it is opened, to be by a holder of the key. Others are made again.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import hmac

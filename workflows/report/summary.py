@@ -1,7 +1,5 @@
 """Summary of a run: its files and metrics."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

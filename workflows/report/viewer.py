@@ -1,7 +1,5 @@
 """RUN/viewer.html: the page that shows what the run made in a browser. Like the report it belongs to no stage and can be made again."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from contextlib import suppress

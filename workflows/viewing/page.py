@@ -1,7 +1,5 @@
 """The viewer page of a run or of an asset file: the one that is there, if this program wrote it, or a new one."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

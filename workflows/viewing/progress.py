@@ -1,7 +1,5 @@
 """The progress of a run: the states of its stages, the curves of their logs, and the previews, of finished stages and of what is being made."""
 
-from __future__ import annotations
-
 import os
 import re
 import stat

@@ -5,8 +5,6 @@ otherwise; requests must name it by that (a name that was made to point here, DN
 part of a request becomes part of a path; files are opened from the run's folder downwards, through no link; slow clients delay no others.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re
@@ -45,16 +43,12 @@ NOTHING = "default-src 'none'; frame-ancestors 'none'"
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer: bytes, or an open file, which the sender closes.
+    """An answer: bytes, or an open file, which the sender closes."""
 
-    kind    content type
-    policy  content security policy
-    """
-
-    kind: str
+    kind: str  # content type
     data: bytes = b""
     file: int | None = None
-    policy: str = NOTHING
+    policy: str = NOTHING  # content security policy
 
 
 @dataclass

@@ -1,7 +1,5 @@
 """`enerf view`: a page is opened, or served until Ctrl-C."""
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import sys

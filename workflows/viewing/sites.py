@@ -1,7 +1,5 @@
 """Sites to serve: of a run its live page, its progress, its previews and its viewer; of an asset file the viewer alone."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

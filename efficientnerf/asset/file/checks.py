@@ -1,7 +1,5 @@
 """Numbers of the metadata, which must be numbers, and within bounds."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from efficientnerf.asset.file.container import FormatError

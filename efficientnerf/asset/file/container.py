@@ -3,8 +3,6 @@
 Every claim of a file is checked against the file's size before memory for it is allocated, and nothing in it is run.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -8,8 +8,6 @@
 B bricks, N stored voxels, K harmonics, G groups of them, T entries of a table, P of a palette.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,23 +27,18 @@ Tensors = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Layout:
-    """The tensors of one layout, and how they are read.
+    """The tensors of one layout, and how they are read."""
 
-    minor    the format 1.x that brought it
-    tensors  names besides `coarse.occupancy` (which entropy-coded layouts do not have), and the types that each may have
-    expected shapes that the tensors must have, from the metadata and the shapes they do have
-    stored   which voxels of each brick are stored, (B, b^3) bool
-    values   density (N,) float32 and harmonics of the stored voxels; anything wrong in them is a FormatError
-    unpacked  of an entropy-coded layout the tensors that `stored` and `values` read, those of `coarse.occupancy` among them
-    claimed  of such a layout the shapes and types that the metadata claim for these
-    """
-
-    minor: int
-    tensors: dict[str, tuple[str, ...]]
+    minor: int  # the format 1.x that brought it
+    tensors: dict[str, tuple[str, ...]]  # names besides `coarse.occupancy` (which entropy-coded layouts do not have), and the types that each may have
+    # shapes that the tensors must have, from the metadata and the shapes they do have
     expected: Callable[[str, dict[str, Any], dict[str, Shape]], dict[str, Shape]]
-    stored: Callable[[str, dict[str, Any], Tensors], np.ndarray]
+    stored: Callable[[str, dict[str, Any], Tensors], np.ndarray]  # which voxels of each brick are stored, (B, b^3) bool
+    # density (N,) float32 and harmonics of the stored voxels; anything wrong in them is a FormatError
     values: Callable[[str, dict[str, Any], Tensors, int], tuple[np.ndarray, np.ndarray | PaletteHarmonics]]
+    # of an entropy-coded layout the tensors that `stored` and `values` read, those of `coarse.occupancy` among them
     unpacked: Callable[[str, dict[str, Any], Tensors], Tensors] | None = None
+    # of such a layout the shapes and types that the metadata claim for these
     claimed: Callable[[str, dict[str, Any]], tuple[dict[str, Shape], dict[str, np.dtype[Any]]]] | None = None
 
 

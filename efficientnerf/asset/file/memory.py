@@ -3,8 +3,6 @@
 A bit of a file may stand for four bytes of an index, and an untrusted file may hold little else; in an entropy-coded one for whatever its metadata claim.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

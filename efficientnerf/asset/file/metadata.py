@@ -1,7 +1,5 @@
 """The metadata of an asset, checked: the rules of FORMAT.md, sections 2, 8 and 9; those of unbounded scenes are in `whole_scene.py`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -118,10 +116,7 @@ def _check_spiral(name: str, spiral: Any, unit: float) -> None:
 
 
 def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) -> None:
-    """Raises FormatError, naming the file `name`, at the first rule that is broken.
-
-    layouts  those that this build reads
-    """
+    """Raises FormatError, naming the file `name`, at the first rule that is broken."""
     if meta.get("format") != "nerftree":
         raise FormatError(f"{name}: metadata 'format' is {str(meta.get('format'))[:60]}; expected nerftree")
     version = str(meta.get("format_version")).split(".")

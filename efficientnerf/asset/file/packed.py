@@ -6,8 +6,6 @@ the context of a symbol is stated once. Streams are cut into slices of bricks, w
 B bricks, N stored voxels, b voxels along a side of a brick, G groups of harmonics, S slices.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any

@@ -9,8 +9,6 @@
 B bricks, N stored voxels, K harmonics.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -10,8 +10,6 @@ Numbers are LEB128; T and tables are bytes.
 M symbols, n contexts, T tables, S slices, L lanes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -30,15 +28,11 @@ Coder = object  # of `efficientnerf.backends.numba.entropy.rans`, whose import i
 
 
 class Family(NamedTuple):
-    """Contexts of a stream up to `end`, from where the family before ends; they share tables among themselves alone.
-
-    lane     which state codes them
-    symbols  how many a table may have
-    """
+    """Contexts of a stream up to `end`, from where the family before ends; they share tables among themselves alone."""
 
     end: int
-    lane: int = 0
-    symbols: int = 256
+    lane: int = 0  # which state codes them
+    symbols: int = 256  # how many a table may have
 
 
 def _ranges(families: Sequence[Family]) -> Iterator[tuple[slice, Family]]:

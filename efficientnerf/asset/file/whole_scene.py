@@ -3,8 +3,6 @@
 B bricks, H rows of the environment map.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -3,8 +3,6 @@
 Kernels: `efficientnerf.backends.triton.tree_gradients` and `tree_steps`. N voxels, K harmonics, R rays.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any

@@ -3,8 +3,6 @@
 Müller et al. 2022 ("instant-ngp") draw training pixels so. T tiles (`efficientnerf.training.patches`), P patches, R rays.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

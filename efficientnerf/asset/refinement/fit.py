@@ -10,8 +10,6 @@ number of threads and whether or not they were interrupted. On CUDA sums do not 
 PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2022) optimise trees and grids this way. N voxels, R rays.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 
@@ -76,8 +74,6 @@ def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
 def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of `count` random training pixels. They are rendered in the order of the images, where neighbours
     meet the same voxels; each is drawn by itself, for patches would leave voxels out that single views show.
-
-    progress  called with the number of pixels done and `count`
     """
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 4, 0]))
     chosen = np.sort(targets.host_pixels.choose(count, rng))

@@ -3,8 +3,6 @@
 N voxels, K harmonics, R rays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np

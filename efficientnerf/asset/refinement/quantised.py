@@ -6,8 +6,6 @@ their gradients, as if gradients were summed by entries (VQRF, Li et al. 2023, s
 N voxels, P entries of a palette.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -31,7 +29,6 @@ def refit(
     """A tree of codes, as `compacted` or `economised` make it, with better tables; never one of a greater error over a sample of the training pixels.
 
     steps       in all, in so many `rounds`
-    safe_point  called after each step
     """
     if not isinstance(tree.harmonics, PaletteHarmonics):
         raise ValueError("refit of a tree without codes; quantise it first")

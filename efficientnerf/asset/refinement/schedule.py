@@ -10,14 +10,10 @@ from efficientnerf.training.schedule import Schedule
 
 
 class Phase(NamedTuple):
-    """Some steps with the same voxels.
+    """Some steps with the same voxels."""
 
-    name   of the phase, as it is shown
-    share  of all steps, or of the time where there is a budget
-    """
-
-    name: str
-    share: float
+    name: str  # of the phase, as it is shown
+    share: float  # of all steps, or of the time where there is a budget
 
 
 PHASES = (Phase("all voxels", 0.3), Phase("voxels that show", 0.7))  # docs/experiments/tree-training.md
@@ -25,11 +21,9 @@ PHASES = (Phase("all voxels", 0.3), Phase("voxels that show", 0.7))  # docs/expe
 
 @dataclass(frozen=True)
 class RefinementSchedule:
-    """How many steps the phases take. It never changes: `with_phase` makes another one. Steps count from 1.
+    """How many steps the phases take. It never changes: `with_phase` makes another one. Steps count from 1."""
 
-    each  the schedule of each phase, whose steps count from its own first; of those that have begun, where their number follows from the time that they take
-    """
-
+    # the schedule of each phase, whose steps count from its own first; of those that have begun, where their number follows from the time that they take
     each: tuple[Schedule, ...] = ()
 
     def begin(self, phase: int) -> int:

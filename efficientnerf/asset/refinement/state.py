@@ -1,9 +1,4 @@
-"""The state of a refinement: a tree whose values are being fitted, and RMSprop's moments.
-
-N voxels, K harmonics.
-"""
-
-from __future__ import annotations
+"""The state of a refinement: a tree whose values are being fitted, and RMSprop's moments. N voxels, K harmonics."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol

@@ -1,7 +1,4 @@
-"""The targets of a fit: training pixels, and the background that a tree is composited with.
-
-R rays, H rows.
-"""
+"""The targets of a fit: training pixels, and the background that a tree is composited with. R rays, H rows."""
 
 from __future__ import annotations
 
@@ -26,19 +23,14 @@ Bundle = tuple[Any, Any, RayTargets]  # see `Targets.of`
 class Targets:
     """Training pixels, and what the tree is composited with.
 
-    pixels            of the training views
-    background        constant sRGB colour behind the scene; None: an unbounded scene, which is laid over its environment map
-    environment       (H, 2 H, 3) float32 sRGB colours by direction (`efficientnerf.rendering.environment`), of unbounded scenes
-    reaches_infinity  whether the box reaches to infinity, so that the tree should be opaque
-
     Objects with alpha, and boxes that reach to infinity, are compared over a random background, each channel uniform over 0 to 1. The expected error is
     that over its mean plus the channels' summed variance, 3 / 12, times the squared error of the opacity: taken in closed form, without noise.
     """
 
-    pixels: Pixels | DevicePixels
-    background: tuple[float, float, float] | None
-    environment: Any = None
-    reaches_infinity: bool = False
+    pixels: Pixels | DevicePixels  # of the training views
+    background: tuple[float, float, float] | None  # constant sRGB colour behind the scene; None: an unbounded scene, which is laid over its environment map
+    environment: Any = None  # (H, 2 H, 3) float32 sRGB colours by direction (`efficientnerf.rendering.environment`), of unbounded scenes
+    reaches_infinity: bool = False  # whether the box reaches to infinity, so that the tree should be opaque
 
     def __post_init__(self) -> None:
         if self.background is None and self.environment is None:

@@ -1,7 +1,5 @@
 """Which tiles of the training images a tree is trained on: those whose rays may meet it. The others give no gradient. T tiles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

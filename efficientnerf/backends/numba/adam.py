@@ -1,7 +1,5 @@
 """Adam (Kingma and Ba 2015) on the CPU (numba, all cores), dense or restricted to the entries of a table that have a gradient."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -1,7 +1,5 @@
 """What a compiled form depends on that the sources of its function's module leave open: what the function was bound to elsewhere, and types of arguments."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import sys

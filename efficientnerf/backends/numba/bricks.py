@@ -3,8 +3,6 @@
 B coarse cells with a row of brick^3 voxels each, N voxels.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -6,8 +6,6 @@ timing nor on the number of threads.
 R rays, N samples, K harmonics.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -10,8 +10,6 @@ number of threads.
 N samples, L levels, T table entries.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -1,7 +1,5 @@
 """The next coarse interval of sixteen rays at once, one per SIMD lane (numba): its sample, and whether the density voxel there is valid."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

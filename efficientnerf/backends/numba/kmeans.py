@@ -5,8 +5,6 @@ Each sum is taken in one order on any number of threads, without fastmath: the s
 n vectors of D numbers, P centroids.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

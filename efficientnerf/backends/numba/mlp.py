@@ -10,8 +10,6 @@ Inside, numbers are float32, or bfloat16 with float32 accumulators; weights, inp
 vectors: I inputs, L hidden layers of H, and O outputs become K, W and V columns. N samples.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -39,15 +37,13 @@ MAX_CHUNKS = 32  # bounds the memory of the partial sums
 
 
 class PackedWeights(NamedTuple):
-    """Weights in the layouts that `product` reads: the dimension of the sum along rows, as int32 pairs where numbers are bfloat16.
+    """Weights in the layouts that `product` reads: the dimension of the sum along rows, as int32 pairs where numbers are bfloat16."""
 
-    first, middle, last                 (K', W), (L - 1, W', W), (W', V) for the forward pass; K' = K / elements per word, and so on
-    first_back, middle_back, last_back  (W', K), (L - 1, W', W), (V', W) for the backward pass
-    """
-
+    # first, middle, last: (K', W), (L - 1, W', W), (W', V) for the forward pass; K' = K / elements per word, and so on
     first: np.ndarray
     middle: np.ndarray
     last: np.ndarray
+    # first_back, middle_back, last_back: (W', K), (L - 1, W', W), (V', W) for the backward pass
     first_back: np.ndarray
     middle_back: np.ndarray
     last_back: np.ndarray

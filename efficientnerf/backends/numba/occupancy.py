@@ -4,8 +4,6 @@ The reference is `efficientnerf.backends.torch.occupancy`. Random numbers are a 
 pseudorandom number generators"): each core draws its own, and any number of cores the same.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.compositing import activate_density

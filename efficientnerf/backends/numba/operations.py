@@ -1,7 +1,5 @@
 """The numba kernels as operations on float32 tensors of the CPU: the functions that `efficientnerf.backends.dispatch` calls."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

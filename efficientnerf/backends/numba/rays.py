@@ -3,8 +3,6 @@
 The reference of the first, and the meaning of the letters, is `efficientnerf.geometry.ndc`; here each ray is warped in one pass. R rays.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -6,8 +6,6 @@ on the number of threads.
 R rays, N samples, D density voxels a side. In unit coordinates a space's box is [-1, 1]^3.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

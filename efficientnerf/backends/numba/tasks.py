@@ -1,7 +1,5 @@
 """Which work a parallel loop does in which order."""
 
-from __future__ import annotations
-
 from efficientnerf.backends.numba.runtime import numba
 
 STRIDE = 64  # at least as many as a machine has cores

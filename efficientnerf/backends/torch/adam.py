@@ -1,7 +1,5 @@
 """Adam in plain torch."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -14,7 +12,6 @@ def adam(
     """One step of Kingma and Ba's Adam, in place on tensors of one shape.
 
     first, second  moments
-    rate           learning rate
     corrections    1 - beta^step of either moment
     skip_zeros     entries whose gradient is zero stay as they are, their moments too
     """

@@ -1,7 +1,5 @@
 """A multiresolution hash grid and its network in plain torch (Mueller et al. 2022, "Instant neural graphics primitives"). N points, L levels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,18 +13,12 @@ PRIME_Y, PRIME_Z = 2654435761, 805459861  # section 3
 
 
 class HashLevels(NamedTuple):
-    """Levels of a hash grid, and the places of their entries in the table.
+    """Levels of a hash grid, and the places of their entries in the table."""
 
-    sides   (L,) int64 resolution
-    dense   (L,) bool: whether a level is dense, not hashed
-    starts  (L,) int64 first entry
-    mask    entries of a hashed level, less one: all bits set
-    """
-
-    sides: np.ndarray
-    dense: np.ndarray
-    starts: np.ndarray
-    mask: np.uint32
+    sides: np.ndarray  # (L,) int64 resolution
+    dense: np.ndarray  # (L,) bool: whether a level is dense, not hashed
+    starts: np.ndarray  # (L,) int64 first entry
+    mask: np.uint32  # entries of a hashed level, less one: all bits set
 
 
 def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer | None = None) -> Tensor:

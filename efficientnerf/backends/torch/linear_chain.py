@@ -8,8 +8,6 @@ scaling).
 N rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path

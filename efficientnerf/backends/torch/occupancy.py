@@ -1,7 +1,5 @@
 """Updates of the density voxels, random cells, and points in cells, in plain torch. N samples, D voxels a side."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Rays of training pixels in plain torch."""
 
-from __future__ import annotations
-
 from torch import Tensor, where
 
 

@@ -49,28 +49,20 @@ def device_cascades(tree: NerfTree, owner: Tensor) -> Cascades:
 
 @dataclass(frozen=True, eq=False)
 class DeviceTree:
-    """What the kernel reads.
+    """What the kernel reads."""
 
-    cascades  grids; their `owner` is (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may skip; of a nested tree
-              those of all cascades one after the other
-    density  (B, E^3) float16, voxels of a brick with its border, z fastest; 0 where nothing is stored
-    index    (B, E^3) int32: which voxel's coefficients, -1 where nothing is stored
-    sh       (N, row) float16: K coefficients for red, green and blue each, then zeros
-    low      (3,) corner of cascade 0 in the tree's frame; `voxel` its unit there
-    nearest  whether voxels are not interpolated
-    environment  (H, 2 H, 3) float32 or None, see `NerfTree`
-    """
-
+    # grids; their `owner` is (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may skip; of a nested tree those of
+    # all cascades one after the other
     cascades: Cascades
-    density: Tensor
-    index: Tensor
-    sh: Tensor
+    density: Tensor  # (B, E^3) float16, voxels of a brick with its border, z fastest; 0 where nothing is stored
+    index: Tensor  # (B, E^3) int32: which voxel's coefficients, -1 where nothing is stored
+    sh: Tensor  # (N, row) float16: K coefficients for red, green and blue each, then zeros
     brick: int
     terms: int
     voxel: float
-    low: np.ndarray
-    nearest: bool = False
-    environment: Tensor | None = None
+    low: np.ndarray  # (3,) corner of cascade 0 in the tree's frame; `voxel` its unit there
+    nearest: bool = False  # whether voxels are not interpolated
+    environment: Tensor | None = None  # (H, 2 H, 3) float32 or None, see `NerfTree`
 
     @property
     def bytes(self) -> int:

@@ -41,10 +41,7 @@ BITS_PER_RAY = 8
 
 @dataclass(frozen=True, eq=False)
 class DeviceGrid:
-    """Where the voxels of a tree lie; `cascades` and `index` as in `efficientnerf.backends.triton.tree.DeviceTree`.
-
-    cascade_of  (N,) uint8 the cascade of each voxel; (1,) where there is one
-    """
+    """Where the voxels of a tree lie; `cascades` and `index` as in `efficientnerf.backends.triton.tree.DeviceTree`."""
 
     cascades: Cascades
     index: Tensor
@@ -52,7 +49,7 @@ class DeviceGrid:
     terms: int
     voxel: float
     nearest: bool
-    cascade_of: Tensor
+    cascade_of: Tensor  # (N,) uint8 the cascade of each voxel; (1,) where there is one
 
     @property
     def row(self) -> int:

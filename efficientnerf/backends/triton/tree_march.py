@@ -32,22 +32,14 @@ class Grid(NamedTuple):
 
 
 class Cascades(NamedTuple):
-    """The grids of a tree, L cascades.
+    """The grids of a tree, L cascades."""
 
-    owner   the coarse cells of all grids, as in Grid
-    shapes  (L, 3) int32 coarse cells of each
-    first   (L,) int64 where each one's cells begin
-    place   (L, 4) float32 corner, and side of a voxel, voxels of cascade 0
-    shape   of cascade 0, as in Grid
-    step    between samples, voxels
-    """
-
-    owner: Any
-    shapes: Any
-    first: Any
-    place: Any
-    shape: Any
-    step: Any
+    owner: Any  # the coarse cells of all grids, as in Grid
+    shapes: Any  # (L, 3) int32 coarse cells of each
+    first: Any  # (L,) int64 where each one's cells begin
+    place: Any  # (L, 4) float32 corner, and side of a voxel, voxels of cascade 0
+    shape: Any  # of cascade 0, as in Grid
+    step: Any  # between samples, voxels
 
 
 class Rays(NamedTuple):
@@ -59,36 +51,26 @@ class Rays(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """origin, direction (unit), inverse (1 / direction) Vec3; enter, leave: distances between which it is in the grid, enter >= 0.
-
-    unit  side of a voxel of the grid, voxels of cascade 0
-    step  between samples, voxels
-    """
+    """origin, direction (unit), inverse (1 / direction) Vec3; enter, leave: distances between which it is in the grid, enter >= 0."""
 
     origin: Any
     direction: Any
     inverse: Any
     enter: Any
     leave: Any
-    unit: Any
-    step: Any
+    unit: Any  # side of a voxel of the grid, voxels of cascade 0
+    step: Any  # between samples, voxels
 
 
 class Sample(NamedTuple):
-    """distance  along the ray
-    unit         of distances and steps, voxels of cascade 0
-    step         to the next sample, voxels
-    inside       whether it lies in a brick
-    corner       place of its lowest corner in the arrays of bricks with border
-    fraction     Vec3 from there to the next corner, 0 to 1
-    """
+    """A sample on a ray."""
 
-    distance: Any
-    unit: Any
-    step: Any
-    inside: Any
-    corner: Any
-    fraction: Any
+    distance: Any  # along the ray
+    unit: Any  # of distances and steps, voxels of cascade 0
+    step: Any  # to the next sample, voxels
+    inside: Any  # whether it lies in a brick
+    corner: Any  # place of its lowest corner in the arrays of bricks with border
+    fraction: Any  # Vec3 from there to the next corner, 0 to 1
 
 
 @triton.jit

@@ -20,14 +20,10 @@ VOXELS_PER_PROGRAM = 256 if INTERPRETED else 32
 
 
 class Neighbours(NamedTuple):
-    """For total variation; without rows where there is none.
+    """For total variation; without rows where there is none."""
 
-    density  (N,) before the step
-    beside   (N, 6) int32 voxels beyond the faces of each, -1 where none is stored
-    """
-
-    density: Tensor
-    beside: Tensor
+    density: Tensor  # (N,) before the step
+    beside: Tensor  # (N, 6) int32 voxels beyond the faces of each, -1 where none is stored
 
 
 class Rule(NamedTuple):

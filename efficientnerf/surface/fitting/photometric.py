@@ -9,8 +9,6 @@ visibility-consistent dense multiview stereo", TPAMI 2012; Goesele et al., "Mult
 C photographs, V vertices, F faces, K places for photographs of each vertex, S offsets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -44,17 +42,14 @@ FEWEST = 100  # seen vertices
 
 @dataclass(frozen=True)
 class PhotometricRefinement:
-    """vertices       (V, 3)
-    seen           share of them that three photographs show
-    before, after  mean agreement of the photographs (normalised cross-correlation, -1 to 1) where these show anything
-    improved       whether the vertices were moved
-    """
+    """Vertices moved to where photographs agree."""
 
     vertices: np.ndarray
-    seen: float
+    seen: float  # share of them that three photographs show
+    # before, after: mean agreement of the photographs (normalised cross-correlation, -1 to 1) where these show anything
     before: float
     after: float
-    improved: bool
+    improved: bool  # whether the vertices were moved
 
 
 def refined(vertices: np.ndarray, faces: np.ndarray, photographs: Iterable[Photograph], tick: Callable[[], None] = lambda: None) -> PhotometricRefinement:

@@ -7,8 +7,6 @@ sharply curved: where it is flat the depths of views are more accurate.
 V vertices, F faces, H x W pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Textures from the asset alone: its colours where no photograph shows any, or where there are none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

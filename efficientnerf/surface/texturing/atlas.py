@@ -21,18 +21,12 @@ GAP = 4  # texels between charts, at least; 1/512 of the side in larger textures
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """A mesh's charts in a texture of S x S texels.
+    """A mesh's charts in a texture of S x S texels."""
 
-    corners  (F, 3, 2) float64 texels of each face's corners: x to the right, y down from the upper edge
-    chart    (F,) int64 number of each face's chart
-    size     S
-    scale    texels for each unit of the mesh
-    """
-
-    corners: np.ndarray
-    chart: np.ndarray
-    size: int
-    scale: float
+    corners: np.ndarray  # (F, 3, 2) float64 texels of each face's corners: x to the right, y down from the upper edge
+    chart: np.ndarray  # (F,) int64 number of each face's chart
+    size: int  # S
+    scale: float  # texels for each unit of the mesh
 
     @property
     def coordinates(self) -> np.ndarray:
@@ -47,16 +41,11 @@ class Atlas:
 
 @dataclass(frozen=True, eq=False)
 class Texels:
-    """Texels that show a point of the surface, face by face.
+    """Texels that show a point of the surface, face by face."""
 
-    place  (T,) int64 row * S + column
-    begin  (F + 1,) int64 first of each face
-    share  (T, 3) float32 barycentric coordinates
-    """
-
-    place: np.ndarray
-    begin: np.ndarray
-    share: np.ndarray
+    place: np.ndarray  # (T,) int64 row * S + column
+    begin: np.ndarray  # (F + 1,) int64 first of each face
+    share: np.ndarray  # (T, 3) float32 barycentric coordinates
 
     def values(self, at: np.ndarray, faces: np.ndarray, part: slice = slice(None)) -> np.ndarray:
         """(T, 3) what vertices have (V, 3), at texels: places, normals, colours."""

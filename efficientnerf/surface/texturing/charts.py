@@ -4,8 +4,6 @@ Each is the projection of neighbouring faces along the mean of their normals. xa
 40 s for the 100 k faces of a mesh from an asset, where this takes one. docs/experiments/textures.md
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,14 +23,10 @@ SMALL = 40  # faces under which a chart joins one next to it, where it fits
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Faces laid flat.
+    """Faces laid flat."""
 
-    chart    (F,) int64 number of each face's chart, 0..C-1; faces of one chart are connected
-    corners  (F, 3, 2) float64 in the plane of the chart, the mesh's units; each chart begins at the origin
-    """
-
-    chart: np.ndarray
-    corners: np.ndarray
+    chart: np.ndarray  # (F,) int64 number of each face's chart, 0..C-1; faces of one chart are connected
+    corners: np.ndarray  # (F, 3, 2) float64 in the plane of the chart, the mesh's units; each chart begins at the origin
 
     @property
     def count(self) -> int:

@@ -1,7 +1,5 @@
 """Vertices that are split where a texture has its seams: as many as files with one texture coordinate each have."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,16 +9,11 @@ from efficientnerf.surface.mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """A mesh whose vertices have one texture coordinate each.
+    """A mesh whose vertices have one texture coordinate each."""
 
-    vertex       (N,) int64, the vertex of the mesh that each is a copy of; ascending
-    coordinates  (N, 2) float32, v up
-    faces        (F, 3) int64 of these
-    """
-
-    vertex: np.ndarray
-    coordinates: np.ndarray
-    faces: np.ndarray
+    vertex: np.ndarray  # (N,) int64, the vertex of the mesh that each is a copy of; ascending
+    coordinates: np.ndarray  # (N, 2) float32, v up
+    faces: np.ndarray  # (F, 3) int64 of these
 
 
 def split_at_seams(mesh: Mesh) -> Corners:

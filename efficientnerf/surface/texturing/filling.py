@@ -1,8 +1,6 @@
 """From colours of texels to a texture: those that show no point of the surface carry the colours of the charts on, so that interpolation and smaller levels
 of the texture have no seams."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -74,16 +74,11 @@ def halved(photo: Photograph) -> Photograph:
 
 @dataclass(frozen=True)
 class Survey:
-    """Statistics of a photograph on the mesh, before any texel sees it.
+    """Statistics of a photograph on the mesh, before any texel sees it."""
 
-    density    (F,) float32 pixels on the side of the square that a face is half of, where one of its vertices shows; zero elsewhere
-    sharpness  of its pixels of the mesh: how much of their detail is fine
-    gains      (3,) factors that bring its colours to those of the vertices; nan where it shows too few
-    """
-
-    density: np.ndarray
-    sharpness: float
-    gains: np.ndarray
+    density: np.ndarray  # (F,) float32 pixels on the side of the square that a face is half of, where one of its vertices shows; zero elsewhere
+    sharpness: float  # of its pixels of the mesh: how much of their detail is fine
+    gains: np.ndarray  # (3,) factors that bring its colours to those of the vertices; nan where it shows too few
 
 
 def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours: np.ndarray, photo: Photograph, tick: Callable[[], None] = _untold) -> Survey:
@@ -233,19 +228,15 @@ def _from_border(shape: tuple[int, ...]) -> np.ndarray:
 
 @dataclass(eq=False)
 class PhotographTexture:
-    """Texels of a mesh that look at photographs, one after the other: `look` at each, then `colours`.
+    """Texels of a mesh that look at photographs, one after the other: `look` at each, then `colours`."""
 
-    vertices, faces, normals  of the mesh, normals at its vertices
-    density    (F,) pixels on the side of each face, of the photograph that has most
-    sharpness  of each photograph, median
-    """
-
+    # vertices, faces, normals: of the mesh, normals at its vertices
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
     atlas: Atlas
-    density: np.ndarray
-    sharpness: float
+    density: np.ndarray  # (F,) pixels on the side of each face, of the photograph that has most
+    sharpness: float  # of each photograph, median
     seen: np.ndarray = field(init=False)
     weights: np.ndarray = field(init=False)
     halvings: int = field(init=False)  # of photographs, before texels look at them: several of whose pixels lie in a texel

@@ -5,8 +5,6 @@ vertex's normal, weighted by the angle of the face there. The bitangent is sign 
 tangent are interpolated as they are, not brought to length one. Mikkelsen, "Simulation of wrinkled surfaces revisited", 2008.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 

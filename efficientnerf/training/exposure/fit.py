@@ -4,8 +4,6 @@ vignetting of its camera, by robust least squares. Much better evidence than the
 O observations, P points, C photographs, K cameras.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,15 +16,11 @@ STIFFNESS = 1.0  # observations that a photograph's gain of one, or a camera's v
 
 @dataclass(frozen=True, eq=False)
 class ExposureFit:
-    """
-    gains       (C, 3) logarithms of gains, of mean zero
-    vignetting  (K, 2) a and b of `efficientnerf.training.exposure.model`
-    explained   share of the weighted squares of the differences between observations of a point that these account for
-    """
+    """What a fit to sparse points found."""
 
-    gains: np.ndarray
-    vignetting: np.ndarray
-    explained: float
+    gains: np.ndarray  # (C, 3) logarithms of gains, of mean zero
+    vignetting: np.ndarray  # (K, 2) a and b of `efficientnerf.training.exposure.model`
+    explained: float  # share of the weighted squares of the differences between observations of a point that these account for
 
 
 def fit_exposure(light: np.ndarray, point: np.ndarray, view: np.ndarray, radius: np.ndarray, camera_of: np.ndarray) -> ExposureFit:

@@ -4,8 +4,6 @@ It is that of the nearest training photographs, times how well theirs predicts a
 view, 0 where each photograph has an exposure at random and the mean is the better guess. No held-back photograph is looked at.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

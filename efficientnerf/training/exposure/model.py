@@ -46,16 +46,11 @@ CELLS = 2 ** (31 - CELL_BITS)
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Learned parameters; zero is no difference.
+    """Learned parameters; zero is no difference."""
 
-    photographs  (C, 3) logarithms of gains over SCALE, before their mean is taken off
-    cameras      (K, 4) a, b and shoulder over SCALE, offset over OFFSET_SCALE
-    camera_of    (C,) int64 camera of each photograph
-    """
-
-    photographs: Tensor
-    cameras: Tensor
-    camera_of: Tensor
+    photographs: Tensor  # (C, 3) logarithms of gains over SCALE, before their mean is taken off
+    cameras: Tensor  # (K, 4) a, b and shoulder over SCALE, offset over OFFSET_SCALE
+    camera_of: Tensor  # (C,) int64 camera of each photograph
 
     @property
     def parameters(self) -> dict[str, nn.Parameter]:

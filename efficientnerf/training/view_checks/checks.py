@@ -70,22 +70,15 @@ class Observations:
 
 @dataclass
 class ViewChecks:
-    """The state of the training views.
+    """The state of the training views."""
 
-    given     the cameras as they came
-    done      (1,) checks
-    left_out  (C,) bool: not trained on
-    replaced  (C,) bool: `pose` is the camera's, and trained on unless left out
-    pose      (C, 4, 4) the pose that was found for a view, world from camera; else the given one
-    evidence  (C, 6) of each view that was ever left out: step, error inside tiles, that of its neighbours, that with the pose that was found, by how many
-              cells this moves the picture (infinite without overlap), evidence as bits (1 another place, 2 points, 4 no likeness, 8 few points)
-    """
-
-    given: tuple[Camera, ...]
-    done: np.ndarray
-    left_out: np.ndarray
-    replaced: np.ndarray
-    pose: np.ndarray
+    given: tuple[Camera, ...]  # the cameras as they came
+    done: np.ndarray  # (1,) checks
+    left_out: np.ndarray  # (C,) bool: not trained on
+    replaced: np.ndarray  # (C,) bool: `pose` is the camera's, and trained on unless left out
+    pose: np.ndarray  # (C, 4, 4) the pose that was found for a view, world from camera; else the given one
+    # (C, 6) of each view that was ever left out: step, error inside tiles, that of its neighbours, that with the pose that was found, by how many cells this
+    # moves the picture (infinite without overlap), evidence as bits (1 another place, 2 points, 4 no likeness, 8 few points)
     evidence: np.ndarray
 
     @staticmethod

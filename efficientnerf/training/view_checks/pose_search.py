@@ -5,8 +5,6 @@ shift of each start is found by correlation and taken as a rotation. The best ar
 in ever smaller cells.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -30,20 +28,15 @@ OVERLAP = 0.4  # of the cells have to meet where a picture is shifted
 
 @dataclass(frozen=True)
 class Search:
-    """Inputs of the pose search.
-
-    cameras    (C) of all photographs
-    renders    of each the field in its cells (H, W, 3)
-    near, far  nearest and farthest of all views along their axes
-    grey       see `residuals.shown`
-    """
+    """Inputs of the pose search."""
 
     model: Model
-    cameras: Sequence[Camera]
-    renders: Sequence[np.ndarray]
+    cameras: Sequence[Camera]  # (C) of all photographs
+    renders: Sequence[np.ndarray]  # of each the field in its cells (H, W, 3)
+    # near, far: nearest and farthest of all views along their axes
     near: float
     far: float
-    grey: bool
+    grey: bool  # see `residuals.shown`
 
     def render(self, cameras: Sequence[Camera], side: int) -> list[np.ndarray]:
         """Renders from cameras in their cells."""

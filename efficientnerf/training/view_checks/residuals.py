@@ -4,8 +4,6 @@ Photographs and renders are compared in cells that average many pixels, so that 
 photograph's variance once the render's colours are fitted to it by channel: exposure and white balance do not matter. C views, H x W cells of a view.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,16 +29,11 @@ SPREAD = 0.2  # of the logarithm of neighbours' errors, at least: photographs of
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of the photographs.
+    """The cells of the photographs."""
 
-    size    (C,) side in pixels
-    colour  of each view (H, W, 3), means of the pixels, over the background where the photograph has alpha
-    weight  of each view (H, W), share of a cell's pixels that masks allow
-    """
-
-    size: tuple[int, ...]
-    colour: tuple[np.ndarray, ...]
-    weight: tuple[np.ndarray, ...]
+    size: tuple[int, ...]  # (C,) side in pixels
+    colour: tuple[np.ndarray, ...]  # of each view (H, W, 3), means of the pixels, over the background where the photograph has alpha
+    weight: tuple[np.ndarray, ...]  # of each view (H, W), share of a cell's pixels that masks allow
 
 
 def photograph(pixels: Pixels, view: int, background: np.ndarray, rows: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:

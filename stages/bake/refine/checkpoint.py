@@ -5,8 +5,6 @@ What was baked gives the grids. A state's voxels are all of those that were bake
 N voxels, n voxels of the state.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

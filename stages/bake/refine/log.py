@@ -1,7 +1,5 @@
 """The log of a refinement, its previews of a view that was held back."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -7,8 +7,6 @@ checkpoint (`stages.bake.refine.checkpoint`).
 With bake.time_budget the number of steps of a phase follows from the time that its first ones take, as in training (`stages.train.budget`).
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 from dataclasses import dataclass, field, replace

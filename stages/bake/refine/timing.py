@@ -1,7 +1,5 @@
 """The shares of bake.time_budget that the phases of the refinement may take."""
 
-from __future__ import annotations
-
 from efficientnerf.asset.refinement.schedule import PHASES
 from efficientnerf.training.schedule import Schedule
 from stages.compiling import clock

@@ -5,8 +5,6 @@ of meshes whose format keeps textures take `picture`, "png" or "jpeg", too; thos
 for what would make a broken file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -20,29 +18,18 @@ _PACKAGES = {"usd": {"pxr": "usd-core"}, "las": {"laspy": "laspy", "lazrs": "laz
 
 @dataclass(frozen=True)
 class Format:
-    """What a format of meshes, of points, of volumes or of Gaussians is.
+    """What a format of meshes, of points, of volumes or of Gaussians is."""
 
-    extension  with its dot
-    keeps      of a mesh, of points or of an asset
-    loses      what it has no place for
-    opened_by  programs that were tried; after "should", others that were not
-    module     of this package, and its function: write
-    textures   whether it keeps textures, and takes `picture`
-    coloured   whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
-    extra      of the package efficientnerf, that has to be installed for it
-    beside     whether a texture lies in files next to it: `companions` of its module
-    """
-
-    extension: str
-    keeps: str
-    loses: str
-    opened_by: str
-    module: str
+    extension: str  # with its dot
+    keeps: str  # of a mesh, of points or of an asset
+    loses: str  # what it has no place for
+    opened_by: str  # programs that were tried; after "should", others that were not
+    module: str  # of this package, and its function: write
     function: str
-    textures: bool = False
-    coloured: bool = True
-    extra: str | None = None
-    beside: bool = False
+    textures: bool = False  # whether it keeps textures, and takes `picture`
+    coloured: bool = True  # whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
+    extra: str | None = None  # of the package efficientnerf, that has to be installed for it
+    beside: bool = False  # whether a texture lies in files next to it: `companions` of its module
 
     def __call__(self, what: Any, path: Path, frame: Any, **options: Any) -> None:
         """Write it. `options`: picture, of formats that keep textures; version, of .spz. The module is imported now. Raises BadInput and UsageError."""

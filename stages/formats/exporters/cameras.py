@@ -4,8 +4,6 @@ What is written are the cameras of the source images (after EXIF rotation) with 
 into the folder of the source images, whose names it uses.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

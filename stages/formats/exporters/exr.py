@@ -5,8 +5,6 @@ normal.X normal.Y normal.Z (unit, in the capture's frame; zero where nothing is 
 capture's frame; zero where nothing is).
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -1,7 +1,5 @@
 """Frames of a render: 8 bits, sRGB, straight alpha, over a background."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.rendering.colour import straight_from_premultiplied

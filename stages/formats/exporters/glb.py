@@ -12,8 +12,6 @@ Sides    a mesh with open edges is seen from both sides.
 Khronos, glTF 2.0 specification, sections 3.7.2.1 (attributes), 3.8 (textures) and 4.4 (binary); extension KHR_materials_unlit.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence

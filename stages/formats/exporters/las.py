@@ -4,8 +4,6 @@ which CloudCompare and PDAL take as such. Where the unit is known to be a metre,
 Coordinates are integers of a step that is a power of ten: at most a millionth of the points' reach, so that 32 bits hold them.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from pathlib import Path

@@ -5,8 +5,6 @@ Without a texture one file: `v x y z r g b` with sRGB colours 0-1 (the extension
 and know no encoding: the names of the other files are plain ASCII (`plain_stem`). The OBJ, which refers to the others, appears last.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 

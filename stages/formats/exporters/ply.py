@@ -1,7 +1,5 @@
 """PLY, binary little endian: float32 x y z nx ny nz, uchar red green blue holding sRGB; meshes add the list vertex_indices. The capture's frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

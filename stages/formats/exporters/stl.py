@@ -1,7 +1,5 @@
 """STL, binary: the faces alone, each with its normal, float32. No colours. The capture's frame, whose unit the header states."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The textures of exported meshes: pictures as files, and names that every reader takes."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import re

@@ -9,8 +9,6 @@ A USDZ is a zip whose files are stored as they are and begin at multiples of 64 
 by UsdUtils.CreateNewUsdzPackage, which puts the local time into it: the same mesh is the same bytes.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

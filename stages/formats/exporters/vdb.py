@@ -43,17 +43,12 @@ _INACTIVE_ARE_BACKGROUND = b"\0"
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Values at some voxels, zero elsewhere.
-
-    coordinates  (N, 3) integers, each once
-    values       (N,) or (N, 3), float32 or float16
-    matrix       (4, 4) from the coordinates to the world: a voxel's centre lies at its coordinates
-    """
+    """Values at some voxels, zero elsewhere."""
 
     name: str
-    coordinates: np.ndarray
-    values: np.ndarray
-    matrix: np.ndarray
+    coordinates: np.ndarray  # (N, 3) integers, each once
+    values: np.ndarray  # (N,) or (N, 3), float32 or float16
+    matrix: np.ndarray  # (4, 4) from the coordinates to the world: a voxel's centre lies at its coordinates
 
 
 def write_volume(tree: NerfTree, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:

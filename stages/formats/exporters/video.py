@@ -1,7 +1,5 @@
 """MP4 with H.264, 4:2:0, Rec. 709, index in front: what every browser plays. The same frames are the same bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -17,7 +15,6 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
     """Encode frames; returns how many.
 
     frames  (H, W, 3) uint8 sRGB, all of one size; an odd width or height is padded by repeating the last column or row
-    fps     frames per second
     crf     x264's quality, 0 lossless to 51 worst
     each    called before each frame; may raise to stop
 

@@ -1,7 +1,5 @@
 """Shared by all exporters: the frame that a file's numbers are in, the checks before, and writing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,16 +19,11 @@ _ROWS = 50_000  # lines of text made at a time
 
 @dataclass(frozen=True, eq=False)
 class SourceFrame:
-    """The capture's frame, in which meshes and points are handed to exporters.
+    """The capture's frame, in which meshes and points are handed to exporters."""
 
-    world_from_capture  to the training frame
-    metric              whether a unit is known to be a metre
-    set_up              (3,) unit, the direction that someone set to be up; None: the training frame's z
-    """
-
-    world_from_capture: Similarity
-    metric: bool = False
-    set_up: np.ndarray | None = None
+    world_from_capture: Similarity  # to the training frame
+    metric: bool = False  # whether a unit is known to be a metre
+    set_up: np.ndarray | None = None  # (3,) unit, the direction that someone set to be up; None: the training frame's z
 
     @property
     def up(self) -> np.ndarray:

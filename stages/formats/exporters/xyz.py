@@ -3,8 +3,6 @@
 No header: readers that know only `x y z` take the first three numbers, and those that show colours expect them next.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

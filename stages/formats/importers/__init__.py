@@ -3,8 +3,6 @@
 Nothing heavy is imported until something is read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -23,16 +21,12 @@ from stages.video import KNOWN, SUFFIXES
 
 @dataclass(frozen=True)
 class Importer:
-    """How one format is read.
+    """How one format is read."""
 
-    module   of this package or one below it
-    entry    the name of its `ListFormat`; None: it states no cameras, and the module itself has recognises(folder) and files(folder, settings)
-    renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
-    """
-
-    module: str
+    module: str  # of this package or one below it
+    # the name of its `ListFormat`; None: it states no cameras, and the module itself has recognises(folder) and files(folder, settings)
     entry: str | None = "FORMAT"
-    renders: bool = False
+    renders: bool = False  # whether its images may be renders of an object on a constant background, whose alpha is coverage
 
     @property
     def posed(self) -> bool:

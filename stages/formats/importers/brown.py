@@ -7,8 +7,6 @@ Our models have neither k4 of r^8 nor a skew. A radial polynomial with k4 become
 `MAX_ERROR` pixels as far as the image reaches; a skew that moves no pixel by more than `MAX_SKEW` is left out. Any other lens is refused.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Of several models in a folder (sparse/0, sparse/1, ...) the one with most regist
 a small reprojection error is no sign of a good one.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ refused. Newer models also hold `rigs` and `frames`; `images` has every pose, so
 Formats: the COLMAP documentation, "Output format".
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct

@@ -5,8 +5,6 @@ A phone's depth is upsampled, smooth across edges and a guess beyond five metres
 other maps confirm it. Their number is bounded, whatever the number of maps. C photos, N points.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging
@@ -41,20 +39,13 @@ EDGE = 0.05  # share by which a sample may differ from its neighbours in the map
 
 @dataclass(frozen=True)
 class DepthFile:
-    """The depth of a photo along its view axis.
+    """The depth of a photo along its view axis."""
 
-    file        PNG of one channel or OpenEXR, without links; 0, or what is not finite: unknown
-    unit        units of the capture's frame to one
-    confidence  PNG of one channel of the same size, or None
-    trusted     the least confidence that is used
-    farthest    units beyond which a depth is not used
-    """
-
-    file: Path
-    unit: float
-    confidence: Path | None = None
-    trusted: int = 0
-    farthest: float = np.inf
+    file: Path  # PNG of one channel or OpenEXR, without links; 0, or what is not finite: unknown
+    unit: float  # units of the capture's frame to one
+    confidence: Path | None = None  # PNG of one channel of the same size, or None
+    trusted: int = 0  # the least confidence that is used
+    farthest: float = np.inf  # units beyond which a depth is not used
 
 
 def depth_file(source: Source, path: Path, unit: float, confidence: Path | None = None, trusted: int = 0, farthest: float = np.inf) -> DepthFile | None:

@@ -1,7 +1,5 @@
 """What a source holds, without changing or decoding it."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Missing images are looked for, one listed folder at a time: where nothing of a l
 stands in for it (images/ listed, rgb/ there). A tie between two folders is not decided.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -24,27 +22,20 @@ _BESIDE_IMAGES = NOT_PHOTOGRAPHS | {"confidence"}  # folders with files of the n
 
 @dataclass(frozen=True)
 class Frame:
-    """An image that a file lists.
+    """An image that a file lists."""
 
-    name    as listed, relative to the folder `beside`
-    where   what messages call it
-    camera  (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
-    bare    the format states no folder: the name alone is looked for, and its place is not reported
-    mask    where the format names masks; else one next to the image is looked for
-    near, far  along the view axis, where the format states them
-    own     what the format keeps of it for itself
-    """
-
-    name: str
+    name: str  # as listed, relative to the folder `beside`
     beside: Path
-    where: str
+    where: str  # what messages call it
+    # (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
     camera: Callable[[str, tuple[int, int]], Camera]
-    bare: bool = False
-    mask: Path | None = None
+    bare: bool = False  # the format states no folder: the name alone is looked for, and its place is not reported
+    mask: Path | None = None  # where the format names masks; else one next to the image is looked for
     split: str | None = None
+    # near, far: along the view axis, where the format states them
     near: float | None = None
     far: float | None = None
-    own: Any = None
+    own: Any = None  # what the format keeps of it for itself
 
 
 def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
@@ -54,20 +45,13 @@ def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
 
 @dataclass
 class Listing:
-    """Frames with the images that they led to.
+    """Frames with the images that they led to."""
 
-    found       (frame, its image)
-    missing     names, as they may be shown
-    repeated    (name, reason) of those that name an image again
-    places      (listed, found) of those found at another place
-    extensions  (listed, found) of those with another extension
-    """
-
-    found: list[tuple[Frame, Path]] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    repeated: list[tuple[str, str]] = field(default_factory=list)
-    places: list[tuple[str, str]] = field(default_factory=list)
-    extensions: list[tuple[str, str]] = field(default_factory=list)
+    found: list[tuple[Frame, Path]] = field(default_factory=list)  # (frame, its image)
+    missing: list[str] = field(default_factory=list)  # names, as they may be shown
+    repeated: list[tuple[str, str]] = field(default_factory=list)  # (name, reason) of those that name an image again
+    places: list[tuple[str, str]] = field(default_factory=list)  # (listed, found) of those found at another place
+    extensions: list[tuple[str, str]] = field(default_factory=list)  # (listed, found) of those with another extension
 
 
 def check_count(count: int, where: str) -> None:

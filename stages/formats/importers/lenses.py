@@ -1,7 +1,5 @@
 """Checks that every importer makes of a camera: its matrix is a rigid motion, its lens is possible, its size is the image's."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

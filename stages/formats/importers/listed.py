@@ -1,7 +1,5 @@
 """Formats that list frames: how one is recognised and read, with what all of them have in common."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -32,50 +30,34 @@ def stated_or_beside(source: Source, found: Sequence[tuple[Frame, Path]]) -> Mas
 
 @dataclass(frozen=True)
 class Listed:
-    """What a source states.
+    """What a source states. The others are fields of `Capture`."""
 
-    where     what messages call it
-    files     those that state it
-    rejected  (name, reason) of images that it names without a camera, e.g. not aligned
-    masks     of frames with their images
-    depth     of a frame and its image
-    finish    adds to the capture what depends on the photos; with the frames in their order
-    remedy    for images that are missing
-    unsaid    remarks of `lenses.fit_to_images` that are no news
-    The others are fields of `Capture`.
-    """
-
-    where: str
+    where: str  # what messages call it
     frames: Sequence[Frame]
-    files: Sequence[Path]
-    rejected: Sequence[tuple[str, str]] = ()
+    files: Sequence[Path]  # those that state it
+    rejected: Sequence[tuple[str, str]] = ()  # (name, reason) of images that it names without a camera, e.g. not aligned
     warnings: Sequence[str] = ()
     up: np.ndarray | None = None
     bounds: np.ndarray | None = None
     metric: bool = False
     facts: dict[str, object] = field(default_factory=dict)
-    masks: Callable[[Source, Sequence[tuple[Frame, Path]]], Masks] = stated_or_beside
-    depth: Callable[[Frame, Path], DepthFile | None] = lambda frame, image: None
+    masks: Callable[[Source, Sequence[tuple[Frame, Path]]], Masks] = stated_or_beside  # of frames with their images
+    depth: Callable[[Frame, Path], DepthFile | None] = lambda frame, image: None  # of a frame and its image
+    # adds to the capture what depends on the photos; with the frames in their order
     finish: Callable[[Capture, Sequence[Frame]], Capture] = lambda capture, frames: capture
-    remedy: str = "Copy them into the source folder, or export again without them."
-    unsaid: Sequence[str] = ()
+    remedy: str = "Copy them into the source folder, or export again without them."  # for images that are missing
+    unsaid: Sequence[str] = ()  # remarks of `lenses.fit_to_images` that are no news
 
 
 @dataclass(frozen=True)
 class ListFormat:
-    """See `stages.formats.importers.Importer`.
-
-    expected    what a folder of this format holds, for messages
-    signs       files that a folder of this format has
-    listed      what the source states; BadInput where it cannot be read
-    recognised  whether they are of this format, where their being there does not tell
-    """
+    """See `stages.formats.importers.Importer`."""
 
     kind: str
-    expected: str
-    signs: Callable[[Source], Sequence[Path]]
-    listed: Callable[[Source, Sequence[Path]], Listed]
-    recognised: Callable[[Source, Sequence[Path]], bool] = lambda source, signs: True
+    expected: str  # what a folder of this format holds, for messages
+    signs: Callable[[Source], Sequence[Path]]  # files that a folder of this format has
+    listed: Callable[[Source, Sequence[Path]], Listed]  # what the source states; BadInput where it cannot be read
+    recognised: Callable[[Source, Sequence[Path]], bool] = lambda source, signs: True  # whether they are of this format, where their being there does not tell
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         source = Source(folder, allow_outside)

@@ -4,8 +4,6 @@ A row is 3x5 [R | t | (h, w, f)] with camera columns down, right, back, then nea
 h, w, f are those of the full images; the images at hand may be smaller, and f is scaled to them.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Sequence

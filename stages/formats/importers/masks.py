@@ -5,8 +5,6 @@ That of IMG_1.jpg is called IMG_1.png (nerfstudio), IMG_1.jpg.png (COLMAP), IMG_
 may lie in the folder of the photograph itself. Where it is black, the image is left out.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache

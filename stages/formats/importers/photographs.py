@@ -6,8 +6,6 @@ One picture that lies there twice (IMG_1.HEIC and IMG_1.JPG, as clouds export th
 their extension, those that were taken at one time, or look alike.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

@@ -10,8 +10,6 @@ What lies outside the source folder is not read unless the user allows it. `Sour
 that it returns is the one that is opened, whatever becomes of the links later.
 """
 
-from __future__ import annotations
-
 import os
 import unicodedata
 from collections.abc import Sequence
@@ -59,34 +57,22 @@ def name_key(name: str) -> str:
 
 @dataclass(frozen=True)
 class Found:
-    """The file of a listed name.
+    """The file of a listed name."""
 
-    path  the file, or None
-    how   "listed", "extension" (another one than listed) or "elsewhere" (at another place in the source)
-    """
-
-    path: Path | None
-    how: str = "listed"
+    path: Path | None  # the file, or None
+    how: str = "listed"  # "listed", "extension" (another one than listed) or "elsewhere" (at another place in the source)
 
 
 @dataclass
 class Source:
-    """A source folder; all look-ups go through it.
+    """A source folder; all look-ups go through it."""
 
-    root           the folder
-    allow_outside  whether files outside it may be read
-    llff_factor    of the settings
-    runs           run folders below it that a look-up met: they were made from the source, and are no part of it
-    links          linked folders that a look-up met and did not follow, for they lead out of it
-    remarks        sentences about files that are left aside, each once
-    """
-
-    root: Path
-    allow_outside: bool = False
-    llff_factor: int | Auto = "auto"
-    runs: set[Path] = field(default_factory=set)
-    links: set[Path] = field(default_factory=set)
-    remarks: dict[str, None] = field(default_factory=dict)
+    root: Path  # the folder
+    allow_outside: bool = False  # whether files outside it may be read
+    llff_factor: int | Auto = "auto"  # of the settings
+    runs: set[Path] = field(default_factory=set)  # run folders below it that a look-up met: they were made from the source, and are no part of it
+    links: set[Path] = field(default_factory=set)  # linked folders that a look-up met and did not follow, for they lead out of it
+    remarks: dict[str, None] = field(default_factory=dict)  # sentences about files that are left aside, each once
     _real: dict[Path, Path] = field(default_factory=dict)
     _names: dict[Path, str] = field(default_factory=dict)
     _taken: set[str] = field(default_factory=set)

@@ -1,7 +1,5 @@
 """Text files of a source, read within bounds, and the numbers in them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -10,8 +10,6 @@ Where a frame names no mask, one next to its image counts. Depth that frames nam
 becomes sparse points where images agree on it. The capture's frame is that of the matrices; `applied_transform` is recorded only.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The camera of a frame of a transforms.json: matrix and lens, as nerfstudio and instant-ngp name them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

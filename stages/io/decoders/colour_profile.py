@@ -9,8 +9,6 @@ which photographs nearly all have, give the same with either. docs/experiments/c
 A profile is known as sRGB by what it does to colours, not by its name: there are dozens of them under many names, and pictures with one keep their pixels.
 """
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -29,18 +27,12 @@ _CONTRAST = 128  # levels that white is brighter than black by in any picture's 
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """How the numbers of a picture become sRGB.
+    """How the numbers of a picture become sRGB."""
 
-    mode       "L", "RGB" or "CMYK", of what is converted
-    transform  littlecms', None where the numbers are sRGB as they are
-    fault      why the picture's profile is not used, if it is not
-    levels     (256, 3) uint8 what the transform makes of each grey
-    """
-
-    mode: str = "RGB"
-    transform: Any = None
-    fault: str | None = None
-    levels: np.ndarray | None = None
+    mode: str = "RGB"  # "L", "RGB" or "CMYK", of what is converted
+    transform: Any = None  # littlecms', None where the numbers are sRGB as they are
+    fault: str | None = None  # why the picture's profile is not used, if it is not
+    levels: np.ndarray | None = None  # (256, 3) uint8 what the transform makes of each grey
 
     def rgb_of(self, image: Any) -> np.ndarray:
         """(H, W, 3) uint8 sRGB of a decoded Pillow image of a mode that can be made this one's."""

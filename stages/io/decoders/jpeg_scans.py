@@ -1,7 +1,5 @@
 """How many scans a JPEG has: each is a pass over all of its pixels, and an empty one takes 10 bytes of the file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import BinaryIO

@@ -4,8 +4,6 @@ Developed alike for all pictures of a set: white balance as shot, nothing that d
 into EXIF.
 """
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a mesh file holds, in figures."""
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterable

@@ -1,9 +1,4 @@
-"""The shape that a file holds, and what may be wrong with one.
-
-N vertices, F triangles.
-"""
-
-from __future__ import annotations
+"""The shape that a file holds, and what may be wrong with one. N vertices, F triangles."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,16 +16,11 @@ class Damaged(ValueError):
 
 @dataclass(frozen=True)
 class Geometry:
-    """Part of a file, or all of it.
+    """Part of a file, or all of it."""
 
-    vertices   (N, 3) float64
-    triangles  (F, 3) int64, places in `vertices`
-    colours    (N, 3) uint8, or None
-    """
-
-    vertices: np.ndarray
-    triangles: np.ndarray
-    colours: np.ndarray | None = None
+    vertices: np.ndarray  # (N, 3) float64
+    triangles: np.ndarray  # (F, 3) int64, places in `vertices`
+    colours: np.ndarray | None = None  # (N, 3) uint8, or None
 
     def __post_init__(self) -> None:
         if len(self.triangles) and (self.triangles.min() < 0 or self.triangles.max() >= len(self.vertices)):

@@ -3,8 +3,6 @@
 glTF 2.0, sections 3.6 (buffers and accessors), 3.5 (nodes), 4.4 (GLB).
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from typing import Any, BinaryIO
@@ -26,10 +24,7 @@ _LARGEST = 1e15  # of a number in a node
 
 
 class Glb:
-    """A file that is read by its accessors. Raises Damaged, and Unreadable for a document that is none.
-
-    document  its JSON
-    """
+    """A file that is read by its accessors. Raises Damaged, and Unreadable for a document that is none."""
 
     def __init__(self, file: BinaryIO, size: int, limit: int = MAX_JSON) -> None:
         self.file = file
@@ -39,7 +34,7 @@ class Glb:
         length, described = struct.unpack_from("<II", head, 8)
         if length > size or described > min(size, limit):
             raise Damaged(f"{size} bytes; expected {length}, of which a document of at most {limit}")
-        self.document = json_value(exactly(file, described))
+        self.document = json_value(exactly(file, described))  # its JSON
         chunk = file.read(8)
         self.start = self.end = 28 + described
         if len(chunk) == 8 and chunk[4:] == b"BIN\0":

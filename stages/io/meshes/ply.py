@@ -1,7 +1,5 @@
 """PLY, binary or text: the places, colours and faces that it holds."""
 
-from __future__ import annotations
-
 import re
 from array import array
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """OBJ, STL and XYZ, line by line."""
 
-from __future__ import annotations
-
 from array import array
 from typing import BinaryIO
 

@@ -1,7 +1,5 @@
 """Matches by networks added to those of SIFT: features of photographs without a camera, and of those that they are compared with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

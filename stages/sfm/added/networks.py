@@ -7,8 +7,6 @@ of 1; key points are in pixels, or from -1 at the middle of the first pixel to 1
 picture that of the second or -1, and `mscores0`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,18 +27,12 @@ _IN_BOUNDS = 1.001  # of key points from -1 to 1
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Of a picture.
+    """Of a picture."""
 
-    xy           (N, 2) float64 px of the picture as it was given, from its corner
-    seen         (N, 2) float32 px of the picture as the network saw it, from the middle of its first pixel
-    size         width and height of that, px
-    descriptors  (N, D) float32
-    """
-
-    xy: np.ndarray
-    seen: np.ndarray
-    size: tuple[int, int]
-    descriptors: np.ndarray
+    xy: np.ndarray  # (N, 2) float64 px of the picture as it was given, from its corner
+    seen: np.ndarray  # (N, 2) float32 px of the picture as the network saw it, from the middle of its first pixel
+    size: tuple[int, int]  # width and height of that, px
+    descriptors: np.ndarray  # (N, D) float32
 
 
 class Detector:

@@ -5,8 +5,6 @@ photograph by a few per cent, which one camera for all cannot follow. More param
 test of the fit to the others. docs/experiments/sfm.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any, NamedTuple

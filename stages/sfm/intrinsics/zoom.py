@@ -1,7 +1,5 @@
 """Whether photographs of one camera were zoomed or cropped, each by itself; and cameras for those that were cropped. docs/experiments/sfm.md"""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from copy import deepcopy
 from typing import Any

@@ -8,8 +8,6 @@ each colour channel that fits the photograph best is taken of each render. On a 
 its silhouette shows: the rest is right from the first step on. docs/experiments/early-check.md
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ the same pixels, and are compared on the same pixels of the same held-out views.
 ones are not. docs/experiments/early-check.md
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace

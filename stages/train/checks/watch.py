@@ -4,8 +4,6 @@ Results and decisions are noted in the scratch folder, so that a run that is kil
 last the choice. The checkpoints of the training that failed are removed before that is noted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training views with wrong cameras: the checks between the steps, and what is written and shown of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace

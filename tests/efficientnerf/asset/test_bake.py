@@ -1,7 +1,5 @@
 """From a field to a tree: which voxels are kept, and what is written into them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Nested grids: how they nest, which voxels belong to which, and the reference render of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which pieces of a tree are scraps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

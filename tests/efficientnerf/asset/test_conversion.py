@@ -1,7 +1,5 @@
 """Trees made smaller."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +9,9 @@ import pytest
 from efficientnerf.asset.cascades import cascades_of, check_cascades, voxel_coordinates
 from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
 from efficientnerf.asset.quantisation import compacted
-from efficientnerf.asset.rendering import render_rays, render_reference
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, tensors, uniform_tree
 
 

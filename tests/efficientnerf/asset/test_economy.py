@@ -1,7 +1,5 @@
 """Codes chosen for what they cost: smaller files, errors where they show least, the same codes every time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The error map: tiles with larger errors are drawn more often, their mean stays unbiased, and a map goes on where another one stopped."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

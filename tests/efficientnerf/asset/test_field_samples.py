@@ -1,7 +1,5 @@
 """What a field shows along training rays: which voxels of nested grids it needs, where rays end, what lies beyond, and the tree that is made of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The asset file: FORMAT.md, a reader written from it alone, golden files, and a hostile file for each rule."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -23,12 +21,13 @@ from efficientnerf.asset.file import container
 from efficientnerf.asset.file.metadata import STRUCTURE
 from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, save, serialize
 from efficientnerf.asset.queries import colour_at, density_at
-from efficientnerf.asset.rendering import render_rays, render_reference
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
 from tests.efficientnerf import nerftree_reader, packed_reader
 from tests.efficientnerf.damaged import METADATA, NESTED, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
 from tests.efficientnerf.hostile import HOSTILE
 from tests.efficientnerf.nerftree_reader import Tree
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, tensors
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"

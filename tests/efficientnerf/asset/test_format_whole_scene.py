@@ -1,7 +1,5 @@
 """Files of whole scenes: nested grids, an environment map and a foreground region come back as they were saved."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +10,8 @@ import torch
 from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.format import WRITERS, FormatError, describe, load, save, serialize
 from efficientnerf.asset.quantisation import quantised_density
-from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree, Region
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import LOW, random_cascades, random_tree, rays_at, tensors
 
 

@@ -1,7 +1,5 @@
 """Trees in normalised device coordinates: planes of the world at their depth, lookups by world points, harmonics along world directions."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +11,11 @@ import torch
 from efficientnerf.asset import format
 from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
-from efficientnerf.asset.rendering import render, render_rays, render_reference
+from efficientnerf.asset.rendering import render, render_rays
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
 from efficientnerf.geometry.cameras import Camera, rays
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.walls import DEPTH, NEAR, camera_at, looking_along_y, wall
 
 

@@ -1,8 +1,6 @@
 """Refinement of nested trees on the CPU: rays through all cascades, their gradients, steps by each cascade's own voxels, and the same bytes whatever the
 threads and interruptions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +14,7 @@ from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.host import in_voxels
 from efficientnerf.asset.refinement.state import initial_state, subset_state
 from efficientnerf.asset.refinement.targets import Targets
-from efficientnerf.asset.rendering import ray_parts, render_reference, tree_density
+from efficientnerf.asset.rendering import ray_parts
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import contributions as kernels
 from efficientnerf.backends.numba.tree.cells import cells_of
@@ -24,6 +22,7 @@ from efficientnerf.backends.numba.tree.nearest import render_rays as render_near
 from efficientnerf.rendering import environment
 from tests.efficientnerf.balls import pixels
 from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.tree_reference import render_reference, tree_density
 from tests.efficientnerf.trees import nested_rays, random_cascades, tensors, uniform_tree
 
 WHITE = (1.0, 1.0, 1.0)

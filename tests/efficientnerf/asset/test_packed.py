@@ -1,7 +1,5 @@
 """The layout `packed`: what `compact` holds, in fewer bytes, without loss; rANS and its tables."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

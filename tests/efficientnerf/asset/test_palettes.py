@@ -1,7 +1,5 @@
 """Harmonics kept as codes into palettes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

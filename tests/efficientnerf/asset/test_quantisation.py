@@ -1,7 +1,5 @@
 """From floats to codes, and the layouts that hold them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

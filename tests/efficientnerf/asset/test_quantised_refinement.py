@@ -1,7 +1,5 @@
 """Tables and palettes fitted to images, codes as they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

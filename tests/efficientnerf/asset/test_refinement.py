@@ -1,7 +1,5 @@
 """Fitting a tree to images: gradients against autograd and finite differences, steps against their formula, and what it is for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Regions of trees: inside nothing changes, outside is nothing, and doing it again does nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

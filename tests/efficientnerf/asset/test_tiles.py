@@ -1,7 +1,5 @@
 """Tiles of training images whose rays may meet a tree: `efficientnerf.asset.refinement.tiles`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.asset.refinement.tiles import tiles_met

@@ -1,7 +1,5 @@
 """The tree in memory: how it is built and asked, loop against kernel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The hash field's network in tiles: products and passes are those of numpy and autograd, in both precisions, for every size, on any processor."""
 
-from __future__ import annotations
-
 import copy
 import os
 import subprocess

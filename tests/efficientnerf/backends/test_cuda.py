@@ -1,7 +1,5 @@
 """The CUDA kernels of the hash encoding at sizes and in places that `backends/test_operations.py` does not have."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -2,8 +2,6 @@
 than the compiler does.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Compositing by the CUDA kernels where samples are opaque, or padding; other values and gradients are in test_operations.py."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Valid and pivotal samples by the CUDA kernels against torch, with and without a fixed capacity."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

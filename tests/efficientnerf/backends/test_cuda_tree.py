@@ -1,18 +1,17 @@
 """Images of trees by the CUDA kernel against the torch function and the CPU kernel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.rendering import Rendering, render, render_rays, render_reference
+from efficientnerf.asset.rendering import Rendering, render, render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering import environment
 from tests.efficientnerf.device import DEVICE
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import LOW, looking, nested_rays, random_cascades, random_tree, rays_at, tensors
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.tree")

@@ -1,7 +1,5 @@
 """The fit of baked values by the CUDA kernels against torch's autograd and the CPU kernel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

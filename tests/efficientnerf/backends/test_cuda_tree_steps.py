@@ -1,7 +1,5 @@
 """Optimiser steps of the CUDA kernels against the CPU's, and total variation against autograd."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Compiled kernels are kept where the user alone can write, are found again, and never outlive their sources; and which threads they run on."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What every source of kernels keeps to, so that what is compiled is what the cache takes it for."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

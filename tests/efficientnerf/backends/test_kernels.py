@@ -1,7 +1,5 @@
 """Adam and the directions of training pixels against what they stand for; the kernels' other pairs are with what they replace."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Nearest lookup: the values of the voxel that holds a point, in the kernels, in files and in the fit; torch against the loop is in `test_render`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +11,13 @@ from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_res
 from efficientnerf.asset.format import describe, load, save
 from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.refinement.state import initial_state
-from efficientnerf.asset.rendering import render, render_rays, render_reference
+from efficientnerf.asset.rendering import render, render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.harmonics import basis_numpy
 from tests import reference
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import TREES, random_tree, rays_at, tensors, uniform_tree
 from tests.efficientnerf.walls import camera_at, wall
 

@@ -1,7 +1,5 @@
 """The paper's networks: hand-written passes against autograd, in both types; NeRF's own network; sizes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -4,8 +4,6 @@ Triton's kernels run on the device where there is one, else on the CPU through i
 program's lanes, of a chunk of samples, between dense and hashed levels, in and out of the box.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

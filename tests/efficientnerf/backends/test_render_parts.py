@@ -1,7 +1,5 @@
 """Parts of the kernel that renders packed trees against their definitions: harmonics, rows, colours of a view."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

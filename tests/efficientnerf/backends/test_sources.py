@@ -1,7 +1,5 @@
 """The key of a module changes with each source that it depends on, and with no other."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from pathlib import Path

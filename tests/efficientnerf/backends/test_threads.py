@@ -1,7 +1,5 @@
 """The kernels give the same bytes on one thread and on two, whichever way these are kept busy."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Loss of rays through a tree and its gradients by the tree's values, on every backend, against the loops of `tests/reference.py` and their differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec

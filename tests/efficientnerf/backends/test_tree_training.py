@@ -1,8 +1,6 @@
 """Training of a tree in packets of rays: gradients against autograd whatever the packets, steps and total variation against their formulas, the same bytes on
 any number of threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Vectors inside numba kernels against numpy: operators, functions, sums over the lanes, loads and stores, half floats, corners."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Cameras that stand round the origin."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera

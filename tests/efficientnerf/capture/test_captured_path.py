@@ -1,7 +1,5 @@
 """The path along the captured cameras: smooth, in order, at constant speed, through cameras."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

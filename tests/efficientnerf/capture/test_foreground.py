@@ -1,7 +1,5 @@
 """The foreground region, of rays that are cast into scenes made of balls, boxes and planes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

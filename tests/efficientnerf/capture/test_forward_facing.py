@@ -1,7 +1,5 @@
 """Forward-facing captures: which are, the reference camera and box of those that are, the spiral before them; and LLFF captures from all around."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which frames of a video are chosen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """How sharp a frame is, and how far the picture has moved."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Edges of square markers by known cameras: exact without noise, within the stated error with it, and no place for what moves."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

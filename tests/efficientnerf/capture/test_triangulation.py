@@ -1,7 +1,5 @@
 """Places by pixels of photographs with known cameras: exact without noise, lengths within the stated error with it, whatever the frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """PSNR and SSIM against closed forms, scikit-image and the slow reference."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio

@@ -1,13 +1,11 @@
 """Where density lies against surfaces: closed forms in uniform trees, the reference render, cascades and normalised device coordinates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.rendering import render_reference
 from efficientnerf.evaluation.surfaces import MARGIN_VOXELS, opacity_nearer, surface_limits
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 from tests.efficientnerf.walls import DEPTH, NEAR, looking_along_y, wall
 

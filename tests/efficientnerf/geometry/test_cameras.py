@@ -1,7 +1,5 @@
 """Laws of cameras: projecting and tracing are inverse for every lens, similarities compose, axes convert and back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Normalised device coordinates: the appendix's closed form, inverses, straight rays, distances and normals; numpy and torch alike."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """World to grid: inverses, the contraction's closed form, and what it leaves alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Rendering ends, whatever the file and the camera say; Python answers to signals meanwhile; and memory keeps to the file's size."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -15,10 +13,11 @@ import pytest
 import torch
 
 from efficientnerf.asset.format import FormatError, describe, load
-from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays, render_reference
+from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.hostile import HOSTILE, filled
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import looking, random_tree, uniform_tree
 
 FAR = [1e9, 1e15, 1e18, 1e25, 1e200]

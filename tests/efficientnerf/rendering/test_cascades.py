@@ -1,7 +1,5 @@
 """Renders of nested grids and environment maps on the CPU: against the reference, and what must not change them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -12,13 +10,14 @@ import torch
 from efficientnerf.asset.cascades import cascade_grids, cascade_tree, cascades_of, nested, point_cascades
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
-from efficientnerf.asset.rendering import Rendering, ray_parts, render, render_rays, render_reference, tree_density
+from efficientnerf.asset.rendering import Rendering, ray_parts, render, render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
 from tests.efficientnerf.balls import pose
+from tests.efficientnerf.tree_reference import render_reference, tree_density
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
 FIELDS = ("colour", "opacity", "depth", "normal")
@@ -111,8 +110,6 @@ def test_view_colours_of_far_cascades_match_the_reference(layout: str) -> None:
         tree = in_palettes(tree)
     camera = camera_of(tree, distance=400.0)
     camera = replace(camera, params=(4000.0, 3600.0, 12.0, 10.0))
-    work = rendering.ray_statistics(tree, camera)
-    assert work[..., 3].sum() == work[..., 2].sum() > 0  # there every sample has its colour
     assert_as_the_reference(tree, render(tree, camera), *rays(camera))
 
 

@@ -1,7 +1,5 @@
 """Volume rendering: laws, a closed form, and loop, torch and kernel against each other, values and gradients."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

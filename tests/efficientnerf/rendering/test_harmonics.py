@@ -1,7 +1,5 @@
 """Spherical harmonics: orthonormal, of the documented order and signs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,18 +1,17 @@
 """Pictures of trees and fields: loop, torch and kernel against each other, closed forms, and what skipping may not change."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.rendering import render, render_rays, render_reference
+from efficientnerf.asset.rendering import render, render_rays
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from tests import reference
 from tests.efficientnerf.balls import pose, untrained
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tensors, uniform_tree
 
 

@@ -1,7 +1,5 @@
 """NeRF's samplings: even and by importance, their laws, a loop, and gradients of every sampler's differentiable part."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

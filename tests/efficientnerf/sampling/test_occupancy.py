@@ -1,7 +1,5 @@
 """Momentum density voxels: equation 7 against the loop, the other rule, the threshold, and how pruned space returns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

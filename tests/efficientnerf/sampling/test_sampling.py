@@ -1,7 +1,5 @@
 """Valid and pivotal samples: loop, torch and kernel agree; pivotal slots tile their intervals; nothing is evaluated twice."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

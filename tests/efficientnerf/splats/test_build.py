@@ -1,7 +1,5 @@
 """From trees to Gaussians: what is merged, and that fitting brings it nearer to the pictures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,14 +1,13 @@
 """What a set of Gaussians may hold, and its frames."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from efficientnerf.splats.gaussians import Gaussians, covariances, quaternions_from, rotation_matrices
+from efficientnerf.splats.gaussians import Gaussians, quaternions_from, rotation_matrices
+from tests.efficientnerf.splats_reference import covariances
 
 
 def some(count: int = 50, degree: int = 1, seed: int = 0) -> Gaussians:

@@ -1,7 +1,5 @@
 """The rasteriser's kernels against plain torch: values and gradients."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +15,9 @@ from efficientnerf.backends.numba.vector.memory import pointer
 from efficientnerf.geometry import cameras
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.gaussians import Gaussians
-from efficientnerf.splats.reference import render_reference
 from efficientnerf.splats.rendering import gaussians_from, lens_of, render, values_of
 from tests.efficientnerf.balls import pose
+from tests.efficientnerf.splats_reference import render_reference
 
 WIDTH, HEIGHT = 37, 27  # neither a multiple of a tile or block
 
@@ -128,7 +126,7 @@ def test_a_small_gaussian_lands_where_the_lens_sends_its_points(model: str, extr
     records = np.zeros((16, RECORD), np.float32)
     project(values_of(gaussians), lens_of(lens), 3, records)
     np.testing.assert_allclose(records[:3, :2], pixels, atol=2e-3)
-    from efficientnerf.splats.gaussians import covariances
+    from tests.efficientnerf.splats_reference import covariances
 
     for n in range(3):
         points = rng.multivariate_normal(np.zeros(3), covariances(gaussians)[n], 4000) * 1e-3 + means[n]

@@ -1,7 +1,5 @@
 """A surface against views of an asset: balls whose silhouettes are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

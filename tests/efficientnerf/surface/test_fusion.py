@@ -1,7 +1,5 @@
 """Depths of many views fused: against planes, balls and slabs in closed form; what views see through, what none reaches, and what is thin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The level at which a surface has its asset's silhouettes: soft and hard balls, in the world."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

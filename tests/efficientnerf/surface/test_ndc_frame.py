@@ -1,7 +1,5 @@
 """Surfaces of forward-facing trees: a slanted wall and its points land where they are in the world, coloured as they were seen; the backdrop stays out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

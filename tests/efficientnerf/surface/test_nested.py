@@ -1,7 +1,5 @@
 """The surface of nested grids: a ball that reaches through several of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Images of meshes against closed forms: silhouettes, depths, and which of two faces is in front."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

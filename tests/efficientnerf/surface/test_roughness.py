@@ -1,7 +1,5 @@
 """Roughness in plain regions of photographs: rags are rough, walls, corners with an edge and smooth curves are not, and textured places say nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

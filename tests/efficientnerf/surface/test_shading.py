@@ -1,7 +1,5 @@
 """Images of textured meshes against closed forms and slow loops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Surfaces of analytic densities: areas and volumes in closed form, seams, closed boundaries, what is left out, even sampling."""
 
-from __future__ import annotations
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -24,7 +24,9 @@ NOBODY = np.zeros((0, 3))
 
 
 class Balls:
-    """A tree whose density passes LEVEL on spheres: LEVEL * 2^(-distance / softness), capped. Colour: position / 2 + 1/2."""
+    """A volume whose density passes LEVEL on spheres: LEVEL * 2^(-distance / softness), capped. Colour: position / 2 + 1/2. No part of it is without."""
+
+    region = None
 
     def __init__(self, *balls: tuple[tuple[float, float, float], float], cells: int = 16, softness: float = 0.03, hollow: float = 0.0) -> None:
         self.shape, self.brick, self.voxel, self.bounds_min = (cells, cells, cells), 4, 2 / (4 * cells), np.full(3, -1.0)
@@ -40,6 +42,15 @@ class Balls:
         index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high)), indexing="ij"), -1)
         inside = ((index >= 0) & (index < np.array(self.shape) * self.brick)).all(-1)
         return np.where(inside, self.density(self.bounds_min + (index + 0.5) * self.voxel), 0).astype(np.float32)
+
+    def dense_voxels(self, threshold: float) -> Iterator[np.ndarray]:
+        yield np.argwhere(self.density_block(np.zeros(3, int), np.array(self.shape) * self.brick) >= threshold)
+
+    def filled_parts(self, axis: int, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        yield low, high
+
+    def filled_blocks(self, counts: list[int], block: int) -> np.ndarray:
+        return np.argwhere(np.ones(counts, bool))
 
     def colour(self, at: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
         return (at / 2 + 0.5).astype(np.float32)

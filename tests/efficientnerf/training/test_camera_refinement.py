@@ -1,7 +1,5 @@
 """Corrections of cameras: their group, their derivatives, and cameras that are found again, by themselves and beside a field."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

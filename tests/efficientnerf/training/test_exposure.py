@@ -1,7 +1,5 @@
 """Exposure: against loops over plain numbers, its inverse, gradients, and photographs exposed differently from which the same scene is learned."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

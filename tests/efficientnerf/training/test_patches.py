@@ -1,7 +1,5 @@
 """Patches of pixels: every usable pixel as probable as any other, whatever the sizes of views."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Pixels that masks allow: as probable as each other, however few they are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Training that does not wait for the device: on the CPU, through Triton's interpreter where it is there, else the bookkeeping alone."""
 
-from __future__ import annotations
-
 import traceback
 import warnings
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Training on an analytic ball: it learns, does not collapse, repeats, and goes on where it was."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Cameras that are wrong are found by the field, photographs that merely look different are not."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

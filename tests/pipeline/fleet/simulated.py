@@ -1,7 +1,5 @@
 """Workers without processes: tasks end when the test's clock says so, and workers come and go."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

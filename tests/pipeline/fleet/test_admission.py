@@ -1,7 +1,5 @@
 """Admission by memory: what is admitted together fits, everything has its turn, and what fits nowhere runs alone. On simulated workers."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The scheduler on simulated workers: every scene comes to its end, and nothing takes more than there is."""
 
-from __future__ import annotations
-
 import itertools
 import random
 import signal

@@ -1,7 +1,5 @@
 """The bake stage: the same bytes whatever happened on the way, and an asset that needs no run."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Baking in normalised device coordinates: voxels deeper than wide, and a budget that follows the pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

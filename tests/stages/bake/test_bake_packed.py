@@ -1,7 +1,5 @@
 """The codes of a packed asset: as good as its size has room for."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Baking whole scenes: all that the photographs show, within the asset's size, to the same bytes whatever happens on the way."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """In forward-facing scenes what few photographs show is baked and kept where it is faint, and what many show where it is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

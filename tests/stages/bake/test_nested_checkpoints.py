@@ -1,7 +1,5 @@
 """Checkpoints of a refinement whose tree has cascades."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A refinement ends in the same bytes wherever it was killed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator

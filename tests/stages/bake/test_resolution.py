@@ -1,7 +1,5 @@
 """The choice of a resolution: by what pixels tell apart, by what there is room for, and where it is finest."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Arrays in the scratch folder of a bake."""
 
-from __future__ import annotations
-
 import ast
 import errno
 import os

@@ -1,7 +1,5 @@
 """A bake with a budget of seconds: phases that take their shares of it, and steps that give the same asset again. The clock is a made one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

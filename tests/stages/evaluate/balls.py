@@ -1,7 +1,5 @@
 """Evaluations of a ball with a closed form: its photographs, jobs and figures."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

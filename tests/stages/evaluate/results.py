@@ -1,7 +1,5 @@
 """Figures of results that were never made: metrics.json with one thing or another wrong."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from typing import Any

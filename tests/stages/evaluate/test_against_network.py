@@ -1,7 +1,5 @@
 """The asset against its network on a ball with a closed form: gap, holes, floaters, fitted colours."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

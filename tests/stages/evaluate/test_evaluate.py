@@ -1,7 +1,5 @@
 """The evaluate stage on a ball with a closed form: the right views, the right figures, over the right background, the same after a stop."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from dataclasses import replace

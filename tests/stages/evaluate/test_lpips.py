@@ -1,7 +1,5 @@
 """LPIPS against its formula with made-up weights, from files; and what is said where they are missing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The mesh's figures: a mesh as good as its asset is as good as that, a worse one is not, and what lies round it is the asset's own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Strips at full size and the video of the captured path: what they show, what they cost, the same after a stop."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

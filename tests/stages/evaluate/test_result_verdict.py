@@ -1,7 +1,5 @@
 """The verdict on a result: the grade that people who look at the pictures give, worse figures never a better one, and each problem with what to do."""
 
-from __future__ import annotations
-
 import random
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Trivial pictures of a photograph: what they score, and what a PSNR amounts to."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Assets that hold a whole scene: rendered by themselves, and over what the network shows around cascade 0."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +11,7 @@ import torch
 
 from efficientnerf.asset.camera_paths import pose_on_sphere
 from efficientnerf.asset.cascades import cascade_tree, cascades_of, subset, voxel_cascades
-from efficientnerf.asset.rendering import Rendering, render_reference
+from efficientnerf.asset.rendering import Rendering
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.evaluation.surfaces import opacity_nearer
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
@@ -25,6 +23,7 @@ from stages.evaluate.run import evaluate
 from stages.figures.plots import to_uint8
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, save
+from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import random_cascades
 from tests.stages.evaluate.balls import BALL_MESH, TREE, figures_of, job_in, settings
 

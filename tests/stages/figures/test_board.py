@@ -1,7 +1,5 @@
 """The sheet of markers has its true size on paper, and its markers are found in it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

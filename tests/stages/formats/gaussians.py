@@ -1,7 +1,5 @@
 """Gaussians for tests of splat files, and small readers of these, written from the formats' descriptions."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """Exports of other programs: a known point lies at the known pixel in every image, and each folder is taken by one importer."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Depth that phone apps export: which of it becomes points, and what they are used for."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One contract for all exporters of meshes and points: written by us, read by others, and the same."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace

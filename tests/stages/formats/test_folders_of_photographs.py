@@ -1,7 +1,5 @@
 """Which files of a folder are photographs: nothing is left aside without a word, and nothing is read that is none."""
 
-from __future__ import annotations
-
 import unicodedata
 from pathlib import Path
 from typing import Any

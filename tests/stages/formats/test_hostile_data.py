@@ -1,7 +1,5 @@
 """Lists of cameras from anybody: numbers of 400 digits, values of other types, deep nesting and lying headers are refused with one short line."""
 
-from __future__ import annotations
-
 import json
 import struct
 import tracemalloc

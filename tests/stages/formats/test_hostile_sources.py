@@ -1,7 +1,5 @@
 """Sources from anybody: nothing outside of them is read, their names do no harm, and runs inside of them are no part of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

@@ -1,7 +1,5 @@
 """PNG, EXR and MP4: written, read again with the format's own library, compared."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 

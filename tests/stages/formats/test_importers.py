@@ -1,7 +1,5 @@
 """Every importer: the same cameras written in each format give the same rays; real data sets read right."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bad data sets get an error of one or two lines that names what is wrong and where; what can be got round is warned about."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

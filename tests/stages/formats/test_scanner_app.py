@@ -1,7 +1,5 @@
 """3D Scanner App's "All Data": what is particular to it; `test_exported_cameras` has what every importer does."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is said of files of 3D Gaussians, ours and those of others; and that damaged ones are named, whatever their headers say."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

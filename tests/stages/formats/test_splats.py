@@ -1,7 +1,5 @@
 """Files of 3D Gaussians: written by us, read by the letter of their formats, and by others where there are any."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json
@@ -21,7 +19,7 @@ from PIL import Image
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.rendering.harmonics import basis_numpy
-from efficientnerf.splats.gaussians import Gaussians, covariances
+from efficientnerf.splats.gaussians import Gaussians
 from pipeline.errors import BadInput, CorruptArtifact
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.glb import gltf_from_capture
@@ -30,6 +28,7 @@ from stages.formats.exporters.splats.description import describe_splats
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import property_names, read_splats
 from stages.formats.exporters.writing import SourceFrame
+from tests.efficientnerf.splats_reference import covariances
 from tests.stages.formats.gaussians import joined_streams, read_glb_splats, read_sog, read_spz, scattered
 from tests.stages.io.meshes import Y_DOWN, Z_UP, accessor, glb_document
 

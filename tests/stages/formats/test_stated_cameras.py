@@ -1,7 +1,5 @@
 """Cameras that a data set states: which of its files are believed, for which pixels, and through which lens."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

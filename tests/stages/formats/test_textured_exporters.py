@@ -1,7 +1,5 @@
 """Meshes with a texture in every format: read back by small parsers of the tests' own (and USD's library), the same surface in the same colours."""
 
-from __future__ import annotations
-
 import io
 import os
 import struct

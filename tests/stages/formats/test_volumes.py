@@ -1,7 +1,5 @@
 """OpenVDB: written by us, read by OpenVDB's own library where there is one, and the same."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """Turntables see the whole box upright; nerfstudio's paths mean what they meant there; what is wrong with a path is said."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Up, focus, box, near and far: on rigs whose answers are known, and on real captures where they are there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

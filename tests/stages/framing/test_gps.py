@@ -1,7 +1,5 @@
 """GPS positions give cameras their scale and upward axis where they are exact enough for the extent of the capture, and nothing where they are not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

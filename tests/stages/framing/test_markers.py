@@ -1,7 +1,5 @@
 """Markers in made photographs give metres and up, or are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

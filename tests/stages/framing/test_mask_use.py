@@ -1,7 +1,5 @@
 """Masks and alpha channels: silhouettes of an object, or pixels to be ignored; decided, said, and what becomes of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

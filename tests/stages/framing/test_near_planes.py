@@ -1,7 +1,5 @@
 """Near planes, and what is masked before them, keep clear of the subject whatever the photographs happen to observe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Up by all that says it: accelerometers of phones, markers, the floor; in agreement, or named where they contradict each other."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where few photographs look no matter is learned: what counts as few, that it is told camera by camera, and that training keeps to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

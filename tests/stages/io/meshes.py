@@ -1,7 +1,5 @@
 """A block, frames and readers for tests of mesh files."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import struct

@@ -1,7 +1,5 @@
 """ICC profiles, byte by byte (version 2), and the arithmetic of the simple ones."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 

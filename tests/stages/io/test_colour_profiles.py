@@ -1,7 +1,5 @@
 """Pictures that are not sRGB: one conversion, for cameras, training and textures alike; profiles that are none harm nothing."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The trained field on disk: the same after a round trip, and every kind of damage is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Colours at the edges of silhouettes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What `inspect` says of mesh files: as another library reads them, in memory that the file's size bounds, whatever a file says of itself."""
 
-from __future__ import annotations
-
 import copy
 import json
 import struct

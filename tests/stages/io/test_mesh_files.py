@@ -1,7 +1,5 @@
 """The mesh of a run, read again from its files: what was written, or a word about what is wrong."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

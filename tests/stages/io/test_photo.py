@@ -1,7 +1,5 @@
 """Photographs read upright, with their masks and focal lengths."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pictures from anybody: every type of pixel has one meaning or is refused by name, and no file ends more than itself."""
 
-from __future__ import annotations
-
 import ast
 import errno
 import io

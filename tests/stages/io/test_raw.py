@@ -1,7 +1,5 @@
 """Pictures of newer formats: AVIF, and what a camera's sensor took."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

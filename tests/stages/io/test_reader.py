@@ -1,7 +1,5 @@
 """Photographs and masks of a stage: each decoded once for a size, and again where the file or what was kept of it has changed."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import fields
 from pathlib import Path

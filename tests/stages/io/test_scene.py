@@ -1,7 +1,5 @@
 """scene.json: written and read back the same, refused in words where it has been damaged; cameras handed on to nerfstudio."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

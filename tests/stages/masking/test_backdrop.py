@@ -1,7 +1,5 @@
 """A white backdrop is left out where nothing contradicts it, and what does: points in it, silhouettes that do not agree, texture."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Silhouettes of the foreground: what of a trained scene is its subject, how masks of it are made, and when they are refused."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Masks that users bring: what they are called, which level of them is kept, and what is done where nothing is known of the cameras yet."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

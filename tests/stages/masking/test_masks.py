@@ -1,7 +1,5 @@
 """Masks that are made: of screens of one colour, and of backgrounds that stand still."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Masks by a network that the user has: tiny ones, made here, in the shapes that rembg's have."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

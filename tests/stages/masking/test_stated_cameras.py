@@ -1,7 +1,5 @@
 """Photographs of a source that states cameras: those that are found come into its frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

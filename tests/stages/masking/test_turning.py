@@ -1,7 +1,5 @@
 """A subject that turns before a camera on a stand: told from a camera that moves, masked, and its cameras found by it alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

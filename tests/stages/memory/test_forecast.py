@@ -1,7 +1,5 @@
 """What stages take and write, predicted: fleets admit them by it. Of memory it is what the stage itself says once it begins."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

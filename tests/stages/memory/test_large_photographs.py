@@ -1,7 +1,5 @@
 """Sixty photographs of 12 megapixels under a limit of the system: their pixels alone are 2 GiB, and the process gets 1.6."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Every stage says before its work what it takes: it is refused where that does not fit, and made smaller where that changes no byte."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Any

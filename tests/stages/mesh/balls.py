@@ -1,7 +1,5 @@
 """A baked ball, and one whose foreground is its upper half, as asset files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The stage `mesh` on a real asset file that holds a ball."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The stage `points` on a real asset file that holds a ball."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The poses stage: any source becomes a scene that stands on its own."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

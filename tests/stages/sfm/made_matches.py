@@ -1,7 +1,5 @@
 """Features and verified matches of made cameras, for what is tested without detecting and comparing any."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

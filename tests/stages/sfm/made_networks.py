@@ -1,7 +1,5 @@
 """Small networks that behave as a detector and a matcher do, in the layouts of public exports: corners by fixed convolutions, patches, nearest neighbours."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

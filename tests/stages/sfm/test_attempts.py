@@ -1,7 +1,5 @@
 """Attempts of structure from motion: what is tried when, what is kept, and that a weak photograph gets its camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Features that were detected before are not detected again, and nothing but those is taken for them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

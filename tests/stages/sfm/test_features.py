@@ -1,7 +1,5 @@
 """Masked parts give no features."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The last adjustment of all cameras and points."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

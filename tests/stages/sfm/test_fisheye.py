@@ -1,7 +1,5 @@
 """Cameras of photographs that a fisheye lens took: half of all directions in one picture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sub-models put together where the points that they share fit, and left alone where they do not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What moves between photographs is told by its matches, which one motion explains and the cameras do not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Features and matches by networks that the user has: tiny ones, made here, in the layouts of public exports; and cameras that SIFT alone does not find."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

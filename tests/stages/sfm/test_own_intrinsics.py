@@ -1,7 +1,5 @@
 """Intrinsics of each photograph's own: found where they differ, and left alone where they do not."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

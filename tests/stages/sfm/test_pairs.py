@@ -1,7 +1,5 @@
 """Which pairs of photographs are compared."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

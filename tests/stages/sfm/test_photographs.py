@@ -1,7 +1,5 @@
 """Cameras from photographs: reading them upright, features and matches that survive a kill, and the cameras that come out."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import shutil

@@ -1,7 +1,5 @@
 """Structure from motion in a process of its own: what passes between the two, and how either of them may end."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

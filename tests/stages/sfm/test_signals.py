@@ -1,7 +1,5 @@
 """COLMAP's library answers no signal in our place."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Photographs that were zoomed or cropped, each by itself, and whose EXIF data do not say so: each gets a camera of its own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

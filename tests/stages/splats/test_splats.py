@@ -1,7 +1,5 @@
 """The stage `splats` on a real asset file that holds a ball, before its photographs and without them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 from pathlib import Path

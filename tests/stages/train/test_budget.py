@@ -1,7 +1,5 @@
 """A budget of seconds becomes a number of steps that gives the same bytes again; the clock is a made one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path

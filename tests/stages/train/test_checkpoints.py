@@ -1,7 +1,5 @@
 """A checkpoint is restored whole or not at all, and what can't be used costs a warning and some steps."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

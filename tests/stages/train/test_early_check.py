@@ -1,7 +1,5 @@
 """Whether anything is learned, and what follows where nothing is: a training that fails by construction is reported, rescued, and repeatable to the byte."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

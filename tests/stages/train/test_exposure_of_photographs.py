@@ -1,7 +1,5 @@
 """Which photographs of a capture are exposed otherwise: told by the points that they show, not by how bright what they show is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The size of the hash grid follows the photographs unless the settings state it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training pixels in a file: what an array gives, and what becomes of the file."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Previews: which of the scratch folder are published."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The train stage: the same bytes whatever happened on the way."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

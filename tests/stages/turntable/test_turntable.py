@@ -1,7 +1,5 @@
 """The turntable stage: its files, and that a stop in the middle changes none of their bytes."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whether photographs were taken from almost one place: what lies behind a subject says nothing of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is said of photographs before a run of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

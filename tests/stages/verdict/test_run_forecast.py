@@ -1,7 +1,5 @@
 """What a whole run will take, before it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The verdict on cameras: how photographs look, what stands against a capture, and its pictures."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Videos become photographs: which frames, under which names, again after a kill."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

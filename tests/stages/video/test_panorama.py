@@ -1,7 +1,5 @@
 """Panoramas and the views that are cut from them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

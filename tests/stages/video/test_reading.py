@@ -1,7 +1,5 @@
 """Reading videos: orientation, times, colours, and what is no video."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Chromium for the tests of pages: one process for all of them, or the reason why there is none."""
 
-from __future__ import annotations
-
 import base64
 import shutil
 from collections.abc import Iterator

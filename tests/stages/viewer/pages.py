@@ -1,7 +1,5 @@
 """What a page of the viewer carries, taken out of its text; and what holds of every one."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Scenes for the tests of the viewer's page, and what they are looked at from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Every control of the page in a real browser: keys, one finger, cameras to click at, rotation by itself; and the page in all its shapes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """docs/still_life_viewer.html, which the README links: whole, small, of the example, and drawn as `enerf render` draws its asset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

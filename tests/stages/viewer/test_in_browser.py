@@ -1,7 +1,5 @@
 """The page in a real browser, software rendering: pictures against the CPU renderer, hands on the page, files that it has to refuse."""
 
-from __future__ import annotations
-
 import base64
 import re
 from pathlib import Path

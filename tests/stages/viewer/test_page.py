@@ -1,7 +1,5 @@
 """The viewer as a file: one page, without requests, which names cannot break out of."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

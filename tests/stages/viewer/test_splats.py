@@ -1,7 +1,5 @@
 """The page of Gaussians: as the CPU renders what the file holds, in another frame, and refused where it is damaged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -7,8 +7,6 @@ runs in a fork of this process, which saves the imports, and ends as any Python 
 {"code", "out", "err"}.
 """
 
-from __future__ import annotations
-
 import gc
 import importlib
 import json

@@ -1,7 +1,5 @@
 """verify, diff and convert with bare asset files."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

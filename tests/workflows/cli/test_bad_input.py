@@ -1,7 +1,5 @@
 """Bad input at the command line: a clear error or a warning, the right exit code, no traceback, and what a run held before stays."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """`enerf check`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

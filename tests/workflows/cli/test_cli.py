@@ -1,7 +1,5 @@
 """The command line over toy stages: what it prints, records, exits with."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

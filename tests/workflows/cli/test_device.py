@@ -1,7 +1,5 @@
 """Which device is taken, and that asking does not import torch."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """A file that ends too early is not a terminal that was closed: exit code 130 is that of an interrupt alone."""
 
-from __future__ import annotations
-
 import pytest
 
 from workflows.cli import files, main

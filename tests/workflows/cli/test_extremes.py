@@ -1,7 +1,5 @@
 """The lowest and the highest value of every setting: a stage can work with it, or it is refused before the first stage."""
 
-from __future__ import annotations
-
 import typing
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal

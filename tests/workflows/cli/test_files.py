@@ -1,7 +1,5 @@
 """export, render and inspect with a bare asset file: a ball."""
 
-from __future__ import annotations
-
 import json
 import typing
 from collections.abc import Callable

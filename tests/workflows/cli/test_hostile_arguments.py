@@ -1,7 +1,5 @@
 """Every command with every kind of hostile argument: a documented exit code, one or two lines, no traceback, and no hang."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """What libraries say does not reach the terminal; what we say does."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

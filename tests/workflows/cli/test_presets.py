@@ -1,7 +1,5 @@
 """The presets that are shipped, against the real stages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

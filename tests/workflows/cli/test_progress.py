@@ -1,7 +1,5 @@
 """Displays: what is shown of the engine's events, and how often."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -81,7 +79,8 @@ ESCAPED = "a\\x1b]0;title\\x07\\n\\u202eb\\udcff\\x9b"
 
 def test_each_of_several_stages_has_a_bar_and_lines_of_its_own() -> None:
     stream = io.StringIO()
-    with Bars() as bars, Lines(stream) as lines:
+    lines = Lines(stream)
+    with Bars() as bars:
         for stage in ("mesh", "splats"):
             for each in (event("stage_started", stage=stage), event("progress", stage=stage, done=1, total=4, text=stage)):
                 bars(each)

@@ -1,7 +1,5 @@
 """Settings from presets, files and options: typed, checked, the last word wins."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`enerf run` with several folders and videos."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands on a run that a stranger packed: nothing outside changes or is read, nothing hangs, and every exit code is a documented one."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

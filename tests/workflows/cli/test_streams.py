@@ -1,7 +1,5 @@
 """Output that cannot be written: the result of the command decides its exit code, and nothing ends in a traceback or in Python's own code 120."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Two commands on one run: what is recorded is what was run with."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

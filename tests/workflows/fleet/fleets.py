@@ -1,7 +1,5 @@
 """Fleets that never ran, for tests of what shows them."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

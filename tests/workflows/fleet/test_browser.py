@@ -1,7 +1,5 @@
 """The page of a fleet in a browser: sorted, filtered, walked through by keys; pictures as they come into sight, the turntable of one scene at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

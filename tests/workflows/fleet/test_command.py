@@ -1,7 +1,5 @@
 """`enerf fleet` on toy scenes: whatever becomes of one scene, the others are done."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Fleets on Dask's own local cluster: in this process, and with worker processes of which one is killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Templates in examples/fleet and manifests in docs/fleet.md: as far as can be checked without the machines that they are for."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """Pages of fleets: what stands on them, that names stay text, that nothing is asked for from elsewhere, and that they are whole whenever they are read."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import random

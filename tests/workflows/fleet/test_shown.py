@@ -1,7 +1,5 @@
 """What `enerf fleet` writes beside the runs, on toy scenes."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """A fleet by ssh: a server of asyncssh's in this process, on 127.0.0.1 with keys of its own, starts Dask's scheduler and a worker."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

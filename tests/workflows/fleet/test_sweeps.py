@@ -1,7 +1,5 @@
 """Sweeps: the product of values, names of folders, and which scene makes what others share."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

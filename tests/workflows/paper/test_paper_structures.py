@@ -1,7 +1,5 @@
 """Table 7 at a small scale: all rows, and what holds on any machine."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables that train: what a scale makes of the settings, what a log says of the pace, what the tables make of figures, and one table from end to end."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Dense voxels, hash map, octree and NerfTree: all give what a dict gives."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

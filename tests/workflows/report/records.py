@@ -1,7 +1,5 @@
 """Manifests for the tests of pages: of what the artifacts of a run were made."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page about a run: it says what is there, points only to files that are, and is not led astray by what names hold."""
 
-from __future__ import annotations
-
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """A page of a run is opened, kept and linked only where this program wrote it; `verify` knows one that was altered."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

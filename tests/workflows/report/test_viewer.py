@@ -1,7 +1,5 @@
 """RUN/viewer.html: made where there is an asset, made again when that changes, and no hindrance where anything is wrong."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

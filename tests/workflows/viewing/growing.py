@@ -1,7 +1,5 @@
 """A run whose training goes on under our eyes: what it writes step by step."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

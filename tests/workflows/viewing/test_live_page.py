@@ -1,7 +1,5 @@
 """The page of `enerf view RUN --serve` in a real browser: it shows a run as it is made, and follows it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

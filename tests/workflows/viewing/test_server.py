@@ -1,7 +1,5 @@
 """The server of `enerf view --serve`: it answers for what its site lists, to whoever may ask, and for nothing else."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

@@ -1,7 +1,5 @@
 """What is served of a run while it is made, and what of a hostile one."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

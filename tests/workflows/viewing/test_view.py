@@ -1,7 +1,5 @@
 """`enerf view`: the page is made where it is missing, opened, or served until Ctrl-C."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -3,8 +3,6 @@
 Seconds are those that a scene takes by itself: a stage that another scene made for it counts as if it had made it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,21 +30,16 @@ _TABLES = 200  # scenes with a table of their own
 
 @dataclass(frozen=True)
 class Result:
-    """A scene with one combination of values, or the means of all scenes with it. Without figures: not done yet, or not measured.
+    """A scene with one combination of values, or the means of all scenes with it. Without figures: not done yet, or not measured."""
 
-    scene   its name without the values; "" for means
-    values  of the settings that the sweep changed
-    run     whose report is linked
-    """
-
-    scene: str
-    values: tuple[Any, ...]
+    scene: str  # its name without the values; "" for means
+    values: tuple[Any, ...]  # of the settings that the sweep changed
     psnr: float | None = None
     ssim: float | None = None
     seconds: float | None = None
     megabytes: float | None = None
     state: str = ""
-    run: str | None = None
+    run: str | None = None  # whose report is linked
 
 
 def write_comparison(fleet: Path, state: FleetState, reports: Container[str] = (), *, plots: bool = True) -> bool:

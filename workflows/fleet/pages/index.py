@@ -4,8 +4,6 @@ The page is one file with its script, and asks for nothing but the thumbnails in
 turntable of the scene that is pointed at or has the focus. Names and messages are text, whatever they hold.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Container, Mapping

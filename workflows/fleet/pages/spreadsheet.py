@@ -1,7 +1,5 @@
 """FLEET/fleet.csv: a line a scene."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Pages of a running fleet: each written atomically, now and then, and at the end."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time
@@ -24,15 +22,11 @@ THUMBNAIL_SECONDS = 1.0  # of work on thumbnails in one writing, while the fleet
 
 
 class Pages:
-    """Writes index.html, fleet.csv, thumbnails and, of a sweep, comparison.html. Call it with each new state.
-
-    fleet    its folder
-    trouble  why the last writing failed, or None: pages that cannot be written end no fleet
-    """
+    """Writes index.html, fleet.csv, thumbnails and, of a sweep, comparison.html. Call it with each new state."""
 
     def __init__(self, fleet: Path) -> None:
-        self.fleet = fleet
-        self.trouble: str | None = None
+        self.fleet = fleet  # its folder
+        self.trouble: str | None = None  # why the last writing failed, or None: pages that cannot be written end no fleet
         self._next = 0.0
         self._pending: FleetState | None = None
         self._pictures: dict[str, tuple[str, int]] = {}  # scene -> what its thumbnail is of, and when it was made

@@ -6,8 +6,6 @@ Contexts are those of `walks`; what a symbol of a context costs was counted in t
 N stored voxels, P entries of a palette, D numbers of a vector, T entries of a table.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.entropy.walks import NEW, REPEAT_CONTEXTS, base_prediction, density_context, known_codes, near_voxels, newness

@@ -6,8 +6,6 @@ turn (Giesen 2014): while one waits for its table the next ones go on. Nothing b
 M symbols, T tables, n contexts, S slices, L lanes.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,28 +22,19 @@ LOWEST = 1 << 16  # of a state between symbols
 
 
 class Coder(NamedTuple):
-    """One stream, read or written by the same walk.
+    """One stream, read or written by the same walk."""
 
-    reads    whether symbols are read from words; else they are recorded, for `encode`
-    state    (S, L) int64
-    at, end  (S,) int64: the next word of each slice and the end of its words; the next record and the first
-    failed   (S,) int64: not 0 where words ran out, or a symbol stood for nothing
-    words    (W + 1,) uint16, of which the last is none
-    table    (n,) uint8, of each context
-    symbol   (T, SLOTS) uint8: which symbol a slot stands for
-    shares   (T, 256) uint32: of a symbol the number of its slots, and 2^16 times the first of them
-    symbols, contexts  (M,) uint8 and uint16, recorded
-    """
-
-    reads: bool
-    state: np.ndarray
+    reads: bool  # whether symbols are read from words; else they are recorded, for `encode`
+    state: np.ndarray  # (S, L) int64
+    # at, end: (S,) int64: the next word of each slice and the end of its words; the next record and the first
     at: np.ndarray
     end: np.ndarray
-    failed: np.ndarray
-    words: np.ndarray
-    table: np.ndarray
-    symbol: np.ndarray
-    shares: np.ndarray
+    failed: np.ndarray  # (S,) int64: not 0 where words ran out, or a symbol stood for nothing
+    words: np.ndarray  # (W + 1,) uint16, of which the last is none
+    table: np.ndarray  # (n,) uint8, of each context
+    symbol: np.ndarray  # (T, SLOTS) uint8: which symbol a slot stands for
+    shares: np.ndarray  # (T, 256) uint32: of a symbol the number of its slots, and 2^16 times the first of them
+    # symbols, contexts: (M,) uint8 and uint16, recorded
     symbols: np.ndarray
     contexts: np.ndarray
 

@@ -6,8 +6,6 @@ FORMAT.md, section 14. A walk goes on from item `begin` of each slice to its ite
 B bricks, N stored voxels, b voxels along a side of a brick, S slices, G groups of harmonics.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.entropy.rans import coded, coded_bit, coded_few, digits, slice_of

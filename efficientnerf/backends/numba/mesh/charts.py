@@ -1,7 +1,5 @@
 """Charts of a mesh: growing them over neighbouring faces, finding where a flat chart lies over itself, and packing charts into a square (numba)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -3,8 +3,6 @@
 C cameras, H x W pixels, N voxels. A plane that a camera sees has an inverse depth that is linear in pixels: 1 / z = w + a du + b dv around a pixel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -1,7 +1,5 @@
 """Normals of faces, smoothed, and those of a dense mesh where lines through points of a coarser one meet it (numba)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

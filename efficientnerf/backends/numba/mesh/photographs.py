@@ -1,7 +1,5 @@
 """Photographs on a mesh: how far each pixel is from what spoils it, what texels see in it, and one colour of what several photographs show (numba)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

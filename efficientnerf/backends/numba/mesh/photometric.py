@@ -3,8 +3,6 @@
 V vertices, K places for photographs of each, S offsets along the normal. A patch is SIDE x SIDE points of the plane across the normal.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

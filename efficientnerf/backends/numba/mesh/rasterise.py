@@ -1,7 +1,5 @@
 """Triangles into images: which of them a pixel shows, and at what depth (numba)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -1,7 +1,5 @@
 """Colours of what a rasterised mesh shows: from a texture, or from its vertices (numba)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -7,8 +7,6 @@ Gaussian's size. 3DGS carries them along.
 Squares of gradients are averaged over a Gaussian's mean, scales, rotation, opacity, base colour and other harmonics, one number each.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -26,22 +24,19 @@ _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 
 class Rates(NamedTuple):
-    """Of a step.
+    """Of a step."""
 
-    rates            (PARTS,) float32 learning rates: of means, in standard deviations along the longest axis; of logarithms of scales; of quaternions; of
-                     logits; of colours' base and of their other harmonics
-    momentum, decay  of the running means of gradients and of their squares
-    epsilon          added to the root of the latter
-    of_mean, of_square  (V,) float32: 1 / (1 - momentum^n) and 1 / (1 - decay^n) after n steps, the last for all beyond
-    least, greatest  logarithms of the scales
-    """
-
+    # (PARTS,) float32 learning rates: of means, in standard deviations along the longest axis; of logarithms of scales; of quaternions; of logits; of
+    # colours' base and of their other harmonics
     rates: np.ndarray
+    # momentum, decay: of the running means of gradients and of their squares
     momentum: np.float32
     decay: np.float32
-    epsilon: np.float32
+    epsilon: np.float32  # added to the root of the latter
+    # of_mean, of_square: (V,) float32: 1 / (1 - momentum^n) and 1 / (1 - decay^n) after n steps, the last for all beyond
     of_mean: np.ndarray
     of_square: np.ndarray
+    # least, greatest: logarithms of the scales
     least: np.float32
     greatest: np.float32
 

@@ -6,8 +6,6 @@ touch: those that its ellipse meets, by rows of blocks. The pairs of a tile foll
 P pairs, N Gaussians, T tiles.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -21,22 +19,14 @@ DIGITS, DIGIT = 3, 11  # of the depths' bits, that they are sorted by
 
 
 class Pairs(NamedTuple):
-    """The pairs of an image.
+    """The pairs of an image."""
 
-    begin     (T + 1,) int64: the first of each tile, row by row
-    gaussian  (P,) int32
-    mask      (P,) int32
-    slot      (P,) int32: number of the pair among those of all Gaussians, one Gaussian's after the other's
-    first     (N + 1,) int64: the first slot of each Gaussian
-    columns   tiles along a row
-    """
-
-    begin: np.ndarray
-    gaussian: np.ndarray
-    mask: np.ndarray
-    slot: np.ndarray
-    first: np.ndarray
-    columns: int
+    begin: np.ndarray  # (T + 1,) int64: the first of each tile, row by row
+    gaussian: np.ndarray  # (P,) int32
+    mask: np.ndarray  # (P,) int32
+    slot: np.ndarray  # (P,) int32: number of the pair among those of all Gaussians, one Gaussian's after the other's
+    first: np.ndarray  # (N + 1,) int64: the first slot of each Gaussian
+    columns: int  # tiles along a row
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -7,8 +7,6 @@ knows pinholes alone, the derivative here includes the lens: distorted pictures 
 Values lie in groups of sixteen Gaussians: (G, rows, 16) float32, rows as named below, 3 K of them harmonics, coefficient by coefficient.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -30,22 +28,15 @@ _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 
 class Lens(NamedTuple):
-    """A camera as kernels take it.
+    """A camera as kernels take it; width and height are those of its picture."""
 
-    turn          (9,) float32, rows of the rotation from the world to the camera
-    centre        (3,) float32
-    numbers       (16,) float32: fx fy cx cy; k1 k2 k3 k4 over k4 k5 k6 (of a fisheye k1..k4 over nothing); p1 p2; squared radius at which the lens folds
-                  back, on the undistorted plane; nearest depth; 0
-    limits        (4,) float32: least and greatest u, least and greatest v on the undistorted plane at which derivatives are taken
-    fisheye       whether the undistorted plane is that of angles
-    width, height of the picture
-    """
-
-    turn: np.ndarray
-    centre: np.ndarray
+    turn: np.ndarray  # (9,) float32, rows of the rotation from the world to the camera
+    centre: np.ndarray  # (3,) float32
+    # (16,) float32: fx fy cx cy; k1 k2 k3 k4 over k4 k5 k6 (of a fisheye k1..k4 over nothing); p1 p2; squared radius at which the lens folds back, on the
+    # undistorted plane; nearest depth; 0
     numbers: np.ndarray
-    limits: np.ndarray
-    fisheye: bool
+    limits: np.ndarray  # (4,) float32: least and greatest u, least and greatest v on the undistorted plane at which derivatives are taken
+    fisheye: bool  # whether the undistorted plane is that of angles
     width: int
     height: int
 

@@ -10,8 +10,6 @@ to the last. The sums of a Gaussian over a tile's pixels are its pair's own: no 
 P pairs, N Gaussians, H x W pixels.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -29,14 +27,11 @@ _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 
 class Picture(NamedTuple):
-    """What an image is compared with: pixels (H, W, 4) uint8, straight alpha, and mask (H, W) uint8, 0 where a pixel does not count.
-
-    over_all  whether it is compared over all backgrounds at once, as a picture with alpha; else over `background` (3,) float32, and alpha is not read
-    """
+    """What an image is compared with: pixels (H, W, 4) uint8, straight alpha, and mask (H, W) uint8, 0 where a pixel does not count."""
 
     pixels: np.ndarray
     mask: np.ndarray
-    over_all: bool
+    over_all: bool  # whether it is compared over all backgrounds at once, as a picture with alpha; else over `background` (3,) float32, and alpha is not read
     background: np.ndarray
 
 

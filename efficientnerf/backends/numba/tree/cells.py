@@ -3,8 +3,6 @@
 N stored voxels, L cascades, C coarse cells of all cascades.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,28 +14,19 @@ from efficientnerf.backends.numba.vector.memory import pointer
 
 
 class Cells(NamedTuple):
-    """Structure of a tree, all cascades alike; see `NerfTree`.
-
-    step         distance between samples, voxels
-    step_length  the same in cascade 0, units of the frame
-    brick_index  (C,) int32, leap (C,) uint8
-    shape        (L, 3) int64 coarse cells
-    first        (L,) int64 where a cascade's cells begin
-    corner       (L, 3) float64, voxels of cascade 0
-    scale        (L,) float64 side of a voxel, voxels of cascade 0
-    """
+    """Structure of a tree, all cascades alike; see `NerfTree`."""
 
     brick: int
     nearest: bool
-    step: float
-    step_length: float
+    step: float  # distance between samples, voxels
+    step_length: float  # the same in cascade 0, units of the frame
     voxel_index: np.ndarray
-    brick_index: np.ndarray
-    leap: np.ndarray
-    shape: np.ndarray
-    first: np.ndarray
-    corner: np.ndarray
-    scale: np.ndarray
+    brick_index: np.ndarray  # (C,) int32
+    leap: np.ndarray  # (C,) uint8
+    shape: np.ndarray  # (L, 3) int64 coarse cells
+    first: np.ndarray  # (L,) int64 where a cascade's cells begin
+    corner: np.ndarray  # (L, 3) float64, voxels of cascade 0
+    scale: np.ndarray  # (L,) float64 side of a voxel, voxels of cascade 0
 
 
 class TreePointers(NamedTuple):

@@ -1,7 +1,5 @@
 """What voxels contribute to rays at most (numba, all cores). R rays, N voxels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.layout import EARLY_STOP

@@ -1,7 +1,5 @@
 """Images from packed trees (numba): rays of a camera, or given rays, in tiles of neighbours."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
@@ -65,7 +63,7 @@ def beginning(threads: int) -> np.ndarray:
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def render_batch(  # type: ignore[no-untyped-def]
     batch, background, packed, brick, view_colours, views, voxel, tile, threads, budget, progress,
-    colour, opacity, depth, normal, statistics,
+    colour, opacity, depth, normal,
 ):  # fmt: skip
     """Renders a RayBatch, or as much of it as each thread's budget allows; returns whether that was all.
 
@@ -82,7 +80,6 @@ def render_batch(  # type: ignore[no-untyped-def]
     opacity        (H, W) float32
     depth          (H, W) float32, world units: along the view axis for a camera, along the ray for given rays
     normal         (H, W, 3) float32, or (0, 0, 3) where none is wanted
-    statistics     (H, W, 4) int32, or (0, 0, 4): coarse cells visited, samples tested, samples interpolated, colours looked up
     """
     # numba removes writes to arrays that come out of a tuple argument: outputs are arguments of their own.
     height, width = opacity.shape
@@ -97,7 +94,7 @@ def render_batch(  # type: ignore[no-untyped-def]
             pointer(floats[worker]), pointer(ints[worker]), pointer(mine), pointer(mine[clear:]), pointer(mine[clear + cascades :]),
             pointer(mine[clear + 2 * cascades :]), pointer(warped[worker]), pointer(looking[worker]),
         )  # fmt: skip
-        outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), pointer(statistics), len(normal) > 0, len(statistics) > 0)
+        outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), len(normal) > 0)
         rays = ray_pointers(batch)
         scene = Scene(
             cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointer(views.direction), views.direction_rate,

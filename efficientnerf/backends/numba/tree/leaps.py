@@ -1,7 +1,5 @@
 """Distances of coarse cells to the nearest occupied one (numba): `NerfTree.leap`, in as many bytes as there are cells, and the same in eight directions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

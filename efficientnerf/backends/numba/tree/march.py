@@ -8,8 +8,6 @@ a sample of thirty-two rays is taken at once. Through a made tree of 80 voxels a
 one of a packet with colours (6.1 and 4.6 us on one core). docs/experiments/renderer.md
 """
 
-from __future__ import annotations
-
 import math
 import types
 from collections.abc import Callable

@@ -1,9 +1,7 @@
-"""Rendering of rays through trees of nearest lookup on the CPU (numba, all cores). The torch reference is `efficientnerf.asset.rendering.render_reference`.
+"""Rendering of rays through trees of nearest lookup on the CPU (numba, all cores). The torch reference is `tests.efficientnerf.tree_reference`.
 
 R rays, K harmonics.
 """
-
-from __future__ import annotations
 
 import numpy as np
 

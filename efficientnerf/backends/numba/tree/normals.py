@@ -1,7 +1,5 @@
 """Normals of packed trees, a packet at a time (numba)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

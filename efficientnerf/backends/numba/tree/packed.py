@@ -6,8 +6,6 @@ lie beside each other: see `efficientnerf.backends.numba.tree.packets.rows`.
 L cascades, C coarse cells of all of them, B bricks, N stored voxels, K harmonics, P entries of a palette; b = brick.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Density, normal and colour of a tree at points (numba, all cores), from the tree's own arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ The rays of a tile lie in a cone. As long as the ball in which the cone widens m
 first may, and a tile that never may is done. That skips samples of density zero and changes no value.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,30 +29,18 @@ PINHOLE, DIRECTION_TABLE, GIVEN_RAYS = 0, 1, 2
 
 
 class RayBatch(NamedTuple):
-    """Rays in H rows and W columns; see the module.
+    """Rays in H rows and W columns; see the module."""
 
-    lens               (4,) fx, fy, cx, cy, pixels: read where neither `camera_directions` nor `origins` are given
-    pitch              distance of neighbouring rays, pixels; the first ray lies half of it from the left and upper border of the image
-    first_row          row of the first ray
-    rotation           (3, 3) world from camera
-    centre             (3,) of the camera, voxel coordinates of cascade 0; in the world for a tree in normalised device coordinates
-    camera_directions  (H, W, 3) float32 unit directions in the camera's frame, or (0, 0, 3)
-    origins            (H, W, 3) voxel coordinates of cascade 0, or (0, 0, 3)
-    directions         (H, W, 3) unit directions, with `origins`
-    sh_directions      (H, W, 3) float32 directions that harmonics are evaluated along, or (0, 0, 3): those of the rays
-    ndc                (19,) for a camera's rays into a tree in normalised device coordinates: `rays.ndc_numbers`, the corner and the voxel of its grid; or (0,)
-    """
-
-    lens: np.ndarray
-    pitch: float
-    first_row: int
-    rotation: np.ndarray
-    centre: np.ndarray
-    camera_directions: np.ndarray
-    origins: np.ndarray
-    directions: np.ndarray
-    sh_directions: np.ndarray
-    ndc: np.ndarray
+    lens: np.ndarray  # (4,) fx, fy, cx, cy, pixels: read where neither `camera_directions` nor `origins` are given
+    pitch: float  # distance of neighbouring rays, pixels; the first ray lies half of it from the left and upper border of the image
+    first_row: int  # row of the first ray
+    rotation: np.ndarray  # (3, 3) world from camera
+    centre: np.ndarray  # (3,) of the camera, voxel coordinates of cascade 0; in the world for a tree in normalised device coordinates
+    camera_directions: np.ndarray  # (H, W, 3) float32 unit directions in the camera's frame, or (0, 0, 3)
+    origins: np.ndarray  # (H, W, 3) voxel coordinates of cascade 0, or (0, 0, 3)
+    directions: np.ndarray  # (H, W, 3) unit directions, with `origins`
+    sh_directions: np.ndarray  # (H, W, 3) float32 directions that harmonics are evaluated along, or (0, 0, 3): those of the rays
+    ndc: np.ndarray  # (19,) for a camera's rays into a tree in normalised device coordinates: `rays.ndc_numbers`, the corner and the voxel of its grid; or (0,)
 
 
 class RayPointers(NamedTuple):

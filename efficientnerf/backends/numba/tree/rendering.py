@@ -1,10 +1,8 @@
 """Rendering of interpolated trees on the CPU (numba, all cores): from trees and cameras to the arrays of the kernels.
 
 Images and rays are rendered from the tree's packed form by `tree.image` and `tree.packets`; nearest-lookup trees by `tree.nearest`. The torch reference is
-`efficientnerf.asset.rendering.render_reference`.
+`tests.efficientnerf.tree_reference`.
 """
-
-from __future__ import annotations
 
 import functools
 import itertools
@@ -40,14 +38,11 @@ def _allocate(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np
 
 
 class ViewColours(NamedTuple):
-    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`.
-
-    view  all that the colours depend on beside the tree; empty for none
-    """
+    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`."""
 
     views: Views
     colours: np.ndarray
-    view: bytes
+    view: bytes  # all that the colours depend on beside the tree; empty for none
 
 
 def _cone(camera: Camera) -> np.ndarray:
@@ -117,18 +112,13 @@ def _near_distance(tree: NerfTree, view_direction: np.ndarray) -> np.ndarray:
     return least
 
 
-def _render(
-    tree: NerfTree, batch: RayBatch, colours: ViewColours, background: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...],
-    statistics: np.ndarray | None = None,
-) -> None:  # fmt: skip
-    statistics = np.zeros((0, 0, 4), np.int32) if statistics is None else statistics
+def _render(tree: NerfTree, batch: RayBatch, colours: ViewColours, background: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...]) -> None:
     threads = numba.get_num_threads()
     progress = beginning(threads)
     # In pieces: signals are answered between calls.
     while not render_batch(
-        batch, background, packed_of(tree), tree.brick, colours.colours, colours.views, float(tree.voxel), tile, threads, WORK, progress,
-        *out, statistics,
-    ):  # fmt: skip
+        batch, background, packed_of(tree), tree.brick, colours.colours, colours.views, float(tree.voxel), tile, threads, WORK, progress, *out
+    ):
         pass
 
 
@@ -255,12 +245,3 @@ def render_image(
             downsample(supersample, *fine, *part)
     _keep_buffer(tree, colours)
     return image
-
-
-def ray_statistics(tree: NerfTree, camera: Camera) -> np.ndarray:
-    """Coarse cells visited, samples tested, samples interpolated and colours looked up of each pixel's ray: (H, W, 4) int32."""
-    statistics = np.zeros((camera.height, camera.width, 4), np.int32)
-    out = _allocate(camera.height, camera.width, normals=False)
-    batch = _camera_batch(tree, camera, 1, 0, camera.height)
-    _render(tree, batch, _view_colours(tree, _view_direction(tree, camera.centre)), np.zeros(3, np.float32), (TILE, TILE), out, statistics)
-    return statistics

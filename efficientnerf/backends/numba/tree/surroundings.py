@@ -3,8 +3,6 @@
 H, W rows and columns of rays.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ not at every sample. Voxels are visited in memory order.
 B bricks, N stored voxels, K harmonics; b = brick.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

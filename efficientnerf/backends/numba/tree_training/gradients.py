@@ -9,11 +9,9 @@ results depend neither on timing nor on the number of threads.
 The harmonics of a packet are the mean of its rays': neighbouring pixels look the same way but for their distance over the focal length. A packet of one ray is
 exact, and so is one of parallel rays.
 
-The torch reference is `efficientnerf.asset.rendering.render_reference` and its autograd. Works in float32, and in float64 for tests.
+The torch reference is `tests.efficientnerf.tree_reference` and its autograd. Works in float32, and in float64 for tests.
 R rays, P packets, N voxels, K harmonics, M records, U chunks.
 """
-
-from __future__ import annotations
 
 from typing import NamedTuple
 
@@ -44,18 +42,12 @@ BIN_BITS = 15  # voxels of a bin, power of two
 
 
 class Records(NamedTuple):
-    """What voxels got from packets.
+    """What voxels got from packets."""
 
-    numbers   (M, 2) int32 of the voxel, and of the packet
-    gradient  (M, 4) of the loss by the arguments of the sigmoids, and by density
-    begin     (U, bins + 1) int64: where the records of a chunk and bin begin, those of chunk u from u * capacity on
-    basis     (P, K) harmonics of the packets
-    """
-
-    numbers: np.ndarray
-    gradient: np.ndarray
-    begin: np.ndarray
-    basis: np.ndarray
+    numbers: np.ndarray  # (M, 2) int32 of the voxel, and of the packet
+    gradient: np.ndarray  # (M, 4) of the loss by the arguments of the sigmoids, and by density
+    begin: np.ndarray  # (U, bins + 1) int64: where the records of a chunk and bin begin, those of chunk u from u * capacity on
+    basis: np.ndarray  # (P, K) harmonics of the packets
 
 
 class Packets(NamedTuple):

@@ -1,7 +1,5 @@
 """Which rays come near occupied coarse cells of a tree of one grid (numba). R rays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -1,7 +1,5 @@
 """Voxels beside voxels (numba), for total variation. B bricks."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +9,10 @@ from efficientnerf.backends.numba.tree.cells import Cells
 
 
 class Neighbours(NamedTuple):
-    """Bricks beside bricks; without rows where there is no total variation.
+    """Bricks beside bricks; without rows where there is no total variation."""
 
-    around  (B, 6) int32 bricks beyond the faces -x, x, -y, y, -z, z of a brick, -1 where none is stored
-    brick   voxels along a side
-    """
-
-    around: np.ndarray
-    brick: int
+    around: np.ndarray  # (B, 6) int32 bricks beyond the faces -x, x, -y, y, -z, z of a brick, -1 where none is stored
+    brick: int  # voxels along a side
 
 
 def neighbours_of(cells: Cells) -> Neighbours:

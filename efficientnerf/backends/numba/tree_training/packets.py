@@ -10,8 +10,6 @@ coarse cell in which samples have the lowest of their eight voxels, with the blo
 Coordinates of rays are in voxels of cascade 0. N stored voxels, B bricks, L cascades, C coarse cells of all cascades, S samples, K harmonics.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,42 +25,25 @@ SLACK = 1e-3  # voxels by which a clear way ends early, so that no rounding make
 
 
 class PacketArrays(NamedTuple):
-    """Memory of a packet, arrays or pointers to them. `most` blocks and entries, `samples` samples; T slots, most times cube; H = 4 most.
-
-    state       (3,) int64 numbers of blocks, of entries and of samples in use
-    cell_table  (H,) int32 open addressing: entries by their cell, -1 free
-    cell_key    (most,) int64 cell of an entry, row
-    blocks      (most, 8) int32 first slots of the eight blocks of an entry
-    sources     (most, 8) int64 where the densities of these begin
-    brick_table (H,) int32: blocks by their brick, -1 free
-    owner       (most,) int32 brick of a block
-    met         (T,) uint8 whether a sample lies at a slot
-    colour      (T, 4) arguments of the sigmoids, and 1; zeros where no voxel is stored
-    gradient    (T, 4) by these and by density
-    stored      (T, 2) int32 slots at which samples lie and a voxel is stored, and these voxels
-    slots       (S, 8) int32 of a sample
-    weights     (S, 8) of interpolation
-    light       (S, 3) float64 alpha, transmittance at which light arrives, length of the step in units of the frame
-    shade       (S, 4) colour, and one over the weights of the voxels that are stored
-    """
+    """Memory of a packet, arrays or pointers to them. `most` blocks and entries, `samples` samples; T slots, most times cube; H = 4 most."""
 
     most: int
     samples: int
-    state: Any
-    cell_table: Any
-    cell_key: Any
-    blocks: Any
-    sources: Any
-    brick_table: Any
-    owner: Any
-    met: Any
-    colour: Any
-    gradient: Any
-    stored: Any
-    slots: Any
-    weights: Any
-    light: Any
-    shade: Any
+    state: Any  # (3,) int64 numbers of blocks, of entries and of samples in use
+    cell_table: Any  # (H,) int32 open addressing: entries by their cell, -1 free
+    cell_key: Any  # (most,) int64 cell of an entry, row
+    blocks: Any  # (most, 8) int32 first slots of the eight blocks of an entry
+    sources: Any  # (most, 8) int64 where the densities of these begin
+    brick_table: Any  # (H,) int32: blocks by their brick, -1 free
+    owner: Any  # (most,) int32 brick of a block
+    met: Any  # (T,) uint8 whether a sample lies at a slot
+    colour: Any  # (T, 4) arguments of the sigmoids, and 1; zeros where no voxel is stored
+    gradient: Any  # (T, 4) by these and by density
+    stored: Any  # (T, 2) int32 slots at which samples lie and a voxel is stored, and these voxels
+    slots: Any  # (S, 8) int32 of a sample
+    weights: Any  # (S, 8) of interpolation
+    light: Any  # (S, 3) float64 alpha, transmittance at which light arrives, length of the step in units of the frame
+    shade: Any  # (S, 4) colour, and one over the weights of the voxels that are stored
 
 
 BLOCKS, ENTRIES, SAMPLES = 0, 1, 2  # in `PacketArrays.state`

@@ -1,7 +1,5 @@
 """Exponentials of kernels that work in float32, fast, and in float64, exact, for tests."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import types
 from numba.extending import overload

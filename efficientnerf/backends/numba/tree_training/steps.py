@@ -8,8 +8,6 @@ voxel that rays met, n over the voxels beyond its faces that are stored and tau_
 the moments as the weight decay of AdamW (Loshchilov and Hutter 2019) is.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any, NamedTuple
 
@@ -50,22 +48,14 @@ def corrections(decay: float) -> np.ndarray:
 
 
 class Values(NamedTuple):
-    """What is fitted.
+    """What is fitted."""
 
-    density   (N,)
-    sh        (N, 3 K)
-    places    (N,) int64 of `voxel_places`
-    dense     the same densities, of `dense_densities`
-    cascades  (N,) uint8: the cascade of each voxel
-    sides     (L,) float64: sides of the voxels of each cascade, units of the frame
-    """
-
-    density: np.ndarray
-    sh: np.ndarray
-    places: np.ndarray
-    dense: np.ndarray
-    cascades: np.ndarray
-    sides: np.ndarray
+    density: np.ndarray  # (N,)
+    sh: np.ndarray  # (N, 3 K)
+    places: np.ndarray  # (N,) int64 of `voxel_places`
+    dense: np.ndarray  # the same densities, of `dense_densities`
+    cascades: np.ndarray  # (N,) uint8: the cascade of each voxel
+    sides: np.ndarray  # (L,) float64: sides of the voxels of each cascade, units of the frame
 
 
 def values_of(cells: Cells, density: np.ndarray, sh: np.ndarray) -> Values:
@@ -79,21 +69,14 @@ def values_of(cells: Cells, density: np.ndarray, sh: np.ndarray) -> Values:
 
 
 class StepPointers(NamedTuple):
-    """What a step of one voxel reads and writes: pointers to arrays of records, values, moments and hyperparameters, and
-
-    bases          (P, padded) of `rows_of`
-    following      of `_link`
-    row            (padded,) the gradient by a voxel's coefficients
-    width          3 K
-    of_square      `corrections` of the moments, and the last one of these
-    """
+    """What a step of one voxel reads and writes; without a comment: pointers to arrays of records, values, moments and hyperparameters."""
 
     numbers: Any
     gradient: Any
-    bases: Any
-    following: Any
-    row: Any
-    width: int
+    bases: Any  # (P, padded) of `rows_of`
+    following: Any  # of `_link`
+    row: Any  # (padded,) the gradient by a voxel's coefficients
+    width: int  # 3 K
     padded: int
     density: Any
     sh: Any
@@ -105,7 +88,7 @@ class StepPointers(NamedTuple):
     sides: Any
     cascades: Any
     rates: Any
-    of_square: Any
+    of_square: Any  # `corrections` of the moments, and the last one of these
     of_square_end: int
     around: Any
     brick: int

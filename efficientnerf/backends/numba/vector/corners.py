@@ -4,8 +4,6 @@ Corner c has the group that begins at values[size index[at + c stride]], and wei
 float32, or float64 for tests.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """LLVM instructions on vectors, which intrinsics are made of. A value is a number or a vector of LLVM."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -3,8 +3,6 @@
 Processors with half floats (x86 with F16C, ARM) convert them by themselves; for others that is done with integers, to the same values.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from llvmlite import ir

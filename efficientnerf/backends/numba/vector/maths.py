@@ -1,7 +1,5 @@
 """Functions of vectors, lane by lane unless they say otherwise; some take scalars as well."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Vectors and memory: p is a pointer, and p[n] the n-th element of its array in C order."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -11,8 +11,6 @@ widened to float32 first.
 Results are stored as float32 or, through a pointer to int16, rounded to bfloat16.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ Nothing that a header says is believed before the file's size allows it, and no 
 N Gaussians.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import struct

@@ -1,9 +1,4 @@
-"""3D Gaussians in another frame: their places and sizes, their own axes, and the colours that they show to each side.
-
-N Gaussians, K harmonics.
-"""
-
-from __future__ import annotations
+"""3D Gaussians in another frame: their places and sizes, their own axes, and the colours that they show to each side. N Gaussians, K harmonics."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -6,8 +6,6 @@ COLOR_0 is for viewers without the extension: linear, as glTF has it.
 Khronos, KHR_gaussian_splatting, ratified 2026.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

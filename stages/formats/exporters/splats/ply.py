@@ -3,8 +3,6 @@
 Scales are logarithms, opacities logits, rotations w x y z, f_rest channel by channel; colour = 0.5 + sum of basis * coefficient. The capture's frame.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -15,8 +15,6 @@ among 65,536 entries for each Gaussian takes many minutes.
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -14,8 +14,6 @@ Version 3 is all this as gzip. Version 4 is its header as it stands, a table of 
 https://github.com/nianticlabs/spz
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import sys

@@ -1,7 +1,5 @@
 """Matrices of cameras in text files, JSON and NumPy archives, and what a 3x4 projection holds."""
 
-from __future__ import annotations
-
 import re
 import zipfile
 import zlib

@@ -13,8 +13,6 @@ y up, metres. Depth is the sensor's.
                     depth_00000.png, millimetres, and conf_00000.png, ARConfidenceLevel: 0, 1 or 2
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress

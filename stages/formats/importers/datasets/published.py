@@ -12,8 +12,6 @@
 x right, y down, z forward in all but the first.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -114,16 +112,11 @@ POINTS, OBSERVATIONS = "reconstruction/points3d.txt", "reconstruction/observatio
 
 @dataclass
 class _Devices:
-    """Sensors and how they are carried.
+    """Sensors and how they are carried."""
 
-    lenses  sensor -> camera at the origin
-    mounts  sensor or rig -> (the rig that carries it, sensor from rig)
-    poses   (timestamp, device) -> device from world
-    """
-
-    lenses: dict[str, Camera] = field(default_factory=dict)
-    mounts: dict[str, list[tuple[str, np.ndarray]]] = field(default_factory=dict)
-    poses: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    lenses: dict[str, Camera] = field(default_factory=dict)  # sensor -> camera at the origin
+    mounts: dict[str, list[tuple[str, np.ndarray]]] = field(default_factory=dict)  # sensor or rig -> (the rig that carries it, sensor from rig)
+    poses: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)  # (timestamp, device) -> device from world
 
     def pose(self, timestamp: str, device: str, depth: int = 0) -> np.ndarray | None:
         """(4, 4) device from world, by its own trajectory or that of the rig that carries it; None where there is neither."""

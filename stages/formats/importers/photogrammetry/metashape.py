@@ -8,8 +8,6 @@ so that its p1, p2 are OpenCV's p2, p1. A camera's `transform` is camera to chun
 of the component) leads on to the frame of the project, in metres. A geocentric project lies millions of metres from its origin: there the shift is left out.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

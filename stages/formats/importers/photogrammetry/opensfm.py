@@ -5,8 +5,6 @@ camera with x right, y down, z forward. Lengths of the lens are shares of the im
 is in metres where the photographs have GPS (`reference_lla`). Points that tracks.csv knows are registered in their images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

@@ -9,8 +9,6 @@ side: `f` and FocalLength35mm in 36ths, px, py and PrincipalPointU, V as they ar
 Both worlds have z up. Distortion is Brown's, in the order k1 k2 k3 k4 t1 t2, with t1, t2 OpenCV's p2, p1 (as AliceVision's importer reads them).
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Sequence

@@ -3,8 +3,6 @@
 A document type is refused before it can define an entity, so that none expands and nothing outside is named; size, depth and number of elements are bounded.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, TreeBuilder

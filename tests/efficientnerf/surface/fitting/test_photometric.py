@@ -1,7 +1,5 @@
 """Surfaces fitted to photographs: a textured plane of which the truth is known, and scores against slow ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates

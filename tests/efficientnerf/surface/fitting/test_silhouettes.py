@@ -1,7 +1,5 @@
 """Surfaces moved to the silhouettes of their assets: balls, wires and boxes whose silhouettes are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

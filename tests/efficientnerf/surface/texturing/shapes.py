@@ -1,7 +1,5 @@
 """Meshes, cameras round them, and photographs of them in colours that are known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

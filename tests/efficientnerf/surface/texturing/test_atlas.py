@@ -1,7 +1,5 @@
 """Atlases: every face has its place, no two share one, and neighbouring charts keep their distance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation

@@ -1,7 +1,5 @@
 """Tangents, and normal maps baked from dense meshes: what is decoded as a viewer decodes it is the dense mesh's normal."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Textures from photographs: known colours come back, and what spoils single photographs does not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

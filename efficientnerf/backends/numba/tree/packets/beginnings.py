@@ -3,8 +3,6 @@
 All rays of a packet are laid out at once, in lanes of float64.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -4,8 +4,6 @@ The eight voxels around a sample are read two by two, see `rows`; weights, trans
 away, voxels have the colours of the view; near it their harmonics are summed along each ray.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -10,8 +10,6 @@ State: transmittance; colour; distance at which the transmittance fell to one ha
 colour; counts of coarse cells visited, of samples tested, of samples interpolated and of colours looked up; depth and normal.
 """
 
-from __future__ import annotations
-
 LANES = 32  # rays of a packet; docs/experiments/renderer.md
 ENTRY_X, ENTRY_Y, ENTRY_Z, ALONG_X, ALONG_Y, ALONG_Z, FIRST, LAST = range(0, 8 * LANES, LANES)
 TRANSMITTANCE, RED, GREEN, BLUE, HALF_DISTANCE, PENDING_WEIGHT, GAIN = range(8 * LANES, 15 * LANES, LANES)

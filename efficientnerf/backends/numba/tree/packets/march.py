@@ -7,8 +7,6 @@ looked up, for their colours take so long to come from memory; so rays go one sa
 All rays sample at t = t_enter + (k + 1/2) step, whatever is skipped and whatever the other lanes do: neither changes any value.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -1,7 +1,5 @@
 """Pixels of a packet of rays (numba): what its rays met, written into the images."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,16 +28,14 @@ _NONE, _ONE = np.float32(0), np.float32(1)
 
 
 class Outputs(NamedTuple):
-    """The images that `render_batch` writes, as pointers, and whether the last two are wanted."""
+    """The images that `render_batch` writes, as pointers, and whether normals are wanted."""
 
     width: int
     colour: Any
     opacity: Any
     depth: Any
     normal: Any
-    statistics: Any
     with_normal: bool
-    with_statistics: bool
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -79,9 +75,6 @@ def _write_pixels(tile, background, scale, floats, outputs):  # type: ignore[no-
                 if outputs.with_normal:
                     outputs.normal[3 * pixel + c] = floats[NORMAL_X + LANES * c + lane]
             outputs.opacity[pixel], outputs.depth[pixel] = _ONE - floats[TRANSMITTANCE + lane], floats[DEPTH + lane] * scale
-            if outputs.with_statistics:
-                for m in range(4):
-                    outputs.statistics[4 * pixel + m] = np.int32(floats[VISITED + LANES * m + lane])
             lane += 1
 
 
@@ -95,8 +88,6 @@ def write_clear(top, low, left, right, background, outputs):  # type: ignore[no-
             outputs.opacity[pixel], outputs.depth[pixel] = _NONE, np.float32(np.inf)
         for n in range(3 * (row * outputs.width + left), 3 * (row * outputs.width + right) if outputs.with_normal else 0):
             outputs.normal[n] = _NONE
-        for n in range(4 * (row * outputs.width + left), 4 * (row * outputs.width + right) if outputs.with_statistics else 0):
-            outputs.statistics[n] = np.int32(0)
     return (low - top) * (right - left)
 
 
@@ -107,7 +98,7 @@ def write_packet(tile, background, voxel, rays, scratch, outputs):  # type: igno
     if rays.warped:
         _unwarp_packet(tile, voxel, rays, scratch, outputs.with_normal)
     scale = 1.0 if rays.warped else voxel
-    if count == LANES and tile.last - tile.first == 8 and not (outputs.with_normal or outputs.with_statistics):
+    if count == LANES and tile.last - tile.first == 8 and not outputs.with_normal:
         _write_rows(tile, background, scale, floats, outputs)
     else:
         _write_pixels(tile, background, scale, floats, outputs)

@@ -8,8 +8,6 @@ its lowest b + 2 bits, where the voxels are not too many for that.
 B bricks, N stored voxels; b = brick.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba

@@ -1,7 +1,5 @@
 """Tiles of an image, rendered packet by packet of rays (numba): where rays begin and end in each cascade, and what they bring back."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

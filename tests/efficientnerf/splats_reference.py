@@ -1,12 +1,12 @@
 """The rasteriser as plain torch, one Gaussian after the other over all pixels: the kernels' reference. Pinhole cameras."""
 
-from __future__ import annotations
-
+import numpy as np
 import torch
 from torch import Tensor
 
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.harmonics import basis
+from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import NEAR
 
 
@@ -47,3 +47,9 @@ def render_reference(means: Tensor, log_scales: Tensor, quaternions: Tensor, log
         image = image + (light * alpha)[..., None] * colours[n]
         light = light * (1 - alpha)
     return image, light
+
+
+def covariances(gaussians: Gaussians) -> np.ndarray:
+    """(N, 3, 3) float64."""
+    axes = rotation_matrices(gaussians.rotations) * gaussians.scales[:, None, :].astype(np.float64)
+    return np.asarray(np.einsum("nij,nkj->nik", axes, axes))
