@@ -4,7 +4,7 @@
 
 A sheet on a table, with markers whose edges are 1 to 3 % of the longest side of a picture: the board of `enerf board`, or four at places of their own. Pictures
 are blurred and noisy JPEGs; sheets are bent, their dictionary is none that is tried, or markers move from photograph to photograph. The cameras are off, as
-those of structure from motion are. Writes markers.json and .md; exit code 1 where lengths or up are wrong by more than the issue allows.
+those of structure from motion are. Writes markers.json and .md; exit code 1 where lengths are off by more than 0.5 %, up by more than a degree.
 
 With --cameras: what structure from motion finds on a table without any texture, with the markers as tie points and without; markers_cameras.json.
 """
