@@ -28,6 +28,7 @@ COLOURS_OFF = 2.0  # dB that fitted colours gain, from which exposure or white b
 POOR_VIEWS = 0.25  # of the views
 GAP, LARGE_GAP = -0.5, -1.5  # dB of the asset behind its network: reported; parts are worse than they need be
 HOLES, MANY_HOLES = 0.01, 0.1  # share of the pixels
+VISIBLE = 0.03  # root mean square by which colours in holes are farther from the photographs than the network's: of less nothing is seen, as in a plain sky
 FLOATERS, MANY_FLOATERS = 0.02, 0.15  # share of the asset's opacity, more than the network's own
 SHORT = 0.5  # of the steps that are usual: a refinement with fewer comes before other causes
 AGREEING, LEAST_AGREEING = 0.6, 0.3  # share of the sparse points that the asset's depth agrees with
@@ -268,9 +269,9 @@ def _of_gap(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
 
 
 def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
-    """Reported only where the photographs side with the network."""
+    """Reported only where the photographs visibly side with the network."""
     holes, excess = metrics["holes"], metrics["holes_excess_error"]
-    if holes is None or holes <= HOLES or (excess is not None and excess <= 0):
+    if holes is None or holes <= HOLES or (excess is not None and excess < VISIBLE**2 * holes):
         return []
     sentence = f"The asset has holes: {100 * holes:.1f} % of the pixels show through where the network shows something solid."
     remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or allow a larger asset (bake.max_mib)."

@@ -124,6 +124,13 @@ def on_the_ball(count: int = 80, radius: float = TREE.radius) -> np.ndarray:
     return radius * spread / np.linalg.norm(spread, axis=1, keepdims=True)
 
 
+@pytest.mark.parametrize(("off", "reported"), [(0.004, False), (0.02, False), (0.11, True)])
+def test_holes_that_nobody_sees_are_not_reported(off: float, reported: bool) -> None:
+    """off: root mean square by which the colours in them are worse than the network's."""
+    found = {**a_result(), "holes": 0.035, "holes_excess_error": 0.035 * off**2}
+    assert ("holes" in {problem.what for problem in verdict_on_result(found).problems}) == reported
+
+
 def test_an_asset_that_is_right_is_good_and_agrees_with_its_points(tmp_path: Path) -> None:
     poses = make_scene(tmp_path / "poses", "tttr")
     with_points(poses, on_the_ball())
