@@ -14,7 +14,7 @@ import numpy as np
 from efficientnerf.asset.captured import MetadataError, captured_of
 from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.region import inside_share
-from efficientnerf.asset.tree import Cascade, NerfTree
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.capture.captured_path import captured_path
 from efficientnerf.capture.coverage import coverage
 from efficientnerf.geometry.cameras import Camera, Similarity
@@ -142,31 +142,23 @@ def occupied_points(tree: NerfTree) -> np.ndarray:
 
 
 def cell_centres(tree: NerfTree) -> np.ndarray:
-    """(N, 3) centres of the occupied coarse cells of a tree's region, in its frame; of the inmost cascade where it has none, or one that holds nothing."""
+    """(N, 3) centres of the occupied coarse cells of a tree's region in its inmost cascade, in its frame; of all that cascade where it has no region, or one
+    that holds nothing.
 
-    def centres(cascade: Cascade) -> np.ndarray:
-        return np.asarray(cascade.bounds_min) + (np.argwhere(cascade.brick_index >= 0) + 0.5) * (tree.brick * cascade.voxel)
-
-    cascades = cascades_of(tree)
-    if tree.region is not None:
-        found = []
-        for number, cascade in enumerate(cascades):
-            points = centres(cascade)
-            inside = inside_share(tree.region, points) > 0.5
-            if tree.region.bricks is not None:
-                inside &= np.asarray(tree.region.bricks, bool)[cascade.brick_index[cascade.brick_index >= 0]]
-            if number:  # the box before has its own
-                low, high = cascades[number - 1].bounds(tree.brick)
-                inside &= ((points < low) | (points > high)).any(axis=1)
-            found.append(points[inside])
-        if 0 < sum(map(len, found)) < FEW_CELLS:  # their size counts
-            corners = np.argwhere(np.ones((2, 2, 2))) - 0.5
-            sized = zip(cascades, found, strict=True)
-            spread = [(points[:, None] + corners * (tree.brick * cascade.voxel)).reshape(-1, 3) for cascade, points in sized]
-            return np.clip(np.concatenate(spread), *tree.region.bounds)
-        if sum(map(len, found)):
-            return np.concatenate(found)
-    return centres(cascades[0])
+    Where the region goes on beyond, as with a table and the floor round it, the inmost cascade is what most photographs have in view.
+    """
+    cascade = cascades_of(tree)[0]
+    points = np.asarray(cascade.bounds_min) + (np.argwhere(cascade.brick_index >= 0) + 0.5) * (tree.brick * cascade.voxel)
+    if tree.region is None:
+        return points
+    inside = inside_share(tree.region, points) > 0.5
+    if tree.region.bricks is not None:
+        inside &= np.asarray(tree.region.bricks, bool)[cascade.brick_index[cascade.brick_index >= 0]]
+    if 0 < inside.sum() < FEW_CELLS:  # their size counts
+        corners = np.argwhere(np.ones((2, 2, 2))) - 0.5
+        spread = (points[inside][:, None] + corners * (tree.brick * cascade.voxel)).reshape(-1, 3)
+        return np.clip(spread, *tree.region.bounds)
+    return points[inside] if inside.any() else points
 
 
 def fitted_field_of_view(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> tuple[float, float]:

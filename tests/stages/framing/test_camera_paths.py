@@ -209,6 +209,17 @@ def test_the_whole_region_is_in_the_middle_of_every_picture(degrees: float, size
     assert min(distances) >= 0.97 * 3.0, "not closer than the photographs"
 
 
+def test_a_region_beyond_the_inmost_cascade_is_framed_as_far_as_that_reaches() -> None:
+    """As where it takes in a table and the floor round it."""
+    tree = captured_tree(360.0)
+    inmost = np.stack([tree.bounds_min, tree.bounds_max])
+    wide = replace(tree, region=Region(2 * inmost - inmost.mean(axis=0)))
+    found, expected = (turntable_cameras(replace(wide, region=Region(box)), frames=4, width=64, height=48) for box in (wide.region.bounds, inmost))
+    for camera, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(camera.world_from_camera, other.world_from_camera)
+        np.testing.assert_allclose(camera.params, other.params)
+
+
 def azimuth_of(camera: Camera) -> float:
     return math.degrees(math.atan2(-camera.forward[1], -camera.forward[0]))
 
