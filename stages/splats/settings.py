@@ -41,4 +41,4 @@ class SplatsSettings:
     seed: Seed = setting(0, "Seed of the order of the images.", advanced=True)
 
 
-STAGE = Stage(name="splats", version=7, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))
+STAGE = Stage(name="splats", version=8, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))

@@ -42,7 +42,7 @@ class ViewColours(NamedTuple):
 
     views: Views
     colours: np.ndarray
-    view: bytes  # all that the colours depend on beside the tree; empty for none
+    view: bytes  # all that the colours depend on besides the tree; empty for none
 
 
 def _cone(camera: Camera) -> np.ndarray:

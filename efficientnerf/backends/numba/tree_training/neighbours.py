@@ -1,4 +1,4 @@
-"""Voxels beside voxels (numba), for total variation. B bricks."""
+"""The neighbours of voxels (numba), for total variation. B bricks."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from efficientnerf.backends.numba.tree.cells import Cells
 
 
 class Neighbours(NamedTuple):
-    """Bricks beside bricks; without rows where there is no total variation."""
+    """The neighbours of bricks; without rows where there is no total variation."""
 
     around: np.ndarray  # (B, 6) int32 bricks beyond the faces -x, x, -y, y, -z, z of a brick, -1 where none is stored
     brick: int  # voxels along a side
