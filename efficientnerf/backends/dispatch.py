@@ -35,6 +35,7 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
     "select_pivots": {"torch": "sampling.pivotal", "numba": "backends.numba.operations", "triton": "backends.triton.sampling"},
     "pivotal_samples": {"torch": "sampling.pivotal", "numba": "backends.numba.operations", "triton": "backends.triton.sampling"},
     "composite": {"torch": "rendering.compositing", "numba": "backends.numba.operations", "triton": "backends.triton.compositing"},
+    "scaled_by_distance": {"torch": "rendering.compositing", "numba": "backends.numba.operations"},
     "encode": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "hash_network": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "update_occupancy_maximum": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
@@ -138,6 +139,11 @@ def pivotal_samples(
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
     """See `efficientnerf.rendering.compositing.composite`; but for torch the samples' colours, the lengths and the harmonics carry no gradient."""
     return implementation("composite", backend_of(raw, length, harmonics, background))(raw, length, first, harmonics, background, activation)
+
+
+def scaled_by_distance(values: Tensor, start: Tensor, first: Tensor, subject: Tensor) -> Tensor:
+    """See `efficientnerf.rendering.compositing.scaled_by_distance`."""
+    return implementation("scaled_by_distance", backend_of(values, start, subject))(values, start, first, subject)
 
 
 def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:

@@ -36,6 +36,11 @@ def ray_of_sample(first: Tensor, samples: int) -> Tensor:
     return torch.repeat_interleave(torch.arange(len(counts), device=first.device), counts, output_size=samples)
 
 
+def scaled_by_distance(values: Tensor, start: Tensor, first: Tensor, subject: Tensor) -> Tensor:
+    """Values (N, C) of samples times the square of their distance `start` (N,), measured in their ray's `subject` (R,), at most 1."""
+    return values * ((start / subject[ray_of_sample(first, len(start))]).clamp(max=1) ** 2)[:, None]
+
+
 def sample_weights(depth: Tensor, first: Tensor) -> Tensor:
     """How much each sample contributes to its ray's colour.
 

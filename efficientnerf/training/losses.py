@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
+from efficientnerf.backends import dispatch
 from efficientnerf.backends.transfer import to_device
 from efficientnerf.model import Model, RayOutputs
-from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.training.exposure.model import Exposure, exposed, squared_error
 
 NEARBY = 1e-12  # a distance from which gradients are not scaled
@@ -59,6 +59,4 @@ def scale_gradients_by_distance(m: Model, origins: Tensor, outputs: RayOutputs) 
     for samples, raw in ((outputs.coarse, outputs.coarse_raw), (outputs.fine, outputs.fine_raw)):
         if not raw.requires_grad:  # uniform sampling has no coarse stage
             continue
-        ray = ray_of_sample(samples.first, len(samples.start))
-        scale = (samples.start / subject[ray]).clamp(max=1) ** 2
-        raw.register_hook(lambda grad, scale=scale: grad * scale[:, None])
+        raw.register_hook(lambda grad, samples=samples: dispatch.scaled_by_distance(grad, samples.start, samples.first, subject))

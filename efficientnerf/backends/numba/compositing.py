@@ -133,3 +133,15 @@ def composite_backward(  # type: ignore[no-untyped-def]
                     d = w * g * c * (one - c)
                     for k in range(terms):
                         grad_raw[n, 1 + channel * terms + k] = d * harmonics[r, k]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def scaled_by_distance(values, start, first, subject, out):  # type: ignore[no-untyped-def]
+    """`efficientnerf.rendering.compositing.scaled_by_distance`; writes out (N, C)."""
+    rays, one = len(subject), np.float32(1)
+    for block in numba.prange((rays + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
+            for n in range(first[r], first[r + 1]):
+                ratio = min(start[n] / subject[r], one)
+                for column in range(values.shape[1]):
+                    out[n, column] = values[n, column] * (ratio * ratio)

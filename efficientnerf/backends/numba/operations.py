@@ -96,6 +96,12 @@ class _Composite(torch.autograd.Function):
         return grad_raw, None, None, None, grad_background, None
 
 
+def scaled_by_distance(values: Tensor, start: Tensor, first: Tensor, subject: Tensor) -> Tensor:
+    out = torch.empty(values.shape)
+    compositing.scaled_by_distance(*map(_array, (values, start, first, subject)), out.numpy())
+    return out
+
+
 def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
     """Differentiable in the table, whose gradient is added to the buffer `gradient`, not handed to autograd."""
     return _Encode.apply(points, table, levels, gradient)

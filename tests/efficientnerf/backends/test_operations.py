@@ -328,6 +328,23 @@ def points_in_cells_case() -> Case:
     return Case(call, loop, {"cell": torch.arange(side**3).repeat(20).float()}, atol=0, rtol=0)
 
 
+def scaled_by_distance_case() -> Case:
+    """Rays without samples, with samples nearer than the subject, at it and beyond; more rays than a block of the kernel."""
+    rng = np.random.default_rng(0)
+    counts = rng.integers(0, 4, 70)
+    first, samples = np.concatenate([[0], np.cumsum(counts)]), int(counts.sum())
+    inputs = {
+        "values": torch.from_numpy(rng.normal(size=(samples, 5)).astype(np.float32)), "start": torch.from_numpy(rng.uniform(0, 3, samples).astype(np.float32)),
+        "first": torch.from_numpy(first), "subject": torch.from_numpy(rng.choice([1e-12, 0.5, 1.5], 70).astype(np.float32)),
+    }  # fmt: skip
+
+    def loop(values: np.ndarray, start: np.ndarray, first: np.ndarray, subject: np.ndarray) -> list[np.ndarray]:
+        rays = [r for r in range(len(subject)) for _ in range(first[r], first[r + 1])]
+        return [np.array([row * min(at / subject[r], 1) ** 2 for row, at, r in zip(values, start, rays, strict=True)])]
+
+    return Case(lambda operation, **given: [operation(**given)], loop, inputs)
+
+
 def ray_directions_case(stride: int) -> Case:
     """Two views of different sizes, every pixel."""
     rng = np.random.default_rng(0)
@@ -379,6 +396,7 @@ CASES: dict[str, dict[str, Callable[[], Case]]] = {
     "select_pivots": {f"{most}": lambda most=most: select_pivots_case(most) for most in (1, 4, 100)},  # type: ignore[misc]
     "pivotal_samples": {f"{'contracted' if c else 'box'}": lambda c=c: pivotal_samples_case(c, 3) for c in (False, True)},  # type: ignore[misc]
     "composite": {f"{a}-{d}": lambda a=a, d=d: composite_case(a, d) for a, d in (("exp", 0), ("softplus", 1), ("exp", 2))},  # type: ignore[misc]
+    "scaled_by_distance": {"": scaled_by_distance_case},
     "encode": {"": encode_case},
     "hash_network": {f"{n}": lambda n=n: hash_network_case(n) for n in (1, 2)},  # type: ignore[misc]
     "update_occupancy_maximum": {a: lambda a=a: update_occupancy_case(a) for a in ("exp", "softplus")}  # type: ignore[misc]
