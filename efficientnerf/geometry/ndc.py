@@ -117,6 +117,11 @@ class Ndc:
         a, b = self.slopes
         return np.stack([rotation[:, 0] / a, rotation[:, 1] / b, -beside, rotation[:, 2] + beside], axis=1)
 
+    @cached_property
+    def world_from_ndc(self) -> np.ndarray:
+        """(4, 4): takes (x', y', z', 1) to W times (x, y, z, 1) of the world; W = (1 - z') / (2 n) is one over the depth."""
+        return np.vstack([self.view_direction_matrix(np.zeros(3)), np.array([0, 0, -1, 1]) / (2 * self.near)])
+
     def rays(self, origins: Any, directions: Any) -> NdcRays:
         """World rays (R, 3), unit directions, to rays in normalised device coordinates.
 

@@ -18,6 +18,7 @@ from efficientnerf.backends.numba.mesh.fusion import CHANNELS, FILLED, fit_plane
 from efficientnerf.backends.numba.tree.queries import distance_back
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import rays
+from efficientnerf.geometry.ndc import world_distance
 from efficientnerf.surface.agreement import AssetView
 
 # docs/experiments/surface.md
@@ -40,8 +41,9 @@ class Fusion:
     """Views as `efficientnerf.backends.numba.mesh.fusion` reads them."""
 
     planes: np.ndarray  # (C, H, W, CHANNELS) float32
-    cameras: np.ndarray  # (C, 3, 4) float64 camera_from_world
+    cameras: np.ndarray  # (C, 4, 4) float64 camera from the tree's frame
     lenses: np.ndarray  # (C, 4) float64 fx, fy, cx, cy
+    depth_scale: float = 1.0  # of a voxel's depth
 
 
 def front_depth(tree: NerfTree, view: AssetView) -> np.ndarray:
@@ -53,24 +55,35 @@ def front_depth(tree: NerfTree, view: AssetView) -> np.ndarray:
     points = origins + (view.depth[hit] / cosine)[:, None] * directions
     out = view.depth.copy()
     for part in pieces(len(points), first=2**14):
-        back = distance_back(tree, points[part], directions[part], np.log(2) + np.log1p(-ABSORBED), LONGEST * float(tree.voxel))
-        out[y[part], x[part]] -= back * cosine[part]
+        out[y[part], x[part]] -= _back(tree, points[part], directions[part]) * cosine[part]
     return out
+
+
+def _back(tree: NerfTree, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """(N,) from median depths back to where ABSORBED of the light is gone, world units."""
+    optical_depth, longest = np.log(2) + np.log1p(-ABSORBED), LONGEST * float(tree.voxel)
+    if tree.ndc is None:
+        return distance_back(tree, points, directions, optical_depth, longest)
+    warped = tree.ndc.rays(points, directions)
+    back = distance_back(tree, warped.origins, warped.directions, optical_depth, longest)
+    return np.asarray(-world_distance(-back, 0.0 * back, warped.ds_dt, warped.dlogz_dt))
 
 
 def fusion_of(tree: NerfTree, views: Sequence[AssetView], tick: Callable[[], None]) -> Fusion:
     """Views of a tree by pinhole cameras with images of one size, for its inmost cascade. `tick` is called before each; an exception from it stops the work."""
     height, width = views[0].depth.shape
     voxel = float(tree.voxel)
+    scale = 1.0 if tree.ndc is None else 0.5 / tree.ndc.near
     planes = np.empty((len(views), height, width, CHANNELS), np.float32)
     lenses = np.array([[view.camera.intrinsics[name] for name in ("fx", "fy", "cx", "cy")] for view in views])
     for view, lens, out in zip(views, lenses, planes, strict=True):
         tick()
         depth = front_depth(tree, view)
         for part in pieces(height, first=16):
-            fit_planes(depth, view.opacity, lens, part.start, part.stop, RADIUS, BAND * voxel, out)
-    cameras = np.array([np.linalg.inv(view.camera.world_from_camera)[:3] for view in views])
-    return Fusion(planes, np.ascontiguousarray(cameras), lenses)
+            fit_planes(depth, view.opacity, lens, part.start, part.stop, RADIUS, BAND * voxel * scale, tree.ndc is not None, out)
+    frame = np.eye(4) if tree.ndc is None else tree.ndc.world_from_ndc
+    cameras = np.array([np.linalg.inv(view.camera.world_from_camera) @ frame for view in views])
+    return Fusion(planes, cameras, lenses, scale)
 
 
 def fused_opacity(fusion: Fusion, opacity: np.ndarray, low: np.ndarray, bounds_min: np.ndarray, voxel: float) -> np.ndarray:
@@ -81,8 +94,8 @@ def fused_opacity(fusion: Fusion, opacity: np.ndarray, low: np.ndarray, bounds_m
     for part in pieces(len(opacity), first=8):
         at = np.array([low[0] + part.start, low[1], low[2]], np.int64)
         fuse(
-            np.asarray(bounds_min, np.float64), at, float(voxel), wanted[part], fusion.planes, fusion.cameras, fusion.lenses, TRUNCATION, distance[part],
-            weight[part],
+            np.asarray(bounds_min, np.float64), at, float(voxel), fusion.depth_scale, wanted[part], fusion.planes, fusion.cameras, fusion.lenses, TRUNCATION,
+            distance[part], weight[part],
         )  # fmt: skip
     density = (TRUNCATION * (1 - 2 * opacity)).astype(np.float32)
     mixed = np.where(wanted > 0, (distance * weight + DENSITY_WEIGHT * density) / (weight + DENSITY_WEIGHT), density).astype(np.float32)

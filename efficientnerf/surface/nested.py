@@ -33,8 +33,7 @@ def scene_surface(
     """The surface of all cascades as one mesh; of a tree with one grid the same as `surface`. Arguments as there.
 
     threshold  density per world unit of the inmost cascade; each one after it has half of that, for its voxels are twice as large
-    views      of the tree by cameras with images of one size, whose depths are fused; none, of a forward-facing tree and of cascades beyond the
-               region: the densities alone decide
+    views      of the tree by cameras with images of one size, whose depths are fused; none, and of cascades beyond the region: the densities alone decide
     region     that the surface is clipped to
     faces      budget of all together, shared by the numbers of voxels; a cascade whose share is under MIN_FACES is left out, but for the greatest
 
@@ -43,7 +42,7 @@ def scene_surface(
     if not tree.outer:
         return surface(
             volume_of(tree, region), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-            fusion=_fusion(0, tree, views, 1, progress), silhouettes=views[::SKIPPED], dense=dense, progress=progress,
+            fusion=_fusion(0, tree, views, 1, progress), silhouettes=() if tree.ndc else views[::SKIPPED], dense=dense, progress=progress,
         )  # fmt: skip
     found, fused = [], _cascades_of_region(tree, region)
     sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
@@ -106,7 +105,7 @@ def _parts(tree: NerfTree) -> Iterator[tuple[int, NerfTree]]:
 
 def _fusion(number: int, tree: NerfTree, views: Sequence[AssetView], fused: int, progress: Progress) -> Fusion | None:
     """Of one of the first `fused` cascades. Those after them may hold parts of a few voxels, and fused distances are smoothed over more than one."""
-    return fusion_of(tree, views, lambda: progress(0, 1, "marching cubes")) if views and tree.ndc is None and number < fused else None
+    return fusion_of(tree, views, lambda: progress(0, 1, "marching cubes")) if views and number < fused else None
 
 
 def _cascades_of_region(tree: NerfTree, region: Region | None) -> int:

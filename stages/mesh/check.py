@@ -52,13 +52,13 @@ def other_cameras(tree: NerfTree, known: list[Camera]) -> list[Camera]:
 
 
 def asset_views(tree: NerfTree, progress: Callable[[int, int, str], None]) -> tuple[list[AssetView], list[AssetView]]:
-    """What the cameras of the check see of the asset; and these with others, whose depths are fused: none of a forward-facing asset."""
+    """What the cameras of the check see of the asset; and these with others, whose depths are fused."""
     checking = check_cameras(tree)
-    cameras, out = [*checking, *(other_cameras(tree, checking) if tree.ndc is None else [])], []
+    cameras, out = [*checking, *other_cameras(tree, checking)], []
     for number, camera in enumerate(cameras):
         out.append(asset_view(tree, camera))
         progress(number + 1, len(cameras), "views of the asset")
-    return out[: len(checking)], out if tree.ndc is None else []
+    return out[: len(checking)], out
 
 
 def checked(mesh: Mesh, views: list[AssetView], tick: Callable[[], None]) -> tuple[dict[str, Any], np.ndarray]:

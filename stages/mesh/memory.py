@@ -42,7 +42,7 @@ def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: in
     terms = {
         "vertices and faces": VOXEL * len(tree.density_values),
         "the grid": CELL * math.prod(cells) + BRICK_VOXEL * min(VOXELS_AT_ONCE, tree.voxel_index.size),
-        "views": (PIXEL * views * LONGER_SIDE**2 + BLOCK_VOXEL * (BLOCK + 1 + 2 * MARGIN) ** 3) if tree.ndc is None else 0,
+        "views": PIXEL * views * LONGER_SIDE**2 + BLOCK_VOXEL * (BLOCK + 1 + 2 * MARGIN) ** 3,
         "the asset": tree_bytes(tree),
         "libraries": libraries() + SURFACES,
     }

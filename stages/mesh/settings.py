@@ -63,7 +63,7 @@ def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
 
 STAGE = Stage(
     name="mesh",
-    version=19,
+    version=20,
     settings=MeshSettings,
     needs=needs_of(MeshInputs),
     run=ByName("stages.mesh.run:run"),

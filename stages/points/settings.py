@@ -30,4 +30,4 @@ class PointsSettings:
     seed: Seed = setting(0, "Seed of the points' positions on the surface.", advanced=True)
 
 
-STAGE = Stage(name="points", version=5, settings=PointsSettings, needs=needs_of(PointsInputs), run=ByName("stages.points.run:run"))
+STAGE = Stage(name="points", version=6, settings=PointsSettings, needs=needs_of(PointsInputs), run=ByName("stages.points.run:run"))

@@ -10,11 +10,13 @@ from efficientnerf.backends.numba.mesh.fusion import CONFIDENCE, FILLED, NEAREST
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.queries import density_at, distance_back
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface import fusion as module
 from efficientnerf.surface.agreement import AssetView, asset_view
 from efficientnerf.surface.fusion import Fusion, front_depth, fused_opacity
 from efficientnerf.surface.mesh import face_vectors, topology
 from efficientnerf.surface.nested import scene_surface
+from tests.efficientnerf.walls import DEPTH, NEAR, looking_along_y, wall
 
 VOXEL, RADIUS = 0.05, 0.5
 LENS = np.array([60.0, 62.0, 24.0, 18.0])
@@ -45,8 +47,8 @@ def fusion_of_views(views: list[AssetView]) -> Fusion:
     lenses = np.array([[view.camera.intrinsics[name] for name in ("fx", "fy", "cx", "cy")] for view in views])
     planes = np.empty((len(views), *views[0].depth.shape, 6), np.float32)
     for view, lens, out in zip(views, lenses, planes, strict=True):
-        fit_planes(view.depth, view.opacity, lens, 0, len(view.depth), 2, 2 * VOXEL, out)
-    return Fusion(planes, np.array([np.linalg.inv(view.camera.world_from_camera)[:3] for view in views]), lenses)
+        fit_planes(view.depth, view.opacity, lens, 0, len(view.depth), 2, 2 * VOXEL, False, out)
+    return Fusion(planes, np.array([np.linalg.inv(view.camera.world_from_camera) for view in views]), lenses)
 
 
 def plane_image(normal: tuple[float, float, float], away: float) -> np.ndarray:
@@ -57,7 +59,7 @@ def plane_image(normal: tuple[float, float, float], away: float) -> np.ndarray:
 
 def fitted(depth: np.ndarray, opacity: np.ndarray | None = None, band: float = 0.1) -> np.ndarray:
     out = np.zeros((*depth.shape, 6), np.float32)
-    fit_planes(depth, np.where(np.isfinite(depth), 1, 0).astype(np.float32) if opacity is None else opacity, LENS, 0, len(depth), 2, band, out)
+    fit_planes(depth, np.where(np.isfinite(depth), 1, 0).astype(np.float32) if opacity is None else opacity, LENS, 0, len(depth), 2, band, False, out)
     return out
 
 
@@ -92,7 +94,7 @@ def grid(count: int = 32) -> tuple[np.ndarray, np.ndarray]:
 
 def fused(fusion: Fusion, wanted: int = 1, count: int = 32) -> tuple[np.ndarray, ...]:
     out = tuple(np.zeros((count,) * 3, np.float32) for _ in range(2))
-    fuse(grid(count)[0], np.zeros(3, np.int64), VOXEL, np.full((count,) * 3, wanted, np.uint8), fusion.planes, fusion.cameras, fusion.lenses, 3.0, *out)
+    fuse(grid(count)[0], np.zeros(3, np.int64), VOXEL, 1.0, np.full((count,) * 3, wanted, np.uint8), fusion.planes, fusion.cameras, fusion.lenses, 3.0, *out)
     return out
 
 
@@ -126,7 +128,7 @@ def test_views_carve_what_they_see_through_and_nothing_else() -> None:
     assert (found[:7, :7, :7] < 0.5).all()
     assert (found[(away < -0.7) & (away > -5)] > 0.5).all()
     assert (found[away > 0.7] < 0.5).all()
-    elsewhere = replace(fusion, cameras=fusion.cameras + np.array([0, 0, 0, -100.0])[None, None])  # all of it behind the cameras
+    elsewhere = replace(fusion, cameras=fusion.cameras - 100 * np.outer([1, 1, 1, 0], [0, 0, 0, 1]))  # all of it behind the cameras
     alone = fused_opacity(elsewhere, opacity, low, first, VOXEL)
     assert ((alone > 0.5) == (opacity > 0.5))[3:-3, 3:-3, 3:-3].mean() > 0.98
 
@@ -222,3 +224,72 @@ def test_a_region_cuts_cleanly() -> None:
         lid = lid[lid[:, 2] > 0]
         assert topology(mesh.vertices, mesh.faces).watertight
         np.testing.assert_allclose(lid[:, 2], 0.2 - 0.02, atol=0.15 * VOXEL)
+
+
+def wall_camera(x: float, z: float) -> Camera:
+    """100 x 75 pixels before the walls of `tests.efficientnerf.walls`."""
+    pose = looking_along_y()
+    pose[:3, 3] += [x, 0, z]
+    return Camera("c", 100, 75, "SIMPLE_PINHOLE", (100.0, 50.0, 37.5), pose)
+
+
+WALL_CAMERAS = [wall_camera(x, z) for x in (-0.5, 0.0, 0.5) for z in (-0.3, 0.3)]
+
+
+def wall_view(view: Camera, slant: float) -> AssetView:
+    """Depth = DEPTH + slant x, in the axes of the reference camera."""
+    ndc = Ndc(looking_along_y(), 100.0, 100.0, 100.0, NEAR)
+    origins, directions = rays(view)
+    start, along = ((part @ ndc.world_from_camera[:3, :3]) for part in (origins - ndc.world_from_camera[:3, 3], directions))
+    distance = (DEPTH + slant * start[:, 0] - start[:, 2]) / (along[:, 2] - slant * along[:, 0])
+    depth = (distance * (directions @ view.forward)).reshape(view.height, view.width)
+    return AssetView(view, np.ones_like(depth, np.float32), depth.astype(np.float32))
+
+
+def test_distances_in_normalised_device_coordinates_are_those_of_the_warped_plane() -> None:
+    tree, slant = wall(0.3), 0.3
+    views = [wall_view(view, slant) for view in WALL_CAMERAS]
+    world = fusion_of_views(views)
+    fusion = Fusion(world.planes, world.cameras @ tree.ndc.world_from_ndc, world.lenses, 0.5 / NEAR)  # type: ignore[union-attr]
+    voxel, count, low = float(tree.voxel), 16, np.array([-0.25, -0.25, 0.0])
+    at = low + (np.argwhere(np.ones((count, count, 32), bool)) + 0.5) * voxel
+    distance, weight = (np.zeros((count, count, 32), np.float32) for _ in range(2))
+    wanted = np.ones(distance.shape, np.uint8)
+    fuse(low, np.zeros(3, np.int64), voxel, 0.5 / NEAR, wanted, fusion.planes, fusion.cameras, fusion.lenses, 3.0, distance, weight)
+    # The plane through three points of the wall, in normalised device coordinates.
+    x, y = np.array([-1.0, 1.0, 0.3]), np.array([0.2, -0.4, 0.7])
+    corners = np.stack([x, y, DEPTH + slant * x], 1) @ looking_along_y()[:3, :3].T + looking_along_y()[:3, 3]
+    a, b, c = tree.ndc.points(corners)  # type: ignore[union-attr]
+    normal = np.cross(b - a, c - a)
+    away = ((at - a) @ (normal / np.linalg.norm(normal)) / voxel).reshape(distance.shape)
+    away *= -np.sign(normal[2])  # positive before the wall
+    near = np.abs(away) < 2
+    assert near.sum() > 500
+    assert (weight[near] > 0).all()
+    np.testing.assert_allclose(distance[near], away[near], atol=0.02)
+    assert (distance[away > 3.5] == 3).all()
+    assert (weight[away < -4] == 0).all()
+
+
+def test_a_noisy_wall_before_a_reference_camera_is_smooth() -> None:
+    tree = wall(0.3, voxels=48, hard=0.3)
+    noise = np.exp(np.random.default_rng(0).normal(scale=0.8, size=len(tree.density_values))).astype(np.float32)
+    tree = replace(tree, density_values=tree.density_values * noise, metadata={"spiral": {"radii": [0.5, 0.3, 0.1], "far": 40.0}})
+    views = [asset_view(tree, view) for view in WALL_CAMERAS]
+    forward = tree.ndc.world_from_camera[:3, 2]  # type: ignore[union-attr]
+
+    def angle(fused: list[AssetView]) -> float:
+        mesh = scene_surface(
+            tree, 0.5 / float(tree.voxel), faces=20_000, min_component=0.01, rounds=5, viewpoints=np.zeros((0, 3)), progress=lambda *_: None, views=fused
+        )  # fmt: skip
+        at = (mesh.vertices - tree.ndc.world_from_camera[:3, 3]) @ tree.ndc.world_from_camera[:3, :3]  # type: ignore[union-attr]
+        vectors, middle = face_vectors(mesh.vertices, mesh.faces), at[mesh.faces].mean(1)
+        front = (np.abs(middle[:, :2]) < 1.5).all(1) & (vectors @ forward < 0) & (np.abs(middle[:, 2] - DEPTH - 0.3 * middle[:, 0]) < 1)
+        true = looking_along_y()[:3, :3] @ np.array([0.3, 0, -1]) / np.hypot(0.3, 1)
+        cosine = vectors[front] @ true / np.linalg.norm(vectors[front], axis=1)
+        assert front.sum() > 300
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+
+    found, before = angle(views), angle([])
+    assert found < 0.5 * before
+    assert found < 8

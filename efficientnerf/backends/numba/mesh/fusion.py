@@ -36,12 +36,12 @@ def _inverse(depth, opacity, y, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _plane(depth, opacity, y, x, radius, band):  # type: ignore[no-untyped-def]
+def _plane(depth, opacity, y, x, radius, band, even):  # type: ignore[no-untyped-def]
     """The plane through a pixel and those around it that lie within `band` of it, by weighted least squares: w, a, b, confidence."""
     w = _inverse(depth, opacity, y, x)
     a = _slope(_inverse(depth, opacity, y, x - 1), w, _inverse(depth, opacity, y, x + 1))
     b = _slope(_inverse(depth, opacity, y - 1, x), w, _inverse(depth, opacity, y + 1, x))
-    allowed = band * w * w
+    allowed = band if even else band * w * w
     n = su = sv = suu = suv = svv = sw = suw = svw = sww = whole = 0.0
     for dv in range(-radius, radius + 1):
         for du in range(-radius, radius + 1):
@@ -64,12 +64,12 @@ def _plane(depth, opacity, y, x, radius, band):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def fit_planes(depth, opacity, lens, begin, end, radius, band, out):  # type: ignore[no-untyped-def]
+def fit_planes(depth, opacity, lens, begin, end, radius, band, even, out):  # type: ignore[no-untyped-def]
     """What each pixel of the rows `begin` to `end` of an image sees.
 
     depth, opacity  (H, W) float32, along the view axis
     lens            (4,) float64 fx, fy, cx, cy
-    radius, band    pixels around, and how far off its plane, in units of the depth, a pixel may be to count
+    radius, band    pixels around, and how far off its plane a pixel may be to count: in units of the depth or, where `even`, of the inverse depth
     out             (H, W, CHANNELS) float32: w, a, b; length of the plane's normal in the camera's frame; confidence, 0 to 1, zero where there is no surface;
                     greatest inverse depth of the pixel and its neighbours, zero where all of them are seen through, infinite where one neither is nor is opaque
     """
@@ -87,21 +87,36 @@ def fit_planes(depth, opacity, lens, begin, end, radius, band, out):  # type: ig
             out[y, x, NEAREST] = nearest
             out[y, x, CONFIDENCE] = 0.0
             if _inverse(depth, opacity, y, x) > 0.0:
-                w, a, b, confidence = _plane(depth, opacity, y, x, radius, band)
+                w, a, b, confidence = _plane(depth, opacity, y, x, radius, band, even)
                 middle = w + a * (lens[2] - x - 0.5) + b * (lens[3] - y - 0.5)
                 out[y, x, W], out[y, x, A], out[y, x, B] = w, a, b
                 out[y, x, LENGTH] = np.sqrt((a * lens[0]) ** 2 + (b * lens[1]) ** 2 + middle * middle)
                 out[y, x, CONFIDENCE] = confidence * min(1.0, max(0.1, (opacity[y, x] - OPAQUE) / (SURE - OPAQUE)))
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _slope_of_plane(pixel, column, row, m, w, lens):  # type: ignore[no-untyped-def]
+    """How fast n . x - 1 of a pixel's plane grows along its normal in the grid's frame, at a point with this W."""
+    if m[3, 2] == 0.0:  # the world
+        return pixel[LENGTH]
+    n0, n1 = pixel[A] * lens[0], pixel[B] * lens[1]
+    n2 = pixel[W] + pixel[A] * (lens[2] - column - 0.5) + pixel[B] * (lens[3] - row - 0.5)
+    # A plane of the world is one of the frame: W (n . x - 1) is linear in it.
+    q0, q1 = n0 * m[0, 0] + n1 * m[1, 0] + n2 * m[2, 0] - m[3, 0], n0 * m[0, 1] + n1 * m[1, 1] + n2 * m[2, 1] - m[3, 1]
+    q2 = n0 * m[0, 2] + n1 * m[1, 2] + n2 * m[2, 2] - m[3, 2]
+    return np.sqrt(q0 * q0 + q1 * q1 + q2 * q2) / w
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distance, weight):  # type: ignore[no-untyped-def]
+def fuse(first, low, voxel, depth_scale, wanted, planes, cameras, lenses, truncation, distance, weight):  # type: ignore[no-untyped-def]
     """Signed distance of voxels from the surface that views see, positive before it.
 
-    first       (3,) float64 the corner of the grid, world; low (3,) int64 index of the first voxel
+    first       (3,) float64 the corner of the grid, in its frame; low (3,) int64 index of the first voxel
+    depth_scale a voxel is voxel * depth_scale / W^2 deep in the world, for the W below
     wanted      (X, Y, Z) uint8 which voxels are asked for: 0 not, FILLED those that are solid where views agree that they lie behind surfaces
     planes      (C, H, W, CHANNELS) of `fit_planes`
-    cameras     (C, 3, 4) float64 camera_from_world; lenses (C, 4) float64
+    cameras     (C, 4, 4) float64 takes (x, y, z, 1) of the frame to W times (x, y, z, 1) of the camera: W is 1 in the world, see `Ndc.world_from_ndc`
+    lenses      (C, 4) float64
     truncation  of distances, voxels
     distance    (X, Y, Z) float32 mean of the views, voxels, from -truncation to truncation
     weight      (X, Y, Z) float32 sum of the views' confidences; zero where none sees it
@@ -117,16 +132,17 @@ def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distanc
             total = sums = behind = 0.0
             for c in range(len(cameras)):
                 m = cameras[c]
-                z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
-                if not z > 1e-6:
+                w = m[3, 0] * px + m[3, 1] * py + m[3, 2] * pz + m[3, 3]
+                z = (m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]) / w
+                if not (w > 0.0 and z > 1e-6):
                     continue
-                x, y = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3], m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
+                x, y = (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]) / w, (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]) / w
                 u, v = lenses[c, 0] * x / z + lenses[c, 2], lenses[c, 1] * y / z + lenses[c, 3]
                 if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
                     continue
                 column, row = int(u), int(v)
                 pixel = planes[c, row, column]
-                if pixel[NEAREST] == 0.0 or 1.0 / pixel[NEAREST] - z > truncation * voxel:
+                if pixel[NEAREST] == 0.0 or 1.0 / pixel[NEAREST] - z > truncation * voxel * depth_scale / (w * w):
                     total, sums = total + 1.0, sums + truncation
                     continue
                 if pixel[CONFIDENCE] <= 0.0:
@@ -135,7 +151,7 @@ def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distanc
                 cosine = across / (pixel[LENGTH] * np.sqrt(x * x + y * y + z * z))
                 if cosine < STEEPEST:
                     continue
-                s = (1.0 - across) / (pixel[LENGTH] * voxel)
+                s = (1.0 - across) / (_slope_of_plane(pixel, column, row, m, w, lenses[c]) * voxel)
                 if s <= -truncation:
                     behind += pixel[CONFIDENCE] if s > -DEEPEST * truncation else 0.0
                 elif s <= truncation:
