@@ -187,6 +187,7 @@ class MeshInputs:
 
 @dataclass(frozen=True)
 class PointsInputs:
+    mesh: MeshOutputs
     bake: BakeOutputs
 
 

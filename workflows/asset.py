@@ -15,7 +15,7 @@ NAMES = (
     "splats",  # bake, train, poses -> 3D Gaussians as PLY and SPZ, unless splats.make is off
     "evaluate",  # mesh, splats, bake, train, poses -> PSNR and SSIM of the network, of the asset, of the mesh and of the Gaussians
     "turntable",  # bake -> frames, video, EXR
-    "points",  # bake -> PLY
+    "points",  # mesh, bake -> PLY
 )
 STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}.settings").STAGE for name in NAMES)
 WORKFLOW = Workflow(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.format import FormatError, describe, serialize
+from efficientnerf.asset.format import FormatError, describe, outline, serialize
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.surface.mesh import Mesh, moved
 from pipeline.decide import decide
@@ -31,6 +31,7 @@ from stages.mesh.memory import surface_needed
 from stages.mesh.run import SURFACE_SHARE, in_capture, mesh_of
 from stages.mesh.settings import STAGE, MeshSettings
 from stages.mesh.texture import largest_photograph, textured, with_relief
+from stages.points.memory import needed as points_needed
 from stages.points.run import points_of
 from stages.viewer.page import compact_bytes, viewer_page
 from workflows.cli.resolve import Settings
@@ -174,33 +175,35 @@ def export_cameras(export: Export) -> list[Written]:
 
 
 def export_surface(export: Export, settings: Settings, progress: Progress) -> list[Written]:
-    """The surface as points or as a mesh. `settings` holds those of the stages mesh and points, with which it is made."""
+    """The surface as a mesh, or points on that. `settings` holds those of the stages mesh and points, with which it is made."""
     if not export.surfaces:
         return []
-    resolved = settings.resolved()
-    wanted = resolved["points" if export.as_points else "mesh"]
-    region = export.region or (wanted.region if export.crop is None else "all")
-    wanted = replace(wanted, region=region)
+    wanted, points = (settings.resolved()[name] for name in ("mesh", "points"))
     if not export.as_points:
-        shown = export.keeps_textures or (export.is_coloured and (export.texture is not None or export.has_photographs))
-        wanted = replace(wanted, texture=(export.texture or wanted.texture) if shown else "off")
-        relief = wanted.normal_map if export.normal_map is None else export.normal_map
-        wanted = replace(wanted, normal_map=relief and export.keeps_textures and wanted.texture != "off")
-        made = None if export.crop is not None else _made_by_the_stage(export.what, wanted, export.keeps_textures)
-        if made is not None:
-            return _write_mesh(export, *made)
-    whole = load_asset(export.what)
-    tree, border = restricted(whole, region, export.crop), whole.region if region == "foreground" else None
-    frame = source_frame(tree.metadata)
-    if not export.as_points:
-        return _write_mesh(export, _meshed(export, tree, border, frame, wanted, progress), frame)
-
-    _refuse_what_does_not_fit(export, tree, f"Lower points.num_points ({wanted.num_points}).", points=wanted.num_points)
-    cloud = points_of(tree, wanted, frame, progress, border)
+        return _write_mesh(export, *_surface(export, wanted, progress))
+    refuse_more_than(export.limit, str(export.what), points_needed(points.num_points), f"Lower points.num_points ({points.num_points}).")
+    mesh, frame = _surface(export, wanted, progress, points.num_points)
+    cloud = points_of(mesh, outline(asset_of(export.what)), points, frame)
     for path in export.surfaces:
         with writing(path, force=export.force):
             export.format(path)(cloud, path, frame)
     return [{"path": str(path.absolute()), "points": len(cloud.positions)} for path in export.surfaces]
+
+
+def _surface(export: Export, wanted: Any, progress: Progress, points: int = 0) -> tuple[Mesh, SourceFrame]:
+    """The mesh in the capture's frame: that of the stage, or made here, then with as many faces as so many points are spread over."""
+    region = export.region or (wanted.region if export.crop is None else "all")
+    shown = export.keeps_textures or (export.is_coloured and (export.texture is not None or export.has_photographs))
+    wanted = replace(wanted, region=region, texture=(export.texture or wanted.texture) if shown else "off")
+    relief = wanted.normal_map if export.normal_map is None else export.normal_map
+    wanted = replace(wanted, normal_map=relief and export.keeps_textures and wanted.texture != "off")
+    made = None if export.crop is not None else _made_by_the_stage(export.what, wanted, export.keeps_textures)
+    if made is not None:
+        return made
+    whole = load_asset(export.what)
+    tree, border = restricted(whole, region, export.crop), whole.region if region == "foreground" else None
+    frame = source_frame(tree.metadata)
+    return _meshed(export, tree, border, frame, replace(wanted, max_faces=max(wanted.faces, points)), progress), frame
 
 
 def export_volumes(export: Export, settings: Settings) -> list[Written]:
@@ -238,10 +241,6 @@ def export_viewers(export: Export) -> list[Written]:
     return [{"path": str(path.absolute()), "bytes": len(page)} for path in export.viewers]
 
 
-def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: Any) -> None:
-    refuse_more_than(export.limit, str(export.what), surface_needed(tree, **needed), remedy)
-
-
 def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -> tuple[Mesh, SourceFrame] | None:
     """The mesh that the run's stage `mesh` has made, if that is what is wanted; its texture may be left out."""
     if not is_run(what):
@@ -274,7 +273,8 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     inputs = MeshInputs(*(kind.of_run(export.what) for kind in (BakeOutputs, TrainOutputs, PosesOutputs)))  # type: ignore[arg-type]
     side = 0 if choice == "off" else wanted.texture_size
     remedy = "Take an asset of fewer voxels (enerf convert --resolution)" + (", or a smaller texture (--texture-size)." if side else ".")
-    _refuse_what_does_not_fit(export, tree, remedy, texture=side, pixels=largest_photograph(inputs, choice), dense=wanted.normal_map)
+    need = surface_needed(tree, texture=side, pixels=largest_photograph(inputs, choice), dense=wanted.normal_map)
+    refuse_more_than(export.limit, str(export.what), need, remedy)
     share = 1.0 if choice == "off" else SURFACE_SHARE
 
     def surface(done: int, total: int, text: str) -> None:

@@ -1,4 +1,4 @@
-"""The surface of a volume: extracted, cleaned, decimated and coloured; and points on it.
+"""The surface of a volume: extracted, cleaned, decimated and coloured.
 
 V vertices, F faces. Everything is in the frame of the volume (`efficientnerf.surface.volume`).
 """
@@ -12,7 +12,7 @@ from efficientnerf.surface.colours import surface_colours
 from efficientnerf.surface.fitting.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.fusion import Fusion
 from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_threshold, enclosed_cells, isosurface, silent
-from efficientnerf.surface.mesh import Mesh, PointCloud, decimate, sample, separate, tidy, vertex_normals
+from efficientnerf.surface.mesh import Mesh, decimate, separate, tidy, vertex_normals
 from efficientnerf.surface.smoothing import rounds_within, smooth, smooth_normals
 from efficientnerf.surface.visible_parts import Shown, visible_parts
 from efficientnerf.surface.volume import NdcVolume, Volume
@@ -101,40 +101,3 @@ def surface(
     colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
     mesh = Mesh(vertices, triangles, normals, colours, facts)
     return mesh if ndc is None else ndc.mesh(mesh)
-
-
-def points(
-    volume: Volume,
-    count: int = 200_000,
-    threshold: float | None = None,
-    *,
-    min_component: float = 0.01,
-    rounds: int = 10,
-    viewpoints: np.ndarray = _NO_VIEWPOINTS,
-    shown: Shown | None = None,
-    fusion: Fusion | None = None,
-    seed: int = 0,
-    progress: Progress = silent,
-) -> PointCloud:
-    """`count` points spread evenly over the surface (before decimation), with normals and colours. Raises NoSurface.
-
-    The same for the same seed; the other arguments as for `surface`. Of an `NdcVolume` they are spread evenly in normalised device
-    coordinates, as images show them: sparser in the world the further they are.
-    """
-    ndc = volume if isinstance(volume, NdcVolume) else None
-    viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS
-    vertices, triangles, _ = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress, shown, fusion)
-    cloud = spread(volume, vertices, triangles, count, seed, progress)
-    return cloud if ndc is None else ndc.points(cloud)
-
-
-def spread(volume: Volume, vertices: np.ndarray, triangles: np.ndarray, count: int, seed: int, progress: Progress = silent) -> PointCloud:
-    """`count` points spread evenly over a surface of the volume, in its frame."""
-    face, weight = sample(vertices, triangles, count, seed)
-    corners = triangles[face]  # (N, 3)
-    normals = (vertex_normals(vertices, triangles)[corners] * weight[..., None]).sum(1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), vertex_normals(vertices, triangles)[corners[:, 0]])
-    positions = (vertices[corners] * weight[..., None]).sum(1)
-    directions = volume.view_directions if isinstance(volume, NdcVolume) else None
-    return PointCloud(positions, normals, surface_colours(volume, positions, normals, progress, directions))

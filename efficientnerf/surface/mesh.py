@@ -262,16 +262,46 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[np.n
     return tidy(places, np.asarray(triangles, np.int64))
 
 
-def sample(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def sample(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int, sizes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Points spread evenly over a surface.
 
+    sizes    (F,) of the faces, to which their points are proportional; None: areas
     returns  face (N,) that each point lies on, ascending, and its barycentric weights (N, 3)
 
-    One point per equal share of the area, in the order of the faces: more even than independent draws, and the same for the same seed.
+    One point per equal share of the size, in the order of the faces: more even than independent draws, and the same for the same seed.
     """
     rng = np.random.default_rng(seed)
-    cumulative = np.cumsum(face_areas(vertices, faces))
+    cumulative = np.cumsum(face_areas(vertices, faces) if sizes is None else sizes)
     where = (np.arange(count) + rng.random(count)) / count * cumulative[-1]
     face = np.minimum(np.searchsorted(cumulative, where, side="right"), len(faces) - 1)
     root, v = np.sqrt(rng.random(count)), rng.random(count)
     return face, np.stack([1 - root, root * (1 - v), root * v], 1)
+
+
+def sampled(mesh: Mesh, count: int, seed: int, sizes: np.ndarray | None = None) -> PointCloud:
+    """`sample` with normals, and colours of the mesh's texture, else of its vertices. The mesh must have a face."""
+    face, weight = sample(mesh.vertices, mesh.faces, count, seed, sizes)
+    corners = mesh.faces[face]  # (N, 3)
+
+    def mixed(of_corners: np.ndarray) -> np.ndarray:
+        return np.einsum("nk,nkc->nc", weight, of_corners)
+
+    normals = mixed(mesh.normals[corners])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), mesh.normals[corners[:, 0]])
+    colours = mixed(mesh.colours[corners]) if mesh.texture is None else texture_colours(mesh.texture, mixed(mesh.texture.coordinates[face]))
+    return PointCloud(mixed(mesh.vertices[corners]), normals, colours.astype(np.float32))
+
+
+def texture_colours(texture: Texture, at: np.ndarray) -> np.ndarray:
+    """(N, 3) sRGB 0-1 at coordinates (N, 2), bilinear."""
+    picture = texture.colours
+    height, width = picture.shape[:2]
+    x = np.clip(at[:, 0] * width - 0.5, 0, width - 1)
+    y = np.clip((1 - at[:, 1]) * height - 0.5, 0, height - 1)
+    left, top = x.astype(np.int64), y.astype(np.int64)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    across, down = (x - left)[:, None], (y - top)[:, None]
+    upper = (1 - across) * picture[top, left] + across * picture[top, right]
+    lower = (1 - across) * picture[bottom, left] + across * picture[bottom, right]
+    return np.asarray(((1 - down) * upper + down * lower) / 255)

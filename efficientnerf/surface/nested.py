@@ -10,13 +10,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascade_tree, cascades_of, voxel_cascades
+from efficientnerf.asset.cascades import cascade_sides, cascade_tree, cascades_of, point_cascades, voxel_cascades
 from efficientnerf.asset.tree import Cascade, NerfTree, Region
 from efficientnerf.surface.agreement import AssetView
-from efficientnerf.surface.extraction import cleaned_surface, points, spread, surface
+from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.fusion import Fusion, fusion_of
 from efficientnerf.surface.isosurface import NoSurface, Progress
-from efficientnerf.surface.mesh import Mesh, PointCloud, compact, face_areas
+from efficientnerf.surface.mesh import Mesh, face_areas
 from efficientnerf.surface.visible_parts import Shown
 from efficientnerf.surface.volume import volume_of
 
@@ -64,35 +64,16 @@ def scene_surface(
     return _joined([(mesh, kept) for mesh, kept in found if kept.any()])
 
 
-def scene_points(
-    tree: NerfTree, count: int, threshold: float | None, *, min_component: float, rounds: int, viewpoints: np.ndarray, seed: int, progress: Progress,
-    shown: Shown | None = None, views: Sequence[AssetView] = (), region: Region | None = None,
-) -> PointCloud:  # fmt: skip
-    """Points on the surfaces of all cascades; of a tree with one grid the same as `points`. Arguments as there and for `scene_surface`.
+def face_sizes(tree: NerfTree, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) areas of a surface's faces, counted in faces of the voxels there: points in proportion to them are sparser where voxels are larger, and of a
+    forward-facing tree as far apart in images at any depth.
 
-    They are spread evenly in each cascade, and as many to a voxel's face in all of them: sparser where voxels are larger.
+    vertices  (V, 3) in the world
     """
-    if not tree.outer:
-        return points(
-            volume_of(tree, region), count, threshold, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-            fusion=_fusion(0, tree, views, 1, progress), seed=seed, progress=progress,
-        )  # fmt: skip
-    found, fused = [], _cascades_of_region(tree, region)
-    for number, part in _parts(tree):
-        try:
-            fusion, volume = _fusion(number, part, views, fused, progress), volume_of(part, region)
-            vertices, triangles, _ = cleaned_surface(volume, _level(threshold, number), min_component, rounds, viewpoints, progress, shown, fusion)
-        except NoSurface:
-            continue
-        kept = triangles[_visible(tree, number, vertices, triangles)]
-        if len(kept):
-            found.append((volume_of(part), *compact(vertices, kept)))
-    if not found:
-        raise NoSurface("the density of no cascade reaches the threshold" + ("" if threshold is None else f" {threshold:.4g}"))
-    size = np.array([face_areas(vertices, triangles).sum() / volume.voxel**2 for volume, vertices, triangles in found])
-    ends = np.round(np.cumsum(size) / size.sum() * count).astype(int)
-    clouds = [spread(*part, number, seed, progress) for part, number in zip(found, np.diff(ends, prepend=0).tolist(), strict=True) if number]
-    return PointCloud(*(np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in ("positions", "normals", "colours")))
+    if tree.ndc is not None:
+        return face_areas(tree.ndc.points(vertices), faces)
+    sides = cascade_sides(tree)[point_cascades(tree, vertices[faces].mean(axis=1))]  # beyond all boxes, by less than a voxel, that of the last
+    return face_areas(vertices, faces) / sides**2
 
 
 def _parts(tree: NerfTree) -> Iterator[tuple[int, NerfTree]]:

@@ -11,7 +11,7 @@ import numpy as np
 from efficientnerf.backends.numba.mesh.shade import shade
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project, resized, rows_of
-from efficientnerf.surface.mesh import Mesh, Texture, face_areas
+from efficientnerf.surface.mesh import Mesh, Texture, face_areas, texture_colours
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 
 SAMPLES = 4  # along each side of a pixel. docs/experiments/textures.md
@@ -112,7 +112,7 @@ def vertex_colours(mesh: Mesh, parts: int = 3) -> np.ndarray:
     sums, total = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
     for weight in _places(parts):
         at = np.einsum("k,fkc->fc", weight, mesh.texture.coordinates)
-        colour = _bilinear(mesh.texture.colours, at)
+        colour = texture_colours(mesh.texture, at)
         for corner in range(3):
             share = weight[corner] * area
             total += np.bincount(mesh.faces[:, corner], share, minlength=len(total))
@@ -129,16 +129,3 @@ def _places(parts: int) -> Iterator[np.ndarray]:
             yield np.array([i + 1 / 3, j + 1 / 3, parts - i - j - 2 / 3]) / parts
             if i + j < parts - 1:
                 yield np.array([i + 2 / 3, j + 2 / 3, parts - i - j - 4 / 3]) / parts
-
-
-def _bilinear(picture: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(N, 3) 0-1 of a picture at places (N, 2), v up."""
-    height, width = picture.shape[:2]
-    x = np.clip(at[:, 0] * width - 0.5, 0, width - 1)
-    y = np.clip((1 - at[:, 1]) * height - 0.5, 0, height - 1)
-    left, top = x.astype(np.int64), y.astype(np.int64)
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    across, down = (x - left)[:, None], (y - top)[:, None]
-    upper = (1 - across) * picture[top, left] + across * picture[top, right]
-    lower = (1 - across) * picture[bottom, left] + across * picture[bottom, right]
-    return np.asarray(((1 - down) * upper + down * lower) / 255)

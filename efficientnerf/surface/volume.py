@@ -16,7 +16,7 @@ from efficientnerf.asset import queries
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.backends.numba.tree import queries as frame_queries
 from efficientnerf.geometry.ndc import Ndc
-from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
+from efficientnerf.surface.mesh import Mesh, vertex_normals
 
 VOXELS_AT_ONCE = 2**20  # of bricks, while dense voxels are found
 FARTHEST = 50.0  # times the near plane's depth: the far limit where the asset does not say
@@ -129,10 +129,6 @@ class NdcVolume(Volume):
         """A mesh of the frame in the world. The map keeps the handedness, so that faces stay outside out."""
         vertices = self.ndc.world(mesh.vertices)
         return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
-
-    def points(self, cloud: PointCloud) -> PointCloud:
-        """A cloud of the frame in the world."""
-        return replace(cloud, positions=self.ndc.world(cloud.positions), normals=self.ndc.world_normals(cloud.positions, cloud.normals))
 
 
 def volume_of(tree: NerfTree, region: Region | None = None) -> Volume:

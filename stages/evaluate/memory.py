@@ -6,7 +6,6 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.settings import resolved
 from efficientnerf.surface.shading import AT_ONCE
 from stages.artifacts import EvaluateInputs
-from stages.evaluate.mesh import mesh_bytes
 from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, EvaluateSettings
 from stages.evaluate.strips import STRIP_RAYS
 from stages.evaluate.views import evaluation_views
@@ -14,6 +13,7 @@ from stages.io.scene import load
 from stages.memory.forecast import Known
 from stages.memory.need import MIB, Need, libraries
 from stages.memory.tree import asset_of, tree_bytes
+from stages.mesh.files import mesh_bytes
 
 # Bytes of a pixel: of a test view with its photograph, renders, errors and windows of SSIM; of a view in which the mesh is drawn. Of a sample of those that are
 # drawn at a time.

@@ -11,7 +11,6 @@ roughness           `efficientnerf.surface.roughness`
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,6 @@ from stages.artifacts import MeshOutputs
 from stages.evaluate.asset import EvaluatedAsset, RenderTree
 from stages.evaluate.views import GroundTruth, constant_background, upsample
 from stages.formats.exporters.writing import source_frame
-from stages.io.pictures import read_header
 from stages.io.scene import Scene, View
 from stages.mesh.files import read_mesh
 
@@ -62,19 +60,6 @@ def load_mesh(outputs: MeshOutputs, tree: NerfTree, region: str) -> EvaluatedMes
     with_surroundings = tree.ndc is None and (tree.environment is not None or (tree.region is not None and region == "foreground"))
     around = partial(render, surroundings(tree, all_is_foreground=region == "all").to(tree.device)) if with_surroundings else None
     return evaluated_mesh(mesh, around)
-
-
-def mesh_bytes(outputs: MeshOutputs) -> int:
-    """Bytes that measuring a mesh takes besides the view itself: its arrays, and those of its texture."""
-    texels = 0
-    if outputs.texture.is_file():
-        width, height = read_header(outputs.texture).size
-        texels = width * height
-    return 16 * (_size(outputs.ply) + _size(outputs.glb) // 4) + 12 * texels
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.is_file() else 0
 
 
 def mesh_image(

@@ -3,6 +3,7 @@ without faces, which exporters refuse."""
 
 import json
 import struct
+from math import prod
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -36,6 +37,16 @@ def read_vertices(outputs: MeshOutputs) -> tuple[np.ndarray, np.ndarray]:
     vertices, _ = _read_ply(outputs.ply)
     places, normals = (np.stack([vertices[name] for name in names], 1).astype(np.float64) for names in (("x", "y", "z"), ("nx", "ny", "nz")))
     return places, normals
+
+
+def mesh_bytes(outputs: MeshOutputs) -> int:
+    """Bytes of memory that a mesh takes while it is read and used: its arrays, and those of its texture."""
+    texels = prod(read_header(outputs.texture).size) if outputs.texture.is_file() else 0
+    return 16 * (_size(outputs.ply) + _size(outputs.glb) // 4) + 12 * texels
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else 0
 
 
 def write_empty_meshes(outputs: MeshOutputs, frame: SourceFrame) -> None:

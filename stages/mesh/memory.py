@@ -19,8 +19,8 @@ from stages.mesh.texture import largest_photograph
 from stages.train.data import count_pixels
 
 # Bytes. Of a stored voxel: vertices and faces while they are joined, cleaned and decimated, as many as a thin shell has; of a cell in which enclosed space
-# is found, and of a voxel of the bricks that these are made from; of a point with the data to look up its colour.
-VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
+# is found, and of a voxel of the bricks that these are made from.
+VOXEL, CELL, BRICK_VOXEL = 150, 8, 64
 # Of a pixel of a view whose depth is fused, and of a voxel of a block that is fused at a time.
 PIXEL, BLOCK_VOXEL = 36, 120
 # Of a texel, with what it has seen of photographs; of a photograph's pixel with depth and edges.
@@ -33,8 +33,8 @@ FITTED_VERTEX = 1600
 WRITTEN_FACE, WRITTEN_TEXEL, SHEET, FACES, TEXELS = 180, 3, 3 * MIB // 4, 4, 4
 
 
-def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False, fitted: int = 0) -> Need:
-    """Memory to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
+def surface_needed(tree: NerfTree, texture: int = 0, pixels: int = 0, dense: bool = False, fitted: int = 0) -> Need:
+    """Memory to mesh a tree and to texture it: so many texels a side, photographs of so many pixels,
     with a normal map where `dense`, and so many vertices fitted to photographs."""
     views = CAPTURED + ORBIT + FUSED
     pool = pool_of(volume_of(tree))
@@ -46,7 +46,7 @@ def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: in
         "the asset": tree_bytes(tree),
         "libraries": libraries() + SURFACES,
     }
-    optional = {"points": POINT * points, "the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
+    optional = {"the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
                 "the fit to photographs": (FITTED_VERTEX * fitted + MOST * min(pixels, LARGEST)) if fitted else 0,
                 "the normal map": (DENSE_VOXEL * len(tree.density_values) + DENSE_CELLS) if dense else 0}  # fmt: skip
     return Need(terms | {what: count for what, count in optional.items() if count})
@@ -61,7 +61,7 @@ def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
 
 
 def _most_faces(tree: NerfTree, settings: MeshSettings) -> int:
-    return min(int(str(settings.max_faces).replace("k", "000")), FACES * len(tree.density_values))
+    return min(settings.faces, FACES * len(tree.density_values))
 
 
 def memory_needed(known: Known) -> Need:

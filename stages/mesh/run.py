@@ -35,7 +35,6 @@ from stages.mesh.timing import Stopwatch
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
 STEPS = 500  # of the progress of each
 SURFACE_SHARE = 0.7  # of the stage's time; the texture takes the rest
-FACES = {"20k": 20_000, "100k": 100_000, "500k": 500_000}  # of mesh.max_faces
 
 
 def mesh_of(
@@ -62,7 +61,7 @@ def mesh_of(
         mesh = scene_surface(
             tree,
             level_of(tree, threshold, seen, tick),
-            faces=FACES[settings.max_faces] if isinstance(settings.max_faces, str) else settings.max_faces,
+            faces=settings.faces,
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             viewpoints=orbit_points(tree.metadata),
@@ -74,7 +73,7 @@ def mesh_of(
         )
     except NoSurface as error:
         if threshold is not None:
-            raise UsageError(f"mesh: {error}. {remedy('mesh', threshold)}") from error
+            raise UsageError(f"mesh: {error}. {remedy(threshold)}") from error
         mesh = nothing(str(error))
     return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"})
 
@@ -109,11 +108,11 @@ def orbit_points(metadata: Mapping[str, Any]) -> np.ndarray:
     return np.asarray(orbit["centre"], np.float64) + float(orbit["radius"]) * direction[: 1 if orbit["forward_facing"] else 8]
 
 
-def remedy(stage: str, threshold: float | None) -> str:
+def remedy(threshold: float | None) -> str:
     """What to do where no surface was found."""
     if threshold is None:
-        return f"The asset is nearly empty: train longer, or set {stage}.density_threshold by hand."
-    return f"Lower {stage}.density_threshold (found {threshold:g}), or set it to auto."
+        return "The asset is nearly empty: train longer, or set mesh.density_threshold by hand."
+    return f"Lower mesh.density_threshold (found {threshold:g}), or set it to auto."
 
 
 def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:
@@ -156,7 +155,7 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
     for path in (outputs.preview, outputs.check):
         write_png(picture, path)
     write_json(outputs.report, describe(mesh, frame) | {"region": job.settings.region} | agreed)
-    job.warn(f"the mesh is empty: {mesh.facts['no_surface']}. {remedy('mesh', None)}")
+    job.warn(f"the mesh is empty: {mesh.facts['no_surface']}. {remedy(None)}")
     job.say("no faces", faces=0, components=0, watertight=False)
 
 

@@ -54,6 +54,11 @@ class MeshSettings:
         advanced=True,
     )
 
+    @property
+    def faces(self) -> int:
+        """`max_faces` as a number."""
+        return int(str(self.max_faces).replace("k", "000"))
+
 
 def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
     """Raise UsageError for a normal map on a mesh without texture coordinates."""

@@ -1,16 +1,22 @@
-"""Memory of spreading points over the surface."""
+"""Memory of sampling points on a mesh."""
 
+from stages.artifacts import PointsInputs
 from stages.memory.forecast import Known
-from stages.memory.need import Need
-from stages.memory.tree import asset_of
-from stages.mesh.memory import surface_needed
+from stages.memory.need import SURFACES, Need, libraries
+from stages.mesh.files import mesh_bytes
 
-WRITTEN = 30  # bytes of a point
+POINT = 350  # bytes of a point in memory. docs/experiments/memory.md
+WRITTEN = 30
+
+
+def needed(count: int, mesh: int = 0) -> Need:
+    """Memory of so many points on a mesh of so many bytes."""
+    return Need({"points": POINT * count, "the mesh": mesh, "libraries": libraries() + SURFACES})
 
 
 def memory_needed(known: Known) -> Need:
-    """Memory of the stage points for all of the asset."""
-    return surface_needed(asset_of(known), known.settings["points"].num_points)
+    """`needed` on the run's mesh."""
+    return needed(known.settings["points"].num_points, mesh_bytes(known.inputs(PointsInputs).mesh))
 
 
 def space_needed(known: Known) -> int:

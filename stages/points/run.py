@@ -1,69 +1,37 @@
-"""The points stage: points spread evenly over the asset's surface, with normals and colours, as PLY in the capture's frame."""
+"""The points stage: points spread evenly over the mesh, with normals and colours, as PLY in the capture's frame."""
 
-from collections.abc import Callable
-
-from efficientnerf.asset.format import load
-from efficientnerf.asset.tree import NerfTree, Region
-from efficientnerf.settings import resolved
-from efficientnerf.surface.isosurface import NoSurface
-from efficientnerf.surface.mesh import PointCloud
-from efficientnerf.surface.nested import scene_points
-from pipeline.errors import StageFailed, UsageError
+from efficientnerf.asset.format import outline
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.mesh import Mesh, PointCloud, sampled
+from efficientnerf.surface.nested import face_sizes
+from pipeline.errors import StageFailed
 from pipeline.stage import Job
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of
-from stages.compiling import compiling_kernels
 from stages.formats.exporters import POINT_EXPORTERS
 from stages.formats.exporters.writing import SourceFrame, source_frame
-from stages.framing.restriction import restricted
 from stages.memory.need import refuse_what_does_not_fit
-from stages.mesh.check import asset_views, level_of, shown_by
-from stages.mesh.memory import surface_needed
-from stages.mesh.run import PARTS, orbit_points, remedy, whole_progress
+from stages.mesh.files import mesh_bytes, read_mesh
+from stages.points.memory import needed
 from stages.points.settings import PointsSettings
 
 
-def points_of(
-    tree: NerfTree, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None], region: Region | None = None
-) -> PointCloud:
-    """Points on the tree's surface, clipped to a region, in the capture's frame.
-
-    Raises StageFailed where there is none, UsageError where there is none at a density that was stated; `progress` takes (done, total, text).
-    """
-    progress = whole_progress(progress, 1 + len(tree.outer))
-    views, fused = asset_views(tree, progress)
-
-    def tick() -> None:
-        progress(1, 1, PARTS[0])
-
-    try:
-        cloud = scene_points(
-            tree,
-            settings.num_points,
-            level_of(tree, resolved(settings.density_threshold), views, tick),
-            min_component=settings.min_component,
-            rounds=settings.smoothing_iterations,
-            seed=settings.seed,
-            viewpoints=orbit_points(tree.metadata),
-            shown=shown_by(views, float(tree.voxel), tick),
-            views=fused if resolved(settings.density_threshold) is None else (),
-            region=region,
-            progress=progress,
-        )
-    except NoSurface as error:
-        failure = StageFailed if settings.density_threshold == "auto" else UsageError
-        raise failure(f"points: {error}. {remedy('points', resolved(settings.density_threshold))}") from error
-    back = frame.world_from_capture.inverse()
-    return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
+def points_of(mesh: Mesh, tree: NerfTree, settings: PointsSettings, frame: SourceFrame) -> PointCloud:
+    """Points on a tree's mesh, in the capture's frame; of the tree the grids alone count. Raises StageFailed where the mesh has no faces."""
+    if not len(mesh.faces):
+        raise StageFailed("points: the mesh has no faces. The asset is nearly empty: train longer, or set mesh.density_threshold by hand.")
+    sizes = face_sizes(tree, frame.world_from_capture.points(mesh.vertices), mesh.faces)
+    return sampled(mesh, settings.num_points, settings.seed, sizes)
 
 
-@compiling_kernels
 def run(job: Job) -> None:
-    whole = load(inputs_of(PointsInputs, job.inputs).bake.asset)
-    tree = restricted(whole, job.settings.region)
+    inputs = inputs_of(PointsInputs, job.inputs)
+    remedy = f"Lower points.num_points ({job.settings.num_points}) or mesh.max_faces."
+    refuse_what_does_not_fit(job, needed(job.settings.num_points, mesh_bytes(inputs.mesh)), remedy)
+    tree = outline(inputs.bake.asset)
     frame = source_frame(tree.metadata)
-    remedy = f"Lower points.num_points ({job.settings.num_points}), bake.max_mib or bake.resolution."
-    refuse_what_does_not_fit(job, surface_needed(tree, job.settings.num_points), remedy)
-    cloud = points_of(tree, job.settings, frame, job.reached, whole.region if job.settings.region == "foreground" else None)
+    mesh = read_mesh(inputs.mesh)
+    job.safe_point()
+    cloud = points_of(mesh, tree, job.settings, frame)
     job.safe_point()
     path = PointsOutputs(job.out).ply
     POINT_EXPORTERS[path.suffix](cloud, path, frame)

@@ -18,13 +18,15 @@ from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Texture
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.run import Run
-from pipeline.stage import settings_dict
-from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
+from pipeline.stage import Job, settings_dict
+from stages.artifacts import BakeOutputs, MeshOutputs, PointsOutputs, PosesOutputs
 from stages.formats.exporters import MESH_EXPORTERS
+from stages.formats.exporters.ply import VERTEX
 from stages.formats.exporters.writing import source_frame
 from stages.framing.true_frame import AS_CAPTURED, Ground, TrueFrame, save_frame
 from stages.mesh.files import read_mesh, read_vertices
 from stages.mesh.settings import MeshSettings
+from stages.points import run as points
 from stages.points.settings import PointsSettings
 from tests.stages.io.meshes import accessor, block, glb_document
 from workflows import exporting
@@ -108,6 +110,24 @@ def test_a_texture_may_be_left_out_of_it(run: Path) -> None:
     assert b"COLOR_0" in (run.parent / "mesh.glb").read_bytes()
     (shape,) = export(run, "mesh.stl", chosen=settings(texture="asset", texture_size=512))
     assert shape["faces"] == 12, "a texture that no file shows is not asked for"
+
+
+def test_points_are_those_of_the_stage_on_its_mesh(run: Path, tmp_path: Path) -> None:
+    """In its frame, or in the one that was found since; settings of the mesh count."""
+    inputs = {"bake": BakeOutputs.of_run(run).folder, "mesh": MeshOutputs.of_run(run).folder}
+    points.run(Job(settings=PointsSettings(), inputs=inputs, out=tmp_path / "points", work=tmp_path / "work"))
+    stage = PointsOutputs(tmp_path / "points").ply.read_bytes()
+    assert export(run, "a.ply", "a.xyz", as_points=True)[0]["points"] == PointsSettings.num_points
+    assert (run.parent / "a.ply").read_bytes() == stage
+    with pytest.raises(pytest.fail.Exception, match=r"made again, with .*max_faces=200000"):
+        export(run, "b.ply", as_points=True, chosen=settings(max_faces=400))
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    save_frame(TrueFrame(Similarity(3.0, np.eye(3), np.zeros(3)), 0.01, ()), run)
+    export(run, "c.ply", as_points=True)
+    before, after = (np.frombuffer(data.split(b"end_header\n", 1)[1], VERTEX) for data in (stage, (run.parent / "c.ply").read_bytes()))
+    for name in "xyz":
+        np.testing.assert_allclose(after[name], 3 * before[name], rtol=1e-5)
 
 
 @pytest.mark.parametrize(

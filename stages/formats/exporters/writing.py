@@ -82,7 +82,7 @@ def _check_texture(mesh: Mesh, path: Path) -> None:
 def check_points(points: PointCloud, path: Path) -> None:
     """Raise BadInput for a cloud that would make a broken file: empty, or with numbers that are not finite."""
     if not len(points.positions):
-        raise BadInput(f"{path}: the point cloud is empty. Lower the threshold (`--set points.density_threshold=...`) or train longer.")
+        raise BadInput(f"{path}: the point cloud is empty. Lower the threshold (`--set mesh.density_threshold=...`) or train longer.")
     _check_finite({"positions": points.positions, "normals": points.normals, "colours": points.colours}, path)
 
 

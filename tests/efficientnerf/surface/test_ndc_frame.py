@@ -7,9 +7,10 @@ import pytest
 
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.surface.extraction import points, surface
+from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.isosurface import NoSurface
-from efficientnerf.surface.mesh import topology
+from efficientnerf.surface.mesh import sampled, topology
+from efficientnerf.surface.nested import face_sizes
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.walls import DEPTH, NEAR, wall
 
@@ -62,15 +63,19 @@ def test_colours_are_those_that_the_cameras_saw() -> None:
     np.testing.assert_allclose(mesh.colours[middle], seen.colour / seen.opacity[:, None], atol=0.03)
 
 
-def test_points_lie_on_the_mesh_and_face_the_same_way() -> None:
+def test_points_lie_on_the_wall_and_are_as_dense_in_images_at_any_depth() -> None:
     tree = marched()
     level = 3.0 / tree.voxel
-    cloud = points(volume_of(tree), 5000, level, rounds=0)
+    mesh = surface(volume_of(tree), level, rounds=0)
+    cloud = sampled(mesh, 20_000, 0, face_sizes(tree, mesh.vertices, mesh.faces))
     at, normal = local(tree, cloud.positions), local(tree, cloud.normals + tree.ndc.world_from_camera[:3, 3])  # type: ignore[union-attr]
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-6)
     front = (np.abs(at[:, :2]) < 2.0).all(1) & (normal[:, 2] < -0.8)
-    assert front.sum() > 200
     assert np.median(np.abs(at[front, 2] - level_depth(tree, level, at[front, 0]))) < 0.05
+    image = at[normal[:, 2] < -0.5, :2] / at[normal[:, 2] < -0.5, 2:]
+    counts = np.histogram(image[np.abs(image[:, 1]) < 0.2, 0], 4, (-0.3, 0.3))[0]
+    assert counts.min() > 200
+    assert np.ptp(counts) < 0.15 * counts.mean()
 
 
 def test_the_backdrop_is_left_out() -> None:

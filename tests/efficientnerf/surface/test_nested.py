@@ -5,9 +5,9 @@ import pytest
 
 from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
-from efficientnerf.surface.extraction import points, surface
-from efficientnerf.surface.mesh import Mesh, PointCloud
-from efficientnerf.surface.nested import scene_points, scene_surface
+from efficientnerf.surface.extraction import surface
+from efficientnerf.surface.mesh import Mesh, face_areas, sampled
+from efficientnerf.surface.nested import face_sizes, scene_surface
 from efficientnerf.surface.volume import volume_of
 
 NO_VIEWPOINTS = np.zeros((0, 3))
@@ -39,17 +39,13 @@ def mesh_of(tree: NerfTree, threshold: float | None = None, faces: int = 20_000)
     return scene_surface(tree, threshold, faces=faces, min_component=0.01, rounds=2, viewpoints=NO_VIEWPOINTS, progress=silent)
 
 
-def points_of(tree: NerfTree, count: int = 4000) -> PointCloud:
-    return scene_points(tree, count, None, min_component=0.01, rounds=2, viewpoints=NO_VIEWPOINTS, seed=0, progress=silent)
-
-
 def test_of_one_grid_it_is_the_surface_as_before() -> None:
     tree = balls(((0, 0, 0), 0.5), count=1)
     ours, before = mesh_of(tree), surface(volume_of(tree), None, faces=20_000, min_component=0.01, rounds=2)
     assert np.array_equal(ours.vertices, before.vertices)
     assert np.array_equal(ours.faces, before.faces)
     assert ours.facts == before.facts
-    assert np.array_equal(points_of(tree, 50).positions, points(volume_of(tree), 50, min_component=0.01, rounds=2).positions)
+    np.testing.assert_allclose(face_sizes(tree, ours.vertices, ours.faces), face_areas(ours.vertices, ours.faces) / VOXEL**2)
 
 
 @pytest.mark.parametrize("threshold", [None, 25.0])
@@ -83,14 +79,15 @@ def test_a_ball_across_the_border_of_two_grids_is_whole_but_for_a_crack() -> Non
     assert distance[~crack].max() < 2.5 * VOXEL
 
 
-def test_points_number_as_asked_and_thin_out_outwards() -> None:
+def test_points_thin_out_outwards() -> None:
+    """As many to a voxel's face: of a ball in the inmost grid, and of one among voxels of four times the side."""
     tree = balls(((0, 0, 0), 0.5), ((0, 2.3, 0), 0.6))
-    cloud = points_of(tree, 3001)
-    assert cloud.positions.shape == cloud.normals.shape == cloud.colours.shape == (3001, 3)
-    near = np.linalg.norm(cloud.positions, axis=1) < 1
-    per_area = near.mean() / 0.5**2, (~near).mean() / 0.6**2
-    assert 10 < per_area[0] / per_area[1] < 28  # voxels of four times the side: 16, and the coarse ball is smaller than it should be
-    assert np.array_equal(cloud.positions, points_of(tree, 3001).positions)
+    mesh = mesh_of(tree)
+    near = np.linalg.norm(mesh.vertices[mesh.faces].mean(axis=1), axis=1) < 1
+    areas, sizes = face_areas(mesh.vertices, mesh.faces), face_sizes(tree, mesh.vertices, mesh.faces)
+    assert sizes[near].sum() / areas[near].sum() == pytest.approx(16 * sizes[~near].sum() / areas[~near].sum())
+    cloud = sampled(mesh, 3001, 0, sizes)
+    assert (np.linalg.norm(cloud.positions, axis=1) < 1).mean() == pytest.approx(sizes[near].sum() / sizes.sum(), abs=1e-3)
 
 
 def test_nothing_is_found_twice_where_grids_overlap() -> None:

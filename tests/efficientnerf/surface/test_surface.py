@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from efficientnerf.surface.extraction import points, surface
+from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.isosurface import automatic_threshold, enclosed_cells, isosurface
 from efficientnerf.surface.mesh import (
     Mesh,
+    Texture,
     decimate,
     face_areas,
     face_vectors,
     face_volumes,
+    sampled,
     separate,
     topology,
 )
@@ -154,18 +156,48 @@ def test_the_automatic_threshold_draws_what_is_opaque(softness: float) -> None:
         assert np.median(np.linalg.norm(vertices, axis=1)) == pytest.approx(radius, abs=ball.voxel)
 
 
-def test_points_are_spread_evenly_and_repeatably() -> None:
-    ball = Balls(((0, 0, 0), 0.6))
-    cloud = points(ball, 20_000, LEVEL)
-    again = points(ball, 20_000, LEVEL)
-    np.testing.assert_array_equal(cloud.positions, again.positions)
-    np.testing.assert_array_equal(cloud.colours, again.colours)
-    np.testing.assert_allclose(np.linalg.norm(cloud.positions, axis=1), 0.6, atol=0.01)
+def test_points_are_spread_evenly_over_a_mesh_and_repeatably() -> None:
+    """However large the faces are: those of one half are a quarter as large."""
+    ball = trimesh.creation.icosphere(4, radius=0.6)
+    fine = ball.subdivide(face_index=np.flatnonzero(ball.triangles_center[:, 0] > 0))
+    fine.vertices *= 0.6 / np.linalg.norm(fine.vertices, axis=1, keepdims=True)
+    vertices, faces = np.asarray(fine.vertices), np.asarray(fine.faces)
+    mesh = Mesh(vertices, faces, vertices / 0.6, (vertices / 1.2 + 0.5).astype(np.float32))
+    cloud, again, other = sampled(mesh, 20_000, 0), sampled(mesh, 20_000, 0), sampled(mesh, 20_000, 1)
+    for name in ("positions", "normals", "colours"):
+        np.testing.assert_array_equal(getattr(cloud, name), getattr(again, name))
+    assert (cloud.positions != other.positions).any(axis=1).all()
+    np.testing.assert_allclose(np.linalg.norm(cloud.positions, axis=1), 0.6, atol=0.002)
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-9)
+    assert ((cloud.normals * cloud.positions).sum(axis=1) > 0.599).mean() > 0.99
+    np.testing.assert_allclose(cloud.colours, cloud.positions / 1.2 + 0.5, atol=1e-6)  # of vertices: linear over a face
     # Archimedes: on a sphere every coordinate is uniform.
     for axis in range(3):
         share = np.histogram(cloud.positions[:, axis], 10, (-0.6, 0.6))[0] / 20_000
-        assert np.abs(share - 0.1).max() < 0.012
+        assert np.abs(share - 0.1).max() < 0.008
+
+
+def test_points_are_as_many_as_stated_sizes_say() -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 0], [9, 5, 0], [5, 9, 0]])
+    mesh = Mesh(corners, np.arange(6).reshape(2, 3), np.tile([0.0, 0, 1], (6, 1)), np.zeros((6, 3), np.float32))
+    for sizes, near in ((None, 1 / 17), (np.array([3.0, 1.0]), 3 / 4), (np.array([0.0, 0.0]), 0)):
+        assert (sampled(mesh, 3400, 0, sizes).positions[:, 0] < 2).mean() == pytest.approx(near, abs=1 / 3400)
+
+
+def test_points_have_the_colours_of_the_texture() -> None:
+    """Which runs from black on the left to red on the right."""
+    picture = np.zeros((4, 256, 3), np.uint8)
+    picture[..., 0] = np.arange(256)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    mesh = Mesh(corners, np.array([[0, 1, 2]]), np.tile([0.0, 0, 1], (3, 1)), np.ones((3, 3), np.float32), texture=Texture(corners[None, :, :2], picture))
+    cloud = sampled(mesh, 500, 0)
+    np.testing.assert_allclose(cloud.colours, cloud.positions * [1, 0, 0], atol=0.005)
+
+
+def test_points_have_unit_normals_where_those_of_the_corners_cancel() -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    mesh = Mesh(corners, np.array([[0, 1, 2]]), np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, 1]]), np.zeros((3, 3), np.float32))
+    assert (np.linalg.norm(sampled(mesh, 500, 0).normals, axis=1) == 1).all()
 
 
 def _shape(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -128,7 +128,7 @@ def test_times_are_read(text: str, seconds: float) -> None:
             seconds_of(other)
 
 
-@pytest.mark.parametrize("text", ["turntable.background=pink", "turntable.background=#12345", "mesh.density_threshold=0", "points.density_threshold=-3.5"])
+@pytest.mark.parametrize("text", ["turntable.background=pink", "turntable.background=#12345", "mesh.density_threshold=0", "mesh.density_threshold=-3.5"])
 def test_values_that_no_stage_can_work_with_are_refused_when_they_are_given(text: str) -> None:
     settings = Settings({stage.name: stage.settings for stage in STAGES})
     with pytest.raises(UsageError, match=re.escape(text.partition("=")[0])):
