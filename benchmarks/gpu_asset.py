@@ -113,7 +113,7 @@ def waits_of(state: RefinementState, targets: Targets, device: str, options: dic
 def test_view_psnr(m: Model, trees: list[NerfTree], camera: Camera, device: str) -> dict[str, float]:
     rgba = ball([camera]).images.reshape(camera.height, camera.width, 4) / 255
     truth = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
-    renders = {"network": FieldRenderer(m, 1.5, 4.5).render(camera).colour}
+    renders = {"network": FieldRenderer(m, 1.5, 4.5).colour(camera)}
     for name, tree in zip(("baked", "refined"), trees, strict=True):
         renders[name] = render(tree.to(device), camera, background=WHITE).colour
     return {name: decibels(float(((colour - truth) ** 2).mean())) for name, colour in renders.items()}

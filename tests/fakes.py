@@ -137,6 +137,9 @@ class BallField:
     noise: float = 0.0
     calls: list[tuple[str, int, int]] = field(default_factory=list)
 
+    def colour(self, camera: Camera, progress: Any = None) -> np.ndarray:
+        return self.render(camera, progress).colour
+
     def render(
         self,
         camera: Camera,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -78,6 +78,12 @@ class FieldRenderer:
     far: float
 
     @torch.no_grad()
+    def colour(self, camera: Camera, progress: Callable[..., Any] | None = None) -> np.ndarray:
+        """(H, W, 3) the colour of `render` alone, in less time."""
+        parts = [outputs.fine_colour.cpu().numpy() for *_, outputs in self._blocks(camera, progress)]
+        return np.concatenate(parts).reshape(camera.height, camera.width, 3)
+
+    @torch.no_grad()
     def render(
         self,
         camera: Camera,
@@ -94,8 +100,25 @@ class FieldRenderer:
         limits  for `nearer`: from where the light is half gone (infinity: nowhere) on rays to where on them to look; distances of the world
         """
         m = self.model
-        count = camera.width * camera.height
         parts, counts = [], SampleCounts()
+        for origins, directions, slant, beyond, outputs in self._blocks(camera, progress):
+            intervals = outputs.coarse.tried if m.space.contracted else len(origins) * (self.far - self.near) / m.step
+            counts += SampleCounts(len(origins), intervals, valid_count(m, outputs), int(outputs.pivotal.sum()), len(outputs.fine.start))
+            split = split_by_box(m, slant, outputs, beyond, box)
+            found = [*split, opacity_within(m, outputs, box if reach is None else reach)]
+            if limits is not None:
+                stated = limits(*(a.double().cpu().numpy() for a in (origins, directions, split[2] / slant)))
+                found.append(opacity_nearer(outputs, torch.as_tensor(stated, dtype=torch.float32, device=m.device)))
+            parts.append([part.cpu().numpy() for part in found])
+        shape = (camera.height, camera.width)
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        colour, opacity, depth, before, behind, inside, within, *nearer = (column.reshape(*shape, *column.shape[1:]) for column in columns)
+        return FieldRendering(colour, opacity, depth, before, behind, inside, counts, within, nearer[0] if nearer else None)
+
+
+    def _blocks(self, camera: Camera, progress: Callable[..., Any] | None) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, RayOutputs]]:
+        """Rays of an image, some at a time: origins, directions, their cosine to the view axis, the colour behind all samples, and what they meet."""
+        m, count = self.model, camera.width * camera.height
         # Without pruning a ray has all samples.
         block = RAYS_PER_BLOCK if m.prunes else min(RAYS_PER_BLOCK, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
         for begin in range(0, count, block):
@@ -105,20 +128,9 @@ class FieldRenderer:
             slant = (directions @ torch.as_tensor(camera.forward, dtype=torch.float32, device=m.device)).clamp(min=1e-3)
             beyond = m.behind(directions)
             outputs = render_rays(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), beyond)
-            intervals = outputs.coarse.tried if m.space.contracted else len(index) * (self.far - self.near) / m.step
-            counts += SampleCounts(len(index), intervals, valid_count(m, outputs), int(outputs.pivotal.sum()), len(outputs.fine.start))
-            split = split_by_box(m, origins, directions, slant, outputs, beyond, box)
-            found = [*split, opacity_within(m, outputs, box if reach is None else reach)]
-            if limits is not None:
-                stated = limits(*(a.double().cpu().numpy() for a in (origins, directions, split[2] / slant)))
-                found.append(opacity_nearer(outputs, torch.as_tensor(stated, dtype=torch.float32, device=m.device)))
-            parts.append([part.cpu().numpy() for part in found])
+            yield origins, directions, slant, beyond, outputs
             if progress is not None:
                 progress(begin + len(index), count)
-        shape = (camera.height, camera.width)
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        colour, opacity, depth, before, behind, inside, within, *nearer = (column.reshape(*shape, *column.shape[1:]) for column in columns)
-        return FieldRendering(colour, opacity, depth, before, behind, inside, counts, within, nearer[0] if nearer else None)
 
 
 def opacity_within(m: Model, outputs: RayOutputs, box: np.ndarray | None) -> Tensor:
@@ -137,15 +149,13 @@ def opacity_nearer(outputs: RayOutputs, limits: Tensor) -> Tensor:
     return torch.zeros_like(limits).index_add(0, ray, outputs.fine_weight * chosen)
 
 
-def split_by_box(
-    m: Model, origins: Tensor, directions: Tensor, slant: Tensor, outputs: RayOutputs, behind: Tensor, box: np.ndarray | None = None
-) -> tuple[Tensor, ...]:
+def split_by_box(m: Model, slant: Tensor, outputs: RayOutputs, behind: Tensor, box: np.ndarray | None = None) -> tuple[Tensor, ...]:
     """Colour, opacity, depth, before, behind and inside_opacity of a FieldRendering for rays (R, ...): each fine sample belongs in front of the box, in it or
     beyond it.
 
     box  (2, 3) in the world, where that is the space's frame; None: that of the space
     """
-    count = len(origins)
+    count = len(slant)
     ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
     middle = outputs.fine.start + outputs.fine.extent / 2
     origins, directions = outputs.rays.origins, outputs.rays.directions
@@ -154,14 +164,16 @@ def split_by_box(
     enter = torch.where(misses, -torch.inf, enter)
     leave = torch.where(misses, -torch.inf, leave)
 
+    def opacity_of(chosen: Tensor) -> Tensor:
+        return outputs.fine_weight.new_zeros(count).index_add(0, ray, outputs.fine_weight * chosen)
+
     def gathered(chosen: Tensor) -> tuple[Tensor, Tensor]:
         weight = outputs.fine_weight * chosen
-        colour = weight.new_zeros(count, 3).index_add(0, ray, weight[:, None] * outputs.fine_rgb)
-        return colour, weight.new_zeros(count).index_add(0, ray, weight)
+        return weight.new_zeros(count, 3).index_add(0, ray, weight[:, None] * outputs.fine_rgb), opacity_of(chosen)
 
     in_front, beyond = middle < enter[ray], middle > leave[ray]
     before, before_opacity = gathered(in_front)
-    _, inside_opacity = gathered(~in_front & ~beyond)
+    inside_opacity = opacity_of(~in_front & ~beyond)
     after, after_opacity = gathered(beyond)
     reaching_box = (1 - before_opacity).clamp(min=0)
     passing_box = (reaching_box - inside_opacity).clamp(min=0)

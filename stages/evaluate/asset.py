@@ -50,15 +50,19 @@ def evaluated(tree: NerfTree) -> EvaluatedAsset:
     return EvaluatedAsset(whole, limits, nearer, inner=partial(render, cascade_tree(tree, 0)), box=bounds[0], reach=bounds[-1], behind=behind)
 
 
+def is_over_field(asset: EvaluatedAsset, scene: Scene) -> bool:
+    """Whether the field shows what surrounds the asset: in an unbounded scene of which it has its box alone."""
+    return constant_background(scene) is None and asset.inner is None
+
+
 def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The asset's image of a view (H, W, 3), and the opacity and the depth of its voxels (H, W).
 
     seen    the field's rendering on every stride-th pixel: the surroundings of an asset that shows none in an unbounded scene; else it is not used
     """
-    background = constant_background(scene)
-    if background is None and asset.inner is None:
+    if is_over_field(asset, scene):
         return over_field(asset.render, view, seen, stride)
-    output = asset.render(view.camera, background=background or asset.behind, normals=False)
+    output = asset.render(view.camera, background=constant_background(scene) or asset.behind, normals=False)
     return output.colour, output.opacity, output.depth
 
 

@@ -29,7 +29,7 @@ from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
-from stages.evaluate.asset import EvaluatedAsset, over_field, render_asset
+from stages.evaluate.asset import EvaluatedAsset, is_over_field, over_field, render_asset
 from stages.evaluate.lpips_weights import find_weights
 from stages.evaluate.mesh import EvaluatedMesh, mesh_image, mesh_metrics
 from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
@@ -67,7 +67,7 @@ def evaluate_view(
     metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
     images: list[np.ndarray] = []
     seen = None
-    if field is not None and (with_field or (unbounded and asset.inner is None)):
+    if field is not None and (with_field or is_over_field(asset, scene)):
         small_camera = subsample_camera(view.camera, stride)
         limits = asset.limits if with_field else None
         seen = field.render(small_camera, progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach, limits=limits)
@@ -77,7 +77,7 @@ def evaluate_view(
     size = {"width": view.camera.width, "height": view.camera.height}
     inside = upsample(seen.inside_opacity, stride, **size) >= 0.5 if unbounded and seen is not None else truth.inside
     metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(perceptual or {}, image, truth)}
-    if unbounded and asset.inner is None:
+    if is_over_field(asset, scene):
         metrics["asset"]["background_scale"] = 1.0 / stride
     drawn, plain, covered, depth = mesh_image(mesh, asset, scene, view, seen, stride)
     metrics["mesh"] = mesh_metrics(shown(drawn, "the mesh"), shown(plain, "the mesh"), covered, depth, image, truth, view.camera)

@@ -12,12 +12,12 @@ from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
 from stages.bake.refine.refinement import usual_steps
 from stages.bake.settings import BakeSettings
 from stages.evaluate import sparse_points
-from stages.evaluate.asset import EvaluatedAsset, render_asset
+from stages.evaluate.asset import EvaluatedAsset, is_over_field, render_asset
 from stages.evaluate.comparison import as_shown, compare, counting, trivial
 from stages.evaluate.sparse_points import ReliablePoints
 from stages.evaluate.summary import means
 from stages.evaluate.trivial import equivalent_blur
-from stages.evaluate.views import constant_background, evenly_spaced, ground_truth
+from stages.evaluate.views import evenly_spaced, ground_truth
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, views_of
 from stages.reports import BakeReport, CameraVerdict, read_report
@@ -34,7 +34,7 @@ def training_figures(asset: EvaluatedAsset, scene: Scene, job: Job, taken: Taken
     taken  `stages.train.averaged.as_taken`
     """
     views = views_of(scene, "train")
-    if constant_background(scene) is None and asset.inner is None:
+    if is_over_field(asset, scene):
         return None
     figures, blurs = [], []
     for k in evenly_spaced(len(views), TRAINING_VIEWS):

@@ -23,7 +23,7 @@ from efficientnerf.surface.mesh import Mesh, moved
 from efficientnerf.surface.roughness import roughness
 from efficientnerf.surface.shading import ColouredImage, Shader
 from stages.artifacts import MeshOutputs
-from stages.evaluate.asset import EvaluatedAsset, RenderTree
+from stages.evaluate.asset import EvaluatedAsset, RenderTree, is_over_field
 from stages.evaluate.views import GroundTruth, constant_background, upsample
 from stages.formats.exporters.writing import source_frame
 from stages.io.scene import Scene, View
@@ -71,9 +71,8 @@ def mesh_image(
     seen  the field's rendering on every stride-th pixel, where the asset is composited with it; else it is not used
     """
     textured, plain = mesh.shader.images(view.camera)
-    background = constant_background(scene)
-    over_field = background is None and asset.inner is None
-    behind = None if over_field else background or asset.behind
+    over_field = is_over_field(asset, scene)
+    behind = None if over_field else constant_background(scene) or asset.behind
     around = None if mesh.surroundings is None else mesh.surroundings(view.camera, background=behind, normals=False)
     size = (view.camera.height, view.camera.width, 3)
     rest = np.broadcast_to(np.asarray(behind or (0.0, 0.0, 0.0), np.float32), size) if around is None else around.colour

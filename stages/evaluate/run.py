@@ -34,7 +34,7 @@ from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of
 from stages.compiling import compiling_kernels
-from stages.evaluate.asset import EvaluatedAsset, evaluated
+from stages.evaluate.asset import EvaluatedAsset, evaluated, is_over_field
 from stages.evaluate.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view, load_lpips
 from stages.evaluate.judging import judge, refinement_of, training_figures
 from stages.evaluate.memory import needed
@@ -98,7 +98,7 @@ def evaluate(
     load_field, warn = cache(load_field), once(job.warn)
     drawn = evenly_spaced(len(views), None if settings.field_views == "all" else settings.field_views)
     stride = _field_stride([views[k] for k in drawn], resolved(settings.field_image_scale))
-    surrounded = constant_background(scene) is not None or asset.inner is not None
+    surrounded = not is_over_field(asset, scene)
     rest = None if surrounded else stride_for([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
     composited = surrounded and constant_background(scene) is None
     perceptual = {f"lpips_{network}": load_lpips(network, resolved(settings.lpips_weights)) for network in networks_of(settings)}

@@ -16,7 +16,7 @@ import numpy as np
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs, PosesOutputs
-from stages.evaluate.asset import EvaluatedAsset, render_asset
+from stages.evaluate.asset import EvaluatedAsset, is_over_field, render_asset
 from stages.evaluate.comparison import as_shown, compare
 from stages.evaluate.mesh import EvaluatedMesh, mesh_image
 from stages.evaluate.summary import quality
@@ -70,10 +70,11 @@ def _write_strip(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, field: FieldRenderer, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
 ) -> dict[str, Any]:
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
-    seen = field.render(subsample_camera(view.camera, stride), progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach)
-    truth = truth.subsampled(stride)
-    shown = partial(as_shown, job, view, taken)
-    network = shown(seen.colour, "the field", stride)
+    small, shown = subsample_camera(view.camera, stride), partial(as_shown, job, view, taken)
+    truth, seen, tick = truth.subsampled(stride), None, lambda *_: job.safe_point()
+    if is_over_field(asset, scene):
+        seen = field.render(small, progress=tick, box=asset.box, reach=asset.reach)
+    network = shown(field.colour(small, tick) if seen is None else seen.colour, "the field", stride)
     image = subsample(shown(render_asset(asset, scene, view, seen, stride)[0], "the asset"), stride)
     drawn = subsample(shown(mesh_image(mesh, asset, scene, view, seen, stride)[0], "the mesh"), stride)
     renders = {"network": network, "asset": image, "mesh": drawn}

@@ -111,7 +111,7 @@ def trained(job: Job) -> bool:
 
 def colours_seen(renderer: FieldRenderer, camera: Camera) -> np.ndarray:
     """Colours (H, W, 3) that a camera sees."""
-    return renderer.render(camera).colour
+    return renderer.colour(camera)
 
 
 def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> SparseDepthRays | None:

@@ -121,7 +121,7 @@ def _train(
     exposure = begin_exposure(folder, s, own, small.exposure, job.device)
     for done in loop.train(loop.trainer(m, exposure, cameras=cameras), own, depth):
         job.reached(done.step, small.iterations, f"second chance, {name}")
-    return judge(held, lambda camera: FieldRenderer(m, near, far).render(camera).colour, small.iterations)
+    return judge(held, lambda camera: FieldRenderer(m, near, far).colour(camera), small.iterations)
 
 
 def _small(settings: TrainSettings) -> TrainSettings:

@@ -121,7 +121,7 @@ def draw_wrong_views(path: Path, t: Trainer, views: tuple[View, ...], folder: Pa
     for n in np.flatnonzero(c.left_out | c.replaced)[:ROWS]:
         stride = max(1, math.ceil(max(views[n].camera.width, views[n].camera.height) / SIDE))
         cameras = [c.given[n], *([replace(c.given[n], world_from_camera=c.pose[n])] if c.replaced[n] else [])]
-        renders = [np.clip(renderer.render(subsample_camera(camera, stride)).colour, 0, 1) for camera in cameras]
+        renders = [np.clip(renderer.colour(subsample_camera(camera, stride)), 0, 1) for camera in cameras]
         rows.append(np.concatenate([ground_truth(folder, views[n], t.model.background, stride).colour, *renders], axis=1))
     height, width = sum(len(row) for row in rows), max(row.shape[1] for row in rows)
     sheet, top = np.ones((height, width, 3)), 0

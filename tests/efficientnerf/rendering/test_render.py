@@ -109,7 +109,7 @@ def test_a_fields_picture_is_what_lies_before_in_and_behind_the_box(contracted: 
     m.fine.table.data.mul_(3e3)
     camera = Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
     seen = FieldRenderer(m, 0.5, 30.0).render(camera)
-    assert np.array_equal(seen.colour, FieldRenderer(m, 0.5, 30.0).render(camera).colour)  # no noise
+    assert np.array_equal(seen.colour, FieldRenderer(m, 0.5, 30.0).colour(camera))  # no noise
     assert seen.inside_opacity.mean() > 0.01
     assert seen.inside_opacity.max() <= 1
     if not contracted:

@@ -52,6 +52,10 @@ class ReferenceField:
         self.calls: list[str] = []
         self.boxes: list[tuple[Any, Any]] = []
 
+    def colour(self, camera: Camera, progress: Any = None) -> np.ndarray:
+        self.calls.append(camera.name)
+        return reference_image(self.tree, camera).colour
+
     def render(self, camera: Camera, progress: Any = None, *, box: Any = None, reach: Any = None, limits: Any = None) -> FieldRendering:
         tree, size = self.tree, (camera.height, camera.width)
         bounds = [cascade.bounds(tree.brick) for cascade in cascades_of(tree)]
