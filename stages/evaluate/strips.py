@@ -17,7 +17,7 @@ from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs, PosesOutputs
 from stages.evaluate.asset import EvaluatedAsset, is_over_field, render_asset
-from stages.evaluate.comparison import as_shown, compare
+from stages.evaluate.comparison import as_shown
 from stages.evaluate.mesh import EvaluatedMesh, mesh_image
 from stages.evaluate.summary import quality
 from stages.evaluate.views import ground_truth, stride_for, subsample, subsample_camera
@@ -78,7 +78,7 @@ def _write_strip(
     image = subsample(shown(render_asset(asset, scene, view, seen, stride)[0], "the asset"), stride)
     drawn = subsample(shown(mesh_image(mesh, asset, scene, view, seen, stride)[0], "the mesh"), stride)
     renders = {"network": network, "asset": image, "mesh": drawn}
-    found = {name: {key: compare(picture, truth, None)[key] for key in FIGURES} for name, picture in renders.items()}
+    found = {name: {"psnr": truth.psnr(picture), "ssim": truth.ssim(picture)} for name, picture in renders.items()}
     pictures: list[np.ndarray | None] = [truth.colour, *renders.values()]
     labels = [f"photograph {view.name}", *(f"{name} {quality(found[name])}" for name in renders)]
     contact_sheet([pictures], [labels], path, thumbnail=max(image.shape[:2]))
