@@ -115,7 +115,6 @@ class FieldRenderer:
         colour, opacity, depth, before, behind, inside, within, *nearer = (column.reshape(*shape, *column.shape[1:]) for column in columns)
         return FieldRendering(colour, opacity, depth, before, behind, inside, counts, within, nearer[0] if nearer else None)
 
-
     def _blocks(self, camera: Camera, progress: Callable[..., Any] | None) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, RayOutputs]]:
         """Rays of an image, some at a time: origins, directions, their cosine to the view axis, the colour behind all samples, and what they meet."""
         m, count = self.model, camera.width * camera.height
