@@ -229,6 +229,7 @@ def bundle_adjust(
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()  # of which one alone makes the mean error infinite
     model.update_point_3d_errors()
 
 

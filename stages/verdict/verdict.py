@@ -272,7 +272,8 @@ def _of_geometry(capture: Capture, seen: Parallax | None, counts: np.ndarray | N
         found.append(Problem("disagreement", "usable", sentence, "Look at cameras.png. Use one lens at one zoom, and photographs as they were taken."))
     if seen is not None and seen.small:
         sentence = f"The photographs were taken from almost one place (parallax {seen.angle:.1f} degrees): depth will be poor."
-        found.append(Problem("parallax", "poor" if seen.angle < 2.0 else "usable", sentence, "Move sideways between photographs, not only turn."))
+        wrong = agreeing is not None and agreeing < DOUBTFUL  # so little parallax fits most matches, even with wrong cameras
+        found.append(Problem("parallax", "poor" if wrong or seen.angle < 2.0 else "usable", sentence, "Move sideways between photographs, not only turn."))
     if capture.reprojection_error is not None and capture.photos:
         longest = float(np.median([max(photo.camera.width, photo.camera.height) for photo in capture.photos]))
         if capture.reprojection_error > LARGE_ERROR * max(1.0, longest / LONGEST):

@@ -134,6 +134,13 @@ def test_each_problem_has_its_grade_and_remedy(changes: dict[str, object], what:
     assert found.problems[0].remedy
 
 
+def test_matches_that_disagree_with_cameras_of_little_parallax_are_worse_than_either() -> None:
+    doubtful = Provenance(pairs_agreeing=0.85)
+    assert verdict_on(capture(radius=0.22), sharp(NAMES)).grade == "usable"
+    assert verdict_on(capture(provenance=doubtful), sharp(NAMES)).grade == "usable"
+    assert verdict_on(capture(radius=0.22, provenance=doubtful), sharp(NAMES)).grade == "poor"
+
+
 @pytest.mark.parametrize(
     ("change", "what"),
     [
