@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from efficientnerf.capture.adjustment import shape_spread
 from efficientnerf.capture.markers import SURE, common_ratio
 from efficientnerf.capture.supports import level_plane
 from efficientnerf.capture.triangulation import Place, length_between, triangulated
@@ -24,10 +25,12 @@ from pipeline.text import printable
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.writing import SourceFrame
+from stages.framing.markers import at_full_size
 from stages.framing.true_frame import AS_CAPTURED, Ground, KnownLength, TrueFrame, load_frame
 from stages.framing.upward import THE_CAMERAS
 from stages.io import scene
 from stages.mesh.files import read_vertices
+from stages.poses.settings import PosesSettings
 from stages.reports import poses_report
 from workflows.cli.resolve import nearest
 from workflows.cli.target import is_run, open_run
@@ -55,6 +58,7 @@ class Measured:
     true   the frame in which places are given: that of exports
     error  of the scale, as a share (99 %); None: not known
     own_up  (3,) unit, in the capture's frame, as the run found it
+    shape  how sure lengths are by the cameras, whatever their scale: their standard deviation, as a share
     grain  the standard deviation of a place X,Y,Z that someone picked, in the capture's unit: half a voxel
     """
 
@@ -63,6 +67,7 @@ class Measured:
     metric: bool
     error: float | None
     own_up: np.ndarray
+    shape: float
     grain: float
 
     @property
@@ -123,7 +128,7 @@ class Measured:
     def length(self, a: Place, b: Place) -> tuple[float, float]:
         """The length between two places in the frame of exports, and its error (99 %)."""
         length, spread = length_between(a, b)
-        return self.frame.scale * length, self.frame.scale * float(np.hypot(SURE * spread, (self.error or 0.0) * length))
+        return self.frame.scale * length, self.frame.scale * float(np.hypot(SURE * np.hypot(spread, self.shape * length), (self.error or 0.0) * length))
 
 
 def measured(run: Path, *, captured: bool = False) -> Measured:
@@ -136,15 +141,27 @@ def measured(run: Path, *, captured: bool = False) -> Measured:
     found, true = scene.load(poses.folder), (None if captured else load_frame(run)) or AS_CAPTURED
     grain = float(describe_asset(asset)["voxel_side"]) / 2 / found.world_from_capture.scale if asset.is_file() else 0.0  # type: ignore[arg-type]
     cameras = {view.name: view.source_camera for view in found.views}
-    up = SourceFrame(found.world_from_capture).up
-    if true.error is not None:
-        return Measured(cameras, true, True, true.error, up, grain)
-    return Measured(cameras, true, found.metric, poses_report(poses.folder).facts.markers.error if found.metric else None, up, grain)
+    report, up = poses_report(poses.folder), SourceFrame(found.world_from_capture).up
+    given = open_run(run).settings.get("poses", {})
+    shape = _shape_spread(poses.folder, found, report.reprojection_error, given.get("feature_image_size", PosesSettings().feature_image_size))
+    metric, error = (True, true.error) if true.error is not None else (found.metric, report.facts.markers.error if found.metric else None)
+    return Measured(cameras, true, metric, error, up, shape, grain)
+
+
+def _shape_spread(poses: Path, found: scene.Scene, reprojection_error: float | None, feature_size: int) -> float:
+    """By the covariance of bundle adjustment, of the sparse points in the scene's bounds; 0 where nothing is known of it."""
+    if not found.points or not reprojection_error:
+        return 0.0
+    (world, counts, observers), cameras = scene.read_observations(poses), [view.source_camera for view in found.views]
+    inside = ((world >= found.bounds[0]) & (world <= found.bounds[1])).all(axis=1)
+    miss = at_full_size(reprojection_error, found.kind, cameras, feature_size)
+    spread = shape_spread(cameras, found.world_from_capture.inverse().points(world), counts, observers, miss, inside)
+    return 0.0 if np.isnan(spread) else min(1.0, spread)
 
 
 def sides_of(run: Path) -> dict[str, Any] | None:
     """The upright box of least area round the run's mesh: its longer side, its shorter one and its height, and their errors, of which all is in the units of
-    exports: how far sparse points are from the surface, or half a voxel, and how far cameras see them off; and a photograph's pixel on it. None without a mesh.
+    exports: how far sparse points are from the surface, or half a voxel, and how sure the cameras are; and a photograph's pixel on it. None without a mesh.
     """
     outputs = MeshOutputs.of_run(run)
     vertices, normals = read_vertices(outputs) if outputs.ply.is_file() else (np.zeros((0, 3)),) * 2
@@ -155,10 +172,9 @@ def sides_of(run: Path) -> dict[str, Any] | None:
     longer, shorter = sorted(cv2.minAreaRect((turned[:, [0, 2]] - turned[0, [0, 2]]).astype(np.float32))[1], reverse=True)
     scale = inside.frame.scale
     sides = scale * np.array([longer, shorter, np.ptp(turned[:, 1])])
-    pixel = scale * _pixel(inside, vertices)
-    surface, cameras = scale * _surface_noise(inside, vertices, normals, _points_of(run)), pixel * _reprojection_error(inside, run)
-    errors = np.hypot(SURE * np.sqrt(2) * np.hypot(surface, cameras), (inside.error or 0.0) * sides)
-    facts = {"surface_noise": surface, "camera_noise": cameras, "ground_sample_distance": pixel}
+    surface = scale * _surface_noise(inside, vertices, normals, _points_of(run))
+    errors = np.hypot(SURE * np.hypot(np.sqrt(2) * surface, inside.shape * sides), (inside.error or 0.0) * sides)
+    facts = {"surface_noise": surface, "shape_spread": inside.shape, "ground_sample_distance": scale * _pixel(inside, vertices)}
     return {"unit": inside.unit, "scale_error": inside.error, "sides": sides.tolist(), "errors": errors.tolist(), **facts}
 
 
@@ -170,12 +186,6 @@ def _pixel(inside: Measured, vertices: np.ndarray) -> float:
         if (depth > 0).any():
             sizes.append(float(np.median(depth[depth > 0])) / camera.intrinsics["fx"])
     return float(np.median(sizes)) if sizes else 0.0
-
-
-def _reprojection_error(inside: Measured, run: Path) -> float:
-    """Mean, in pixels of the photographs at full size: that of photographs is stated at the size at which features are found."""
-    poses, longest = open_run(run).settings.get("poses", {}), max((max(each.width, each.height) for each in inside.cameras.values()), default=1)
-    return (poses_report(PosesOutputs.of_run(run).folder).reprojection_error or 0.0) * max(1.0, longest / poses.get("feature_image_size", longest))
 
 
 def _surface_noise(inside: Measured, vertices: np.ndarray, normals: np.ndarray, points: np.ndarray) -> float:

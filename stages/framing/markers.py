@@ -6,15 +6,16 @@ where half of the light between inside and outside is reached, of light that is 
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from efficientnerf.capture.markers import MIN_VIEWS, SquareFit, common_length, common_normal, fit_square
-from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.capture.adjustment import shape_spread
+from efficientnerf.capture.markers import MIN_VIEWS, SURE, SquareFit, common_length, common_normal, fit_square
+from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.rendering.colour import linear_from_srgb
 from pipeline.errors import BadInput
 from pipeline.stage import Job
@@ -31,6 +32,8 @@ DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "A
 WINDOW, NARROWEST, WIDEST = 0.05, 1.5, 8.0  # to both sides of an edge: share of its length, and pixels
 LARGEST_ERROR = 0.03  # of a length: what is less sure is no scale
 TILT = 30.0  # degrees from the upward axis that the cameras suggest, up to which markers are taken to lie on the ground
+TIED = 1.5  # times as sure as their four corners are the nine tie points of a marker taken to be
+LEAST_MISS = 0.2  # px, of tie points: those of one marker agree by what they are made of
 MIN_CONTRAST = 0.02  # of linear light between inside and outside of an edge
 Seen = dict[tuple[str, int], np.ndarray]  # dictionary and number of a marker -> (4, 2) its corners
 Size = tuple[int, int]
@@ -59,8 +62,10 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     if excess > 3 and max(abs(fit.square.scale / length - 1) for fit in still.values()) > LARGEST_ERROR:
         lengths = ", ".join(f"{number}: {fit.square.scale / length * size:.4g} m" for number, fit in sorted(still.items()))
         raise BadInput(f"{job.source}: markers differ in size ({lengths}): they are not all of one size, they moved, or {_ANYWAY}")
+    error = float(np.hypot(error, SURE * _shape_spread(capture, [*still.values()], job.settings.feature_image_size)))
     if error > LARGEST_ERROR:
-        warn(f"markers give lengths within {error:.0%} only, and are not used. Photograph them larger, and from more sides.")
+        remedy = "Photograph them larger, from more sides, and with more of what is round them."
+        warn(f"markers give lengths within {min(error, 1):.0%} only, and are not used. {remedy}")
         return capture
     if moved:
         warn(f"markers {_listed(moved)} moved, or their number was printed twice; they are not used.")
@@ -171,6 +176,27 @@ def _normal(capture: Capture, fits: list[SquareFit]) -> tuple[np.ndarray, float]
     found = common_normal(fits)
     near = estimated_up([photo.camera for photo in capture.photos]) if capture.up is None else capture.up
     return found if found is not None and found[0] @ near > np.cos(np.radians(TILT)) else None
+
+
+def _shape_spread(capture: Capture, fits: list[SquareFit], feature_size: int) -> float:
+    """How sure lengths round the markers and up to the cameras are by these, whatever their scale, as a share; 0 where nothing is known of that."""
+    points, cameras = capture.points, [photo.camera for photo in capture.photos]
+    if points is None or capture.reprojection_error is None:
+        return 0.0
+    if not any(points.tracks):
+        return np.inf
+    middle = np.mean([fit.square.translation for fit in fits], axis=0)
+    near = np.linalg.norm(points.xyz - middle, axis=1) < np.median([np.linalg.norm(camera.centre - middle) for camera in cameras])
+    counts, observers = np.array([len(track) for track in points.tracks], int), np.array([*itertools.chain.from_iterable(points.tracks)], int)
+    miss = max(LEAST_MISS, at_full_size(capture.reprojection_error, capture.kind, cameras, feature_size))
+    spread = shape_spread(cameras, points.xyz, counts, observers, miss, near, and_cameras=True)
+    return 0.0 if np.isnan(spread) else TIED * spread
+
+
+def at_full_size(reprojection_error: float, kind: str, cameras: Sequence[Camera], feature_size: int) -> float:
+    """In pixels of the cameras: that of photographs is stated at the size in which features are found."""
+    longest = max(max(camera.width, camera.height) for camera in cameras)
+    return reprojection_error * (max(1.0, longest / feature_size) if kind == "photographs" else 1.0)
 
 
 def _on_marker(fit: SquareFit, normal: np.ndarray, scale: float) -> Similarity:

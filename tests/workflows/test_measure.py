@@ -133,11 +133,26 @@ def test_how_far_sparse_points_are_from_the_mesh_is_in_its_error(enerf: Enerf, r
     save_points(sparse, poses)
     assert enerf("measure", run, "--json").object == exact  # less than half a voxel says nothing
     save_points(replace(sparse, xyz=SIMILARITY.points(corners + 2 * exact["surface_noise"] * rng.normal(0, 1, corners.shape))), poses)
-    PosesOutputs.of_run(run).report.write_text('{"reprojection_error": 0.5}', encoding="utf-8")
     noisy = enerf("measure", run, "--json").object
     assert noisy["surface_noise"] > exact["surface_noise"]
-    assert noisy["camera_noise"] == pytest.approx(0.5 * noisy["ground_sample_distance"])
-    assert noisy["errors"][0] == pytest.approx(2.58 * 2**0.5 * np.hypot(noisy["surface_noise"], noisy["camera_noise"]))
+    np.testing.assert_allclose(noisy["errors"], 2.58 * 2**0.5 * noisy["surface_noise"])
+
+
+def test_how_sure_the_cameras_are_is_in_all_errors(enerf: Enerf, run: Path) -> None:
+    outputs, poses, rng = MeshOutputs.of_run(run), PosesOutputs.of_run(run).folder, np.random.default_rng(0)
+    outputs.folder.mkdir()
+    MESH_EXPORTERS[".ply"](block(), outputs.ply, Z_UP)
+    points = rng.uniform(-0.5, 0.5, (40, 3))
+    save(replace(load(poses), points=True), poses)
+    save_points(SparsePoints(SIMILARITY.points(points), np.zeros(points.shape, np.uint8), np.zeros(40), (tuple(range(len(cameras()))),) * 40), poses)
+    leg = ("measure", run, by_numbers(A), by_numbers(B), "--json")
+    exact, exact_leg = enerf("measure", run, "--json").object, enerf(*leg).object["lengths"][0]
+    PosesOutputs.of_run(run).report.write_text('{"reprojection_error": 2.0}', encoding="utf-8")
+    found, found_leg = enerf("measure", run, "--json").object, enerf(*leg).object["lengths"][0]
+    assert exact["shape_spread"] == 0
+    assert 1e-4 < found["shape_spread"] < 1e-2
+    np.testing.assert_allclose(found["errors"], np.hypot(exact["errors"], 2.58 * found["shape_spread"] * np.array(found["sides"])))
+    assert found_leg["error"] == pytest.approx(np.hypot(exact_leg["error"], 2.58 * found["shape_spread"] * LENGTH))
 
 
 def test_lengths_that_do_not_agree_or_are_not_sure_are_refused(enerf: Enerf, run: Path) -> None:

@@ -126,3 +126,19 @@ def test_markers_of_two_sizes_are_refused_and_none_leave_lengths_without_a_unit(
     found, said = measured(tmp_path, capture_of(tmp_path, "APRILTAG_16h5"))
     assert not found.metric
     assert "no marker is seen" in said[0]
+
+
+def test_how_sure_the_cameras_are_is_in_the_error_and_lengths_that_they_do_not_determine_are_none(tmp_path: Path) -> None:
+    capture, rng = capture_of(tmp_path), np.random.default_rng(0)
+    xyz = rng.uniform(-0.5, 0.5, (60, 3))
+    points = SparsePoints(xyz, np.zeros((60, 3), np.uint8), np.zeros(60), (tuple(range(len(capture.photos))),) * 60)
+    errors = []
+    for miss in (0.5, 2.0):
+        found, _ = measured(tmp_path, replace(capture, points=points, reprojection_error=miss))
+        errors.append(found.facts["markers"]["error"])  # type: ignore[index]
+    alone = measured(tmp_path, capture)[0].facts["markers"]["error"]  # type: ignore[index]
+    np.testing.assert_allclose((errors[1] ** 2 - alone**2) / (errors[0] ** 2 - alone**2), 16.0)
+    for unsure, miss in ((points, 30.0), (replace(points, tracks=((),) * 60), 0.0)):
+        found, said = measured(tmp_path, replace(capture, points=unsure, reprojection_error=miss))
+        assert not found.metric
+        assert "only, and are not used" in said[0]
