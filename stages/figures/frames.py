@@ -12,10 +12,11 @@ import numpy as np
 from efficientnerf.asset.camera_paths import similarity_of
 from efficientnerf.asset.rendering import Rendering, render
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.geometry.cameras import Camera, Similarity
+from efficientnerf.geometry.cameras import Camera
 from stages.formats.exporters.exr import write_exr
 from stages.formats.exporters.frames import NAMED, frame_background, frame_from_rendering, over_background
 from stages.formats.exporters.video import write_mp4
+from stages.formats.exporters.writing import SourceFrame
 from stages.io.png import USUAL, read_png, write_png
 from stages.scratch import Warn, note, noted, once
 
@@ -57,7 +58,7 @@ def render_frames(
     reuse     keep frames that are complete by their note: only for a scratch folder of this very request
     draw      `efficientnerf.asset.rendering.render`, unless another is given
     """
-    background, similarity = frame_background(options.background), similarity_of(tree)
+    background, of_capture = frame_background(options.background), SourceFrame(similarity_of(tree), bool(tree.metadata.get("metric", False)))
     surrounded = options.background == "auto" and tree.environment is not None
     if tree.environment is not None and not surrounded:
         tree = replace(tree, environment=None)
@@ -77,7 +78,7 @@ def render_frames(
                 output = draw(tree, camera, supersample=options.supersample, normals=with_exr)
                 if surrounded:
                     output = replace(output, opacity=np.ones_like(output.opacity))  # nothing shows through the environment
-                writing.append(writer.submit(_write_frame, output, camera, similarity, background, outputs, record, options.compress_level))
+                writing.append(writer.submit(_write_frame, output, camera, of_capture, background, outputs, record, options.compress_level))
             while len(writing) > AHEAD:
                 writing.popleft().result()
             written += outputs
@@ -91,7 +92,7 @@ def render_frames(
 def _write_frame(
     output: Rendering,
     camera: Camera,
-    similarity: Similarity,
+    of_capture: SourceFrame,
     background: tuple[float, float, float] | None,
     outputs: Sequence[Path],
     record: Path | None,
@@ -100,7 +101,7 @@ def _write_frame(
     """outputs  a PNG, and an EXR where one is wanted; `record` is their note, None where they are not kept for later."""
     for exr in outputs[1:]:
         passes = {"colour": output.colour, "opacity": output.opacity, "depth": output.depth, "normal": output.normal}
-        write_exr(exr, **passes, camera=camera, world_from_capture=similarity)
+        write_exr(exr, **passes, camera=camera, frame=of_capture)
     write_png(frame_from_rendering(output.colour, output.opacity, background), outputs[0], compress_level=level, durable=record is None)
     if record is not None:
         note(record, [path.name for path in outputs], outputs)

@@ -3,6 +3,8 @@
 Channels: R G B A (linear light, Rec. 709 primaries), depth.Z (along the view axis, in the capture's units; infinity where nothing is hit),
 normal.X normal.Y normal.Z (unit, in the capture's frame; zero where nothing is hit), position.X position.Y position.Z (of what is hit, in the
 capture's frame; zero where nothing is).
+
+Attributes of the header: unit, "metre" or "unknown"; where it is known metersPerUnit, as USD has it, of depths and positions.
 """
 
 import errno
@@ -16,13 +18,14 @@ import OpenEXR
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from efficientnerf.rendering.colour import linear_premultiplied
 from pipeline.files import atomic
+from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame
 
 PIXELS_AT_ONCE = 2**20  # whose rays are made
 
 
 def write_exr(
     path: Path, *, colour: np.ndarray, opacity: np.ndarray, depth: np.ndarray, normal: np.ndarray, camera: Camera,
-    world_from_capture: Similarity | None = None,
+    frame: SourceFrame = CAPTURE_IS_Z_UP,
 ) -> None:  # fmt: skip
     """Write one rendering.
 
@@ -31,11 +34,11 @@ def write_exr(
     depth    (H, W)     along the view axis, world units
     normal   (H, W, 3)  unit, world frame
     camera   that took it, in the world frame, H x W
-    world_from_capture  what takes depth, normals and positions back to the capture's frame; None: they are in it
+    frame    the capture's, to which depth, normals and positions are taken back
 
     The file appears whole or not at all.
     """
-    similarity = Similarity.identity() if world_from_capture is None else world_from_capture
+    similarity = frame.world_from_capture
     scale, rotation = similarity.scale, similarity.rotation
     rgba = np.concatenate([linear_premultiplied(colour, opacity), opacity[..., None]], axis=-1)
     in_capture = normal @ rotation  # rows times R: the transpose of R applied to each
@@ -43,7 +46,7 @@ def write_exr(
     channels = {"RGBA": _plane(rgba), "depth.Z": _plane(depth / scale)}
     place = positions(depth, camera, similarity)
     channels |= {f"{name}.{axis}": _plane(values[..., k]) for name, values in (("normal", in_capture), ("position", place)) for k, axis in enumerate("XYZ")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "unit": frame.unit} | ({"metersPerUnit": 1.0} if frame.metric else {})
     with atomic(path) as temporary:
         try:
             image = OpenEXR.File(header, channels)

@@ -2,6 +2,7 @@
 
 import errno
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -14,6 +15,7 @@ from efficientnerf.rendering.colour import linear_from_srgb, linear_premultiplie
 from stages.formats.exporters.exr import write_exr
 from stages.formats.exporters.frames import frame_from_rendering
 from stages.formats.exporters.video import write_mp4
+from stages.formats.exporters.writing import SourceFrame
 from stages.io.png import read_png, write_png
 from tests.fakes import BallTree
 
@@ -44,7 +46,8 @@ def test_exr_is_linear_premultiplied_and_in_the_capture_frame(tmp_path: Path) ->
     rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     similarity = Similarity(0.25, rotation, np.array([0.3, 0.0, -0.1]))
     seen = BallTree(sigma=3.0).render(CAMERA)
-    arguments = {"colour": seen.colour, "opacity": seen.opacity, "depth": seen.depth, "normal": seen.normal, "camera": CAMERA, "world_from_capture": similarity}
+    arguments: dict[str, Any] = {"colour": seen.colour, "opacity": seen.opacity, "depth": seen.depth, "normal": seen.normal}
+    arguments |= {"camera": CAMERA, "frame": SourceFrame(similarity)}
     write_exr(tmp_path / "a.exr", **arguments)
     write_exr(tmp_path / "b.exr", **arguments)
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
@@ -72,6 +75,15 @@ def test_exr_is_linear_premultiplied_and_in_the_capture_frame(tmp_path: Path) ->
     np.testing.assert_allclose(depth, seen.depth[hit], rtol=1e-6)
     assert len(world) > 100
     assert np.linalg.norm(world, axis=1).max() < 0.6 + 1e-3, "inside of the ball"
+
+
+@pytest.mark.parametrize(("metric", "stated"), [(True, {"unit": "metre", "metersPerUnit": 1.0}), (False, {"unit": "unknown"})])
+def test_exr_states_the_unit_of_depth(tmp_path: Path, metric: bool, stated: dict[str, object]) -> None:
+    seen = BallTree().render(CAMERA)
+    passes = {"colour": seen.colour, "opacity": seen.opacity, "depth": seen.depth, "normal": seen.normal}
+    write_exr(tmp_path / "a.exr", **passes, camera=CAMERA, frame=SourceFrame(Similarity.identity(), metric))
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        assert {name: value for name, value in file.header().items() if name in ("unit", "metersPerUnit")} == stated
 
 
 def test_exr_whose_writing_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
