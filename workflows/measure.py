@@ -1,6 +1,7 @@
 """`enerf measure` and `enerf orient`."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,6 @@ import numpy as np
 
 from pipeline.errors import BadInput, CorruptArtifact, UsageError
 from pipeline.run import Run
-from stages.artifacts import TurntableOutputs
 from stages.framing.true_frame import AS_CAPTURED, NAME, TrueFrame, load_frame, save_frame
 from workflows import measuring
 from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
@@ -20,8 +20,6 @@ from workflows.report.page import NAME as REPORT
 from workflows.report.page import write_report
 from workflows.report.signature import VIEWER
 from workflows.report.viewer import write_run_viewer
-
-CONFLICT = 3.0  # degrees between the up that is set and one that the run knows, beyond which a warning says so
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # places may begin with a minus
@@ -65,7 +63,7 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
         if not as_json:
             listing(*measuring.in_words(found))
     elif not (known or forget):
-        sides = measuring.sides_of(run)
+        sides = measuring.sides_of(run, measuring.measured(run))
         if sides is None:
             raise BadInput(f"{run}: has no mesh to measure. Give two places to measure between.")
         summary = sides
@@ -107,17 +105,19 @@ def orient(run: Path, places: tuple[str, ...], up: str | None, plane: bool, forg
     else:
         ground = measuring.ground_found(inside, run) if up is None else measuring.ground_of(inside, run, up)
     angle, (words, known) = float(np.degrees(np.arccos(np.clip(inside.own_up @ ground.up, -1, 1)))), measuring.up_from(run)
-    _keep(opened, inside.true.with_ground(ground))
+    inside = replace(inside, true=inside.true.with_ground(ground))
+    _keep(opened, inside.true)
     said = f"{angle:.1f} degrees from the up that the run has, which is {words}"
-    conflict = known and angle > max(error or 0.0, CONFLICT)
+    conflict = known and angle > max(error or 0.0, measuring.UPRIGHT)
     if conflict:
         print(f"warning: the new up is {said}.", file=sys.stderr)
     if as_json:
         facts = {"up": list(ground.up), "up_error": error, "ground": ground.height, "degrees_from_run": angle, "up_of_run": words}
         write_json({"event": "summary", "ok": True, "run": str(run), **facts, "exit_code": 0})
     elif not quiet:
-        again = [f"Its turntable keeps the former up. Upright: enerf render {run}"] if TurntableOutputs.of_run(run).video.is_file() and angle > CONFLICT else []
-        closing(f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}", *again)
+        again = measuring.how_to_turn_upright(run, inside)
+        lines = [f"  its turntable keeps the former up; upright: {again}"] if again else []
+        closing(f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}", *lines)
 
 
 def _keep(opened: Run, frame: TrueFrame) -> None:

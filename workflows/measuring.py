@@ -6,6 +6,7 @@ of the photograph at full size and upright, from its upper left corner. All is c
 
 import itertools
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from efficientnerf.capture.triangulation import Place, length_between, triangula
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput, UsageError
 from pipeline.text import printable
-from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs, TurntableOutputs
 from stages.formats.exporters.glb import gltf_from_capture
 from stages.formats.exporters.writing import SourceFrame
 from stages.framing.markers import at_full_size
@@ -39,6 +40,7 @@ from workflows.loading import describe_asset
 LARGEST_ERROR = 0.03  # of a length: what is less sure is no unit, as of markers
 LARGEST_TILT = 5.0  # degrees, of up: what is less sure is none
 LEVEL, FOUND_WITHIN = 5.0, 30.0  # degrees from level of a floor or table: by an up that is given; by the one that the run has
+UPRIGHT = 3.0  # degrees between two that are the same to the eye
 FEW_POINTS = 30  # near the surface, from which they say how noisy it is
 LOWEST = 0.005  # quantile of the mesh's heights that it stands on where there is no floor or table
 FLATTEST = 0.05  # of its longest side, how high the triangle of three places on the ground is at least
@@ -159,7 +161,7 @@ def _shape_spread(poses: Path, found: scene.Scene, reprojection_error: float | N
     return 0.0 if np.isnan(spread) else min(1.0, spread)
 
 
-def sides_of(run: Path) -> dict[str, Any] | None:
+def sides_of(run: Path, inside: Measured) -> dict[str, Any] | None:
     """The upright box of least area round the run's mesh: its longer side, its shorter one and its height, and their errors, of which all is in the units of
     exports: how far sparse points are from the surface, or half a voxel, and how sure the cameras are; and a photograph's pixel on it. None without a mesh.
     """
@@ -167,7 +169,6 @@ def sides_of(run: Path) -> dict[str, Any] | None:
     vertices, normals = read_vertices(outputs) if outputs.ply.is_file() else (np.zeros((0, 3)),) * 2
     if not len(vertices):
         return None
-    inside = measured(run)
     turned = vertices @ gltf_from_capture(inside.up).T  # y up
     longer, shorter = sorted(cv2.minAreaRect((turned[:, [0, 2]] - turned[0, [0, 2]]).astype(np.float32))[1], reverse=True)
     scale = inside.frame.scale
@@ -300,6 +301,12 @@ def _points_of(run: Path) -> np.ndarray:
     folder = PosesOutputs.of_run(run).folder
     found = scene.load(folder)
     return found.world_from_capture.inverse().points(scene.read_observations(folder)[0]) if found.points else np.zeros((0, 3))
+
+
+def how_to_turn_upright(run: Path, inside: Measured) -> str | None:
+    """How to get a turntable that stands upright, where the run's own has another up than was set since."""
+    stands = inside.up @ inside.own_up > np.cos(np.radians(UPRIGHT))
+    return None if stands or not TurntableOutputs.of_run(run).video.is_file() else f"enerf render {shlex.quote(str(run))} --out FRAMES --video upright.mp4"
 
 
 def up_from(run: Path) -> tuple[str, bool]:

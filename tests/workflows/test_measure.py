@@ -1,7 +1,9 @@
 """`enerf measure`: lengths by places and pixels, metres by known lengths that exports follow; `enerf orient`: up by places; and one line for each mistake."""
 
+import html
 import json
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, project
 from pipeline.run import Run
-from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs, TurntableOutputs
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import source_frame
 from stages.framing.true_frame import NAME
@@ -276,6 +278,20 @@ def test_three_places_on_the_ground_make_exports_upright(enerf: Enerf, run: Path
     np.testing.assert_allclose(camera_poses(enerf, run)[0], after, atol=1e-5)
     np.testing.assert_allclose(again.object["up"], found.object["up"], atol=1e-5)
     assert {path: path.read_bytes() for path in kept} == kept
+
+
+def test_a_turntable_that_keeps_the_former_up_comes_with_the_command_for_another(enerf: Enerf, run: Path) -> None:
+    video = TurntableOutputs.of_run(run).video
+    video.parent.mkdir()
+    video.write_bytes(b"")
+    assert enerf("report", run).code == 0
+    assert "enerf render" not in (run / "report.html").read_text(encoding="utf-8")
+    found = enerf("orient", run, "--up", by_numbers(UP))
+    command = f"enerf render {shlex.quote(str(run))} --out FRAMES --video upright.mp4"
+    assert command in found.out
+    assert html.escape(command) in (run / "report.html").read_text(encoding="utf-8")
+    assert enerf("orient", run, "--forget").code == 0
+    assert "enerf render" not in (run / "report.html").read_text(encoding="utf-8")
 
 
 def test_up_and_lengths_are_forgotten_each_for_itself(enerf: Enerf, run: Path) -> None:

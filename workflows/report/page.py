@@ -24,7 +24,7 @@ from pipeline.text import printable
 from stages.reports import CameraVerdict, PosesReport
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
-from workflows.measuring import measured, sides_in_words, sides_of, unit_in_words
+from workflows.measuring import Measured, how_to_turn_upright, measured, sides_in_words, sides_of, unit_in_words
 from workflows.report import documents
 from workflows.report.documents import Damaged, Metrics, Quality, ResultVerdict
 from workflows.report.signature import write_page
@@ -108,6 +108,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
     damaged: list[str] = []
     found = _read(folder / EVALUATE.metrics, Metrics, damaged)
     made = [each.manifest for each in decisions if each.manifest is not None]
+    inside = _inside(folder)
     return _template().render(
         folder=folder,
         name=folder.name,
@@ -132,7 +133,8 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         asset_report=_facts(folder, BAKE.report, damaged),
         mesh_report=_facts(folder, MESH.report, damaged),
         splats_report=_facts(folder, SPLATS.report, damaged),
-        sides=_sides(folder),
+        sides=_sides(folder, inside),
+        upright=None if inside is None else how_to_turn_upright(folder, inside),
         mesh_seconds=_facts(folder, MESH.timings, damaged),
         previews=_previews(folder, TRAIN.previews),
         asset_previews=_previews(folder, BAKE.previews),
@@ -196,10 +198,19 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
     return {"text": text, "rejected": [(each.name, each.reason) for each in report.rejected or []], "warnings": report.warnings or []}
 
 
-def _sides(folder: Path) -> list[str]:
-    """How large the mesh is and in which unit, or how to get one."""
+def _inside(folder: Path) -> Measured | None:
+    """What can be measured in, of a run whose cameras and frame can be read."""
     with suppress(PipelineError):
-        found, inside = sides_of(folder), measured(folder)
+        return measured(folder)
+    return None
+
+
+def _sides(folder: Path, inside: Measured | None) -> list[str]:
+    """How large the mesh is and in which unit, or how to get one."""
+    if inside is None:
+        return []
+    with suppress(PipelineError):
+        found = sides_of(folder, inside)
         known = [f"Lengths are in metres, within {inside.error:.2g} of each (99 %)."] if inside.metric and inside.error is not None else []
         return [*([] if found is None else [f"The mesh: {sides_in_words(found)}."]), *known, *unit_in_words({"unit": inside.unit, "scale_error": inside.error})]
     return []
