@@ -6,14 +6,15 @@ A sheet on a table, with markers whose edges are 1 to 3 % of the longest side of
 are blurred and noisy JPEGs; sheets are bent, their dictionary is none that is tried, or markers move from photograph to photograph. The cameras are off, as
 those of structure from motion are. Writes markers.json and .md; exit code 1 where lengths are off by more than 0.5 %, up by more than a degree.
 
-With --cameras: what structure from motion finds on a table without any texture, with the markers as tie points and without; markers_cameras.json.
+With --cameras: what structure from motion finds on a table without any texture, with the markers as tie points and without, and how far off lengths are then;
+markers_cameras.json. Exit code 1 where lengths are off by more than is stated.
 """
 
 import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ EDGE = 0.04  # metres
 SHEET = 0.5  # metres, a side of the table top that the four markers lie on
 TURN, SHIFT = 0.01, 5e-4  # of cameras: standard deviations in degrees, and of their distance
 ALLOWED_LENGTH, ALLOWED_UP, ALLOWED_OUTSIDE = 0.005, 1.0, 0.05
+FAR = 0.3  # of their distance from the table, how far cameras are from each other whose distance is compared
 SAMPLES = 2  # along a side of a pixel
 
 
@@ -126,9 +128,9 @@ def inexact(camera: Camera, rng: np.random.Generator) -> Camera:
 
 def found(number: int, work: Path, width: int) -> dict[str, Any]:
     """Of a made capture of a bare table: photographs with a camera, root mean square error of their places as a share of their distance, and error of the focal
-    length, with markers as tie points and without."""
-    rng, on_board = np.random.default_rng(number), number % 2 == 0
-    share = 0.05 if on_board else 0.02
+    length, with markers as tie points and without; and error of lengths between the cameras by the markers, at most and as stated."""
+    rng, on_board = np.random.default_rng(number), number % 4 != 1
+    share = 0.05 if number % 4 == 0 else 0.02
     views, texel = cameras(rng, 10, width, share), EDGE / (share * width) / SAMPLES
     places = np.array([[-0.13, -0.11], [0.12, -0.13], [-0.11, 0.12], [0.13, 0.1]]) + rng.uniform(-0.03, 0.03, (4, 2))
     sheet = board(texel, 0.0) if on_board else four(texel, places, rng.uniform(0, 6, 4), "APRILTAG_36h11")
@@ -139,7 +141,7 @@ def found(number: int, work: Path, width: int) -> dict[str, Any]:
         Image.fromarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8)).convert("RGB").save(work / view.name, quality=92)
     job = Job(settings=PosesSettings(marker_size=EDGE), out=work / "out", work=work / "scratch", source=work)
     markers = find_markers(job, {view.name: (work / view.name, (view.width, view.height)) for view in views})
-    facts: dict[str, Any] = {"board": on_board, "markers": max(map(len, markers.values()))}
+    facts: dict[str, Any] = {"board": on_board, "share": share, "markers": max(map(len, markers.values()))}
     quiet: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
     for name, tied in (("tied", markers), ("without", {})):
         try:
@@ -152,7 +154,24 @@ def found(number: int, work: Path, width: int) -> dict[str, Any]:
         away = np.linalg.norm(closest_similarity(centres, at).points(centres) - at, axis=1) / np.linalg.norm(at, axis=1)
         focal = float(np.median([photo.camera.intrinsics["fx"] for photo in capture.photos]) / views[0].params[0] - 1)
         facts[name] = {"cameras": len(centres), "centre": float(np.sqrt((away**2).mean())), "focal": focal}
+        if tied:
+            facts["lengths"] = _between_cameras(replace(capture, markers=markers), job, at)
     return facts
+
+
+def _between_cameras(capture: Capture, job: Job, true: np.ndarray) -> dict[str, Any]:
+    """Of the lengths between cameras at true places (C, 3) that are far from each other."""
+    said: list[str] = []
+    try:
+        found = with_markers(job, capture, EDGE, said.append)
+    except BadInput as error:
+        return {"refused": str(error).removeprefix(f"{job.source}: ")[:100]}
+    if not found.metric:
+        return {"refused": said[-1][:100]}
+    facts: Any = found.facts["markers"]
+    lengths, expected = (np.linalg.norm(each[:, None] - each, axis=2) for each in (np.array([photo.camera.centre for photo in found.photos]), true))
+    far = expected > FAR * np.linalg.norm(true, axis=1).mean()
+    return {"worst": float(np.abs(lengths[far] / expected[far] - 1).max()), "stated": facts["error"]}
 
 
 def measured(number: int, work: Path, width: int) -> dict[str, Any]:
@@ -241,7 +260,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.cameras:
         rows = [found(number, given.work / f"cameras_{number}", given.width) for number in range(given.captures)]
         write_atomically(given.out / "markers_cameras.json", (json.dumps(rows, indent=1) + "\n").encode())
-        return 0
+        stated = [row["lengths"] for row in rows if "stated" in row.get("lengths", {})]
+        return int(any(each["worst"] > each["stated"] for each in stated))
     rows = []
     for number in range(given.captures):
         rows.append(measured(number, given.work / "capture", given.width))
