@@ -58,7 +58,7 @@ class TurntableSettings:
 
 STAGE = Stage(
     name="turntable",
-    version=6,
+    version=7,
     settings=TurntableSettings,
     needs=needs_of(TurntableInputs),
     run=ByName("stages.turntable.run:run"),
