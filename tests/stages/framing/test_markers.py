@@ -16,7 +16,7 @@ from stages.framing.markers import with_markers
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.png import write_png
 from stages.poses.settings import PosesSettings
-from tests.stages.framing.test_circular_targets import KINDS, photograph
+from tests.stages.framing.made_targets import KINDS, photograph
 
 EDGE = 0.05  # metres, of a capture whose unit is UNIT metres
 UNIT = 0.31
