@@ -4,15 +4,22 @@
 
 Kinds: `benchmarks.scenes.catalogue`. FOLDER/KIND is a source for `enerf run`. The forward-facing kind is an LLFF data set too, because NDC needs near and far:
 `enerf run FOLDER/window --as llff`; then every eighth image is a test view.
+
+    python -m benchmarks.scenes FOLDER --drawn 150 --size 128 --train 40 --val 0 --test 0
+
+FOLDER/drawn_000 and so on are scenes that seeds draw (`benchmarks.scenes.drawn`), on all cores.
 """
 
 import argparse
 import json
+import os
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.scenes.catalogue import Recipe, cameras, recipes
+from benchmarks.scenes.drawn import drawn
 from benchmarks.scenes.rendering import image, nearest
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose, rays
 
@@ -57,7 +64,7 @@ def write_scene(recipe: Recipe, folder: Path, counts: dict[str, int], size: int,
     views = {split: cameras(recipe, split, counts[split], size) for split in SPLITS}
     every = [camera for split in SPLITS for camera in views[split]]
     for camera in every:
-        pixels = image(recipe.shapes, camera, supersample=supersample, alpha=recipe.alpha)
+        pixels = image(recipe.shapes, camera, supersample=supersample, alpha=recipe.alpha, light=recipe.sun)
         cv2.imwrite(str(folder / camera.name), cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if recipe.alpha else cv2.COLOR_RGB2BGR))
     if recipe.forward_facing:
         np.save(folder / "poses_bounds.npy", llff_rows(recipe, every))
@@ -73,6 +80,12 @@ def write_scene(recipe: Recipe, folder: Path, counts: dict[str, int], size: int,
     (folder / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
+def write_drawn(folder: Path, seed: int, counts: dict[str, int], size: int) -> None:
+    """The scene of a seed, where it is not written yet."""
+    if not (folder / "transforms.json").exists():
+        write_scene(drawn(seed), folder, counts, size, supersample=2)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
@@ -80,13 +93,21 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=200, help="width of the images, pixels; three quarters as high")
     for split, count in zip(SPLITS, (60, 10, 20), strict=True):
         parser.add_argument(f"--{split}", type=int, default=count, help=f"{split} views")
+    parser.add_argument("--drawn", type=int, metavar="N", help="instead of kinds: the scenes of seeds 0 to N - 1")
     given = parser.parse_args()
+    counts = {split: getattr(given, split) for split in SPLITS}
+    if given.drawn:
+        with ProcessPoolExecutor(os.cpu_count()) as pool:
+            written = [pool.submit(write_drawn, given.folder / f"drawn_{seed:03d}", seed, counts, given.size) for seed in range(given.drawn)]
+            for scene in written:
+                scene.result()
+        return
     wanted = given.kinds.split(",")
     for kind in wanted:
         if kind not in recipes():
             parser.error(f"--kinds: found {kind!r}, expected some of {', '.join(recipes())}")
     for kind in wanted:
-        write_scene(recipes()[kind], given.folder / kind, {split: getattr(given, split) for split in SPLITS}, given.size)
+        write_scene(recipes()[kind], given.folder / kind, counts, given.size)
         print(f"{given.folder / kind}: written", flush=True)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.scenes.rendering import SUN
 from benchmarks.scenes.shapes import Box, Capsule, Ground, Material, Shape, Sphere
 from benchmarks.scenes.thin import garden, thicket
 from efficientnerf.geometry.cameras import Camera
@@ -27,13 +28,14 @@ STONE, WOOD, DARK = ((0.42, 0.38, 0.33), (0.66, 0.61, 0.54)), ((0.40, 0.22, 0.10
 @dataclass(frozen=True)
 class Recipe:
     """shapes; whether images have alpha; (phase, index, count) -> place and target of a camera; focal length over image width;
-    whether all cameras look the same way."""
+    whether all cameras look the same way; direction of the light."""
 
     shapes: tuple[Shape, ...]
     alpha: bool
     place: Callable[[float, int, int], tuple[np.ndarray, np.ndarray]]
     focal: float
     forward_facing: bool = False
+    sun: tuple[float, float, float] = SUN
 
 
 def look_at(name: str, centre: np.ndarray, target: np.ndarray, size: int, focal: float) -> Camera:
@@ -55,7 +57,7 @@ def cameras(recipe: Recipe, split: str, count: int, size: int) -> list[Camera]:
     return out
 
 
-def _dome(radius: float, lowest: float, highest: float, target: tuple[float, float, float]) -> Callable[[float, int, int], tuple[np.ndarray, np.ndarray]]:
+def dome(radius: float, lowest: float, highest: float, target: tuple[float, float, float]) -> Callable[[float, int, int], tuple[np.ndarray, np.ndarray]]:
     """Places on a dome, in a spiral of golden angles; elevations in degrees."""
 
     def place(phase: float, n: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -142,10 +144,10 @@ def _gloss() -> tuple[Shape, ...]:
 def recipes() -> dict[str, Recipe]:
     """Every kind, by name."""
     return {
-        "object": Recipe(_toy(), True, _dome(3.4, -5.0, 70.0, (0.0, 0.0, 0.45)), 1.4),
-        "court": Recipe(_court(), False, _dome(3.2, 8.0, 40.0, (0.0, 0.0, 0.4)), 0.9),
+        "object": Recipe(_toy(), True, dome(3.4, -5.0, 70.0, (0.0, 0.0, 0.45)), 1.4),
+        "court": Recipe(_court(), False, dome(3.2, 8.0, 40.0, (0.0, 0.0, 0.4)), 0.9),
         "window": Recipe(_street(), False, _window, 0.9, forward_facing=True),
-        "thicket": Recipe(thicket(), True, _dome(3.0, -5.0, 70.0, (0.0, 0.0, 0.3)), 1.5),
-        "garden": Recipe(garden(), True, _dome(3.0, -5.0, 70.0, (0.0, 0.0, 0.3)), 1.5),
-        "gloss": Recipe(_gloss(), True, _dome(3.6, -5.0, 70.0, (0.0, 0.0, 0.5)), 1.4),
+        "thicket": Recipe(thicket(), True, dome(3.0, -5.0, 70.0, (0.0, 0.0, 0.3)), 1.5),
+        "garden": Recipe(garden(), True, dome(3.0, -5.0, 70.0, (0.0, 0.0, 0.3)), 1.5),
+        "gloss": Recipe(_gloss(), True, dome(3.6, -5.0, 70.0, (0.0, 0.0, 0.5)), 1.4),
     }

@@ -12,7 +12,8 @@ from benchmarks.scenes.shapes import Material, Shape
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering.colour import srgb_from_linear
 
-SUN = np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])
+Direction = tuple[float, float, float]
+SUN: Direction = tuple((np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])).tolist())
 SUN_COLOUR, SKY_COLOUR = np.array([1.0, 0.94, 0.82]) * 0.85, np.array([0.55, 0.68, 0.90]) * 0.5
 RAYS_AT_ONCE = 2**16
 
@@ -56,11 +57,11 @@ def nearest(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray
     return Hits(distance, found)
 
 
-def environment(directions: np.ndarray) -> np.ndarray:
+def environment(directions: np.ndarray, light: Direction = SUN) -> np.ndarray:
     """(R, 3) light from far away: a sky that brightens towards the horizon, the sun, and three lamps that mirrors show."""
     up = np.clip(directions[:, 2:], -1, 1)
     sky = np.where(up > 0, SKY_COLOUR * (2.0 - 1.2 * np.sqrt(np.maximum(up, 0))), SKY_COLOUR * (0.6 + 0.4 * (1 + up)))
-    sun = 4.0 * np.maximum(directions @ SUN, 0)[:, None] ** 400 * SUN_COLOUR
+    sun = 4.0 * np.maximum(directions @ np.array(light), 0)[:, None] ** 400 * SUN_COLOUR
     lamps = np.zeros_like(sky)
     for n, colour in enumerate(([1.0, 0.5, 0.3], [0.4, 0.9, 0.5], [0.5, 0.5, 1.0])):
         angle = 2.1 * n
@@ -101,10 +102,12 @@ def base_colour(material: Material, points: np.ndarray) -> np.ndarray:
     return first + share[:, None] * (second - first)
 
 
-def radiance(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray, bounces: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def radiance(
+    shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray, bounces: int = 1, light: Direction = SUN
+) -> tuple[np.ndarray, np.ndarray]:
     """Linear colour (R, 3) along rays, and whether each meets a shape (R,)."""
-    hits = nearest(shapes, origins, directions)
-    colour, met = environment(directions), hits.shape >= 0
+    hits, sun = nearest(shapes, origins, directions), np.array(light)
+    colour, met = environment(directions, light), hits.shape >= 0
     if not met.any():
         return colour, met
     points, d, owner = (origins + np.where(met, hits.distance, 0)[:, None] * directions)[met], directions[met], hits.shape[met]  # (H, 3), (H, 3), (H,)
@@ -115,19 +118,19 @@ def radiance(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarra
         (strength[here], exponent[here]), mirror[here] = material.specular, material.mirror
     normal = np.where((normal * d).sum(-1, keepdims=True) > 0, -normal, normal)
     outside = points + 1e-3 * normal
-    lit = np.isinf(nearest(shapes, outside, np.broadcast_to(SUN, points.shape)).distance)[:, None]
-    shaded = own * (lit * np.maximum(normal @ SUN, 0)[:, None] * SUN_COLOUR + (0.55 + 0.45 * normal[:, 2:]) * SKY_COLOUR)
+    lit = np.isinf(nearest(shapes, outside, np.broadcast_to(sun, points.shape)).distance)[:, None]
+    shaded = own * (lit * np.maximum(normal @ sun, 0)[:, None] * SUN_COLOUR + (0.55 + 0.45 * normal[:, 2:]) * SKY_COLOUR)
     mirrored = d - 2 * (d * normal).sum(-1, keepdims=True) * normal
-    shaded += lit * strength * np.maximum(mirrored @ SUN, 0)[:, None] ** exponent * SUN_COLOUR
+    shaded += lit * strength * np.maximum(mirrored @ sun, 0)[:, None] ** exponent * SUN_COLOUR
     shiny = np.flatnonzero(mirror[:, 0] > 0)
     if bounces and len(shiny):
-        reflected, _ = radiance(shapes, outside[shiny], mirrored[shiny], bounces - 1)
+        reflected, _ = radiance(shapes, outside[shiny], mirrored[shiny], bounces - 1, light)
         shaded[shiny] += mirror[shiny] * (reflected - shaded[shiny])
     colour[met] = shaded
     return colour, met
 
 
-def image(shapes: Sequence[Shape], camera: Camera, *, supersample: int = 3, alpha: bool) -> np.ndarray:
+def image(shapes: Sequence[Shape], camera: Camera, *, supersample: int = 3, alpha: bool, light: Direction = SUN) -> np.ndarray:
     """(H, W, 3) uint8 sRGB, or (H, W, 4) with straight alpha; the mean over supersample^2 rays of a pixel."""
     width, height, n = camera.width, camera.height, supersample
     colour, cover = np.empty((width * height, 3)), np.empty(width * height)
@@ -138,7 +141,7 @@ def image(shapes: Sequence[Shape], camera: Camera, *, supersample: int = 3, alph
         x = (index % width)[:, None, None] + inner[None, None, :]
         y = (index // width)[:, None, None] + inner[None, :, None]
         pixels = np.stack(np.broadcast_arrays(x, y), -1).reshape(-1, 2)
-        seen, hit = radiance(shapes, *rays(camera, pixels))
+        seen, hit = radiance(shapes, *rays(camera, pixels), light=light)
         weight = hit[:, None] if alpha else np.ones((len(hit), 1))
         total = weight.reshape(len(index), -1).sum(1)
         colour[index] = (seen * weight).reshape(len(index), -1, 3).sum(1) / np.maximum(total, 1)[:, None]
