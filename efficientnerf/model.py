@@ -118,16 +118,18 @@ class RayOutputs(NamedTuple):
 
 
 def model(
-    space: Space, settings: TrainSettings, background: tuple[float, float, float] | None, device: str = "cpu", span: tuple[float, float] | None = None
-) -> Model:
+    space: Space, settings: TrainSettings, background: tuple[float, float, float] | None, device: str = "cpu", span: tuple[float, float] | None = None,
+    fields: tuple[Field, Field] | None = None,
+) -> Model:  # fmt: skip
     """An untrained model; the same settings give the same numbers.
 
-    span  near and far along the view axis, world units, for `train.near_plane` and `train.far_plane`
+    span    near and far along the view axis, world units, for `train.near_plane` and `train.far_plane`
+    fields  coarse and fine; None: those that `train.field` names
     """
     coarse_samples = resolved(settings.num_coarse_samples) or space.num_coarse_samples
     settings = replace(settings, num_coarse_samples=coarse_samples)
     generator = torch.Generator().manual_seed(settings.seed)
-    coarse, fine = _fields(settings, generator)
+    coarse, fine = _fields(settings, generator) if fields is None else fields
     if settings.far_plane != "auto" and (span is None or space.contracted):
         raise ValueError("train.near_plane and train.far_plane need a scene on a constant background. Leave them auto.")
     span = span if settings.far_plane != "auto" else None

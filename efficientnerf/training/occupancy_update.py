@@ -43,6 +43,18 @@ def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> N
         cell, point = sweep_cells(m.voxels, number // m.settings.occupancy_update_interval, SWEEP_PARTS, seed)
     else:
         cell, point = random_cells(m.voxels, int(m.settings.occupancy_update_fraction * m.voxels.side**3), seed)
+    _update_at_cells(m, cell, point)
+
+
+@torch.no_grad()
+def sweep_occupancy(m: Model, sweeps: int, seed: int = 0) -> None:
+    """Query every voxel `sweeps` times, at random points, for a coarse field that knows the scene before it is trained."""
+    for sweep in range(sweeps):
+        _update_at_cells(m, *sweep_cells(m.voxels, 0, 1, seed * sweeps + sweep))
+    reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
+
+
+def _update_at_cells(m: Model, cell: Tensor, point: Tensor) -> None:
     for begin in range(0, len(cell), BLOCK):
         part = point[begin : begin + BLOCK]
         update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + BLOCK])
