@@ -23,7 +23,7 @@ from efficientnerf.fields.source_views import SourceViewField, SourceViews, as_l
 
 FEATURES = 8  # of a photograph
 ENCODING = 8  # of a voxel
-SIDE = 32
+SIDE = 24
 VIEWS = 3
 
 

@@ -25,11 +25,11 @@ from efficientnerf.training.schedule import Schedule
 from efficientnerf.training.settings import TrainSettings
 
 WHITE = (1.0, 1.0, 1.0)
-RAYS = 96
-SOURCES = 5  # photographs that a target is rendered from
+RAYS = 64
+SOURCES = 4  # photographs that a target is rendered from
 COVERED_SHARE = 0.75  # of the rays, those that the alpha of the target covers
 SETTINGS = TrainSettings(
-    field="nerf", num_coarse_samples=40, num_importance_samples=0, samples_per_pivot=4, max_pivots=8, exploration_fraction=0.05, background_color="scene",
+    field="nerf", num_coarse_samples=32, num_importance_samples=0, samples_per_pivot=4, max_pivots=8, exploration_fraction=0.05, background_color="scene",
     occupancy_rule="momentum", occupancy_resolution=8,
 )  # fmt: skip
 FAR = 100.0  # beyond every box

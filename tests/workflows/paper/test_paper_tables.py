@@ -2,32 +2,17 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.efficientnerf.balls import cameras, picture
-from tests.stages.captures import write_picture
+from tests.workflows.paper.scenes import ball
 from workflows.cli.main import main
 from workflows.paper import document as paper
-from workflows.paper import tables
+from workflows.paper import priors, tables
 from workflows.paper.document import PAPER, Request
+from workflows.paper.priors import Finetuned
 from workflows.paper.runs import Figures, Row, _pace, settings_of
-
-
-def ball(folder: Path) -> Path:
-    """A Blender data set of the analytic ball: 8 views to train on, 2 to test on."""
-    for split, some in (("train", cameras(8, 48)), ("test", cameras(10, 48)[8:])):
-        frames = []
-        for n, camera in enumerate(some):
-            write_picture(folder / split / f"{n}.png", picture(camera))
-            pose = camera.world_from_camera.copy()
-            pose[:3, 1:3] *= -1  # Blender's cameras look along -z
-            frames.append({"file_path": f"./{split}/{n}", "transform_matrix": pose.tolist()})
-        import math
-
-        document = {"camera_angle_x": 2 * math.atan(24 / (1.3 * 48)), "frames": frames}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(document))
-    return folder
 
 
 def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
@@ -69,13 +54,21 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         settings_of(row, request.scale)  # its settings exist
         return made_up(0.184 if row.name == "nerf" else 0.021, 21.0 if row.name == "valid" else 30.0)
 
+    def finetuned(request: Request, data: Path, method: str, sampling: str, settings: dict[str, dict[str, Any]], seed: int) -> Finetuned:
+        return Finetuned(0.1, 1.0, 10.0, 20.0, [1.0, 2.0, 3.0], [15.0, 20.0, 25.0 if sampling == "uniform" else 24.0])
+
     monkeypatch.setattr(tables, "measured", measured)
+    monkeypatch.setattr(priors, "finetuned", finetuned)
+    monkeypatch.setattr(priors, "weights_of", lambda method: tmp_path)
     ball(tmp_path / "scenes" / "chair")
     paper.make(number, Request(tmp_path / "scenes", tmp_path / "out", 0.001))
     document = json.loads((tmp_path / "out" / f"table_{number}.json").read_text())
     assert any(column.endswith(PAPER) for column in document["columns"])
     assert all(set(row) <= set(document["columns"]) for row in document["rows"])
     assert (tmp_path / "out" / f"table_{number}.png").exists()
+    if number == "6":
+        assert [row["method"] for row in document["rows"]] == ["NeRF"] * 3 + ["IBRNet"] * 2 + ["MVSNeRF"] * 2 + ["PlenOctree"] * 2
+        assert [row.get(priors.EQUAL) for row in document["rows"][3:5]] == [2.8, 3.0]
     if number == "5":
         assert document["rows"][0]["method"] == "NeRF"
         for column in ("less time %", "less time %" + PAPER):
