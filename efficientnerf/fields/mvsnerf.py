@@ -56,8 +56,10 @@ class MvsNerfField(SourceViewField):
     def __init__(self, hidden: int, count: int) -> None:
         super().__init__()
         self.network = layers(ENCODING + 8 * VIEWS, *[hidden] * count, 4 + VIEWS)
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
         with torch.no_grad():
-            self.network[-1].bias[0] = INITIAL  # type: ignore[index,union-attr]
+            last.bias[0] = INITIAL
 
     def encoding(self) -> Tensor:
         """The volume that the field reads."""

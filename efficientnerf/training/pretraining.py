@@ -25,7 +25,7 @@ from efficientnerf.training.schedule import Schedule
 from efficientnerf.training.settings import TrainSettings
 
 WHITE = (1.0, 1.0, 1.0)
-RAYS = 64
+RAYS = 96
 SOURCES = 4  # photographs that a target is rendered from
 COVERED_SHARE = 0.75  # of the rays, those that the alpha of the target covers
 SETTINGS = TrainSettings(
