@@ -44,7 +44,7 @@ BOTH: tuple[Sampling, Sampling] = ("uniform", "efficient")
 WEIGHTS = Path(__file__).parent / "weights"
 UNIFORM = 128  # samples of a ray: MVSNeRF's, and IBRNet's 64 + 64
 SHARE_OF_ITERATIONS = 0.1  # of those of the other rows, which begin from nothing
-SWEEPS = 8
+SWEEPS = 4
 REFERENCES = 6  # views whose volumes MVSNeRF encodes, spread over the scene
 CHECKS = (0.0, 0.1, 0.25, 0.5, 1.0)  # shares of the steps after which test views are rendered
 SEEDS = (0, 1)
@@ -93,7 +93,7 @@ def finetuning_settings(train: dict[str, Any], sampling: Sampling, seed: int) ->
         field="nerf", sampling=sampling, seed=seed, iterations=max(4, round(SHARE_OF_ITERATIONS * train["iterations"])),
         sample_batch_size="off", max_rays_per_batch=train["max_rays_per_batch"], num_coarse_samples=UNIFORM, num_importance_samples=0,
         samples_per_pivot=train["samples_per_pivot"], max_pivots=16, early_samples_per_pivot="off", exploration_fraction=0.0, background_color="scene",
-        occupancy_rule="momentum", occupancy_resolution=40, occupancy_beta=0.3, occupancy_warmup_steps=0, occupancy_update_fraction=0.0,
+        occupancy_rule="momentum", occupancy_resolution=40, occupancy_beta=0.5, occupancy_warmup_steps=0, occupancy_update_fraction=0.0,
         occupancy_update_ray_fraction=train["occupancy_update_ray_fraction"], learning_rate=1e-3, lr_final_ratio=0.3, adam_beta2=0.99, adam_epsilon=1e-8,
         precrop_steps=0, exposure="off", wrong_views="off", sparse_depth_loss_weight=0.0,
     )  # fmt: skip

@@ -24,6 +24,12 @@ def test_the_curve_says_when_a_level_is_reached() -> None:
         curve.seconds_to(21.0)
 
 
+def test_the_weights_of_this_package_load_and_are_small() -> None:
+    for method in priors.PRIORS:
+        assert not any(torch.isnan(p).any() for p in priors.pretrained(method).parameters())
+    assert sum(priors.weights_of(method).stat().st_size for method in priors.PRIORS) < 2 * 2**20
+
+
 @pytest.mark.parametrize("method", list(priors.PRIORS))
 def test_a_finetuning_is_measured_once(method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def untrained(method: str) -> priors.Prior:
