@@ -20,6 +20,7 @@ from stages.io.capture import Capture
 from stages.io.reader import PhotoReader
 
 UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
+WIDEST = 0.5  # of the content's depth, that forward-facing cameras may be apart from each other. docs/experiments/ndc.md
 FRONT_AZIMUTH = -90.0  # degrees, of the mean camera in captures whose frame means nothing: it looks along +y, as front views do
 
 
@@ -103,9 +104,16 @@ def find_training_frame(
 def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choice: str) -> tuple[str, ForwardFacing | None, str]:
     """The space of the field, the forward-facing scene where it is ndc, and how it was chosen."""
     usual = "contracted" if capture.background is None else "box"
-    if choice in ("box", "contracted") or (choice == "auto" and (capture.kind != "llff" or capture.background is not None)):
-        return (usual, None, "usual for this kind of source") if choice == "auto" else (choice, None, "given")
-    found = detect_forward_facing(placed, content_depths(capture, placed, world))
+    if choice in ("box", "contracted"):
+        return choice, None, "given"
+    if choice == "auto" and capture.background is not None:
+        return usual, None, "objects before a constant background"
+    depths = content_depths(capture, placed, world)
+    found = detect_forward_facing(placed, depths)
+    if choice == "auto" and capture.kind != "llff" and isinstance(found, ForwardFacing):
+        spread = float(np.linalg.norm(np.ptp([camera.centre for camera in placed], axis=0)) / np.nanmedian(np.sqrt(depths.prod(axis=1))))
+        if spread > WIDEST:
+            return usual, None, f"the cameras are spread over {spread:.2f} times the depth of the content; at most {WIDEST} for normalised device coordinates"
     if isinstance(found, ForwardFacing):
         return "ndc", found, "given" if choice == "ndc" else "the capture is forward-facing"
     if choice == "ndc":

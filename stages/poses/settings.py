@@ -39,7 +39,7 @@ class PosesSettings:
     space: Literal["auto", "box", "contracted", "ndc"] = setting(
         "auto",
         "Space of the field: a box, with a background without depth around it (box), an unbounded scene (contracted), or normalised device coordinates for"
-        " forward-facing captures (ndc); auto: ndc for forward-facing LLFF folders, box for objects with alpha, else contracted.",
+        " forward-facing captures (ndc); auto: box for objects with alpha, ndc for forward-facing captures by cameras close to each other, else contracted.",
     )
     masks: Literal["auto", "silhouette", "ignore"] = setting(
         "auto",

@@ -66,12 +66,13 @@ def capture(cameras: list[Camera], kind: str = "llff", **more: object) -> Captur
     return Capture(kind, photos, None, **more)  # type: ignore[arg-type]
 
 
-def test_the_space_follows_the_kind_of_source_and_the_setting() -> None:
+@pytest.mark.parametrize("kind", ["photographs", "llff", "colmap"])
+def test_the_space_follows_the_cameras_and_the_setting(kind: str) -> None:
     forward, ring = row(), captures.cameras(8)
-    assert find_training_frame(capture(forward)).space == "ndc"
-    assert find_training_frame(capture(ring)).space == "contracted"
-    assert find_training_frame(capture(forward, "colmap")).space == "contracted"
-    assert find_training_frame(capture(forward, "colmap"), space="ndc").space == "ndc"
+    assert find_training_frame(capture(forward, kind)).space == "ndc"
+    assert find_training_frame(capture(ring, kind)).space == "contracted"
+    wide = find_training_frame(capture(row(spread=6.0), kind))
+    assert wide.space == ("ndc" if kind == "llff" else "contracted"), wide.facts
     assert find_training_frame(capture(forward), space="box").space == "box"
     assert find_training_frame(capture(forward), space="contracted").forward is None
     assert find_training_frame(replace(capture(forward), background=(1.0, 1.0, 1.0))).space == "box"
