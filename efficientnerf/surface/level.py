@@ -33,11 +33,15 @@ def silhouette_level(tree: NerfTree, views: Sequence[AssetView], highest: float,
     tree  of one grid
     tick  called before each view; an exception from it stops the work
     """
-    wrong = np.zeros(len(LEVELS))
+    found = []
     for view in views:
         tick()
         opaque, pixels = _near_edges(view)
-        wrong += (surfaces_met(tree, *rays(view.camera, pixels), highest * LEVELS) != opaque[:, None]).sum(0)
+        found.append((opaque, *rays(view.camera, pixels)))
+    if not found:
+        return highest
+    opaque, origins, directions = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    wrong = (surfaces_met(tree, origins, directions, highest * LEVELS) != opaque[:, None]).sum(0)
     return float(highest * LEVELS[np.argmin(wrong)])
 
 
@@ -57,8 +61,10 @@ def surfaces_met(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, le
     opaque = [replace(plain, density_values=(1 - np.exp2(-plain.density_values.astype(np.float64) / level)).astype(np.float32)) for level in levels]
     out = np.zeros((len(origins), len(levels)), bool)
     for ray, points in _samples(plain, origins, directions):
-        for number, each in enumerate(opaque):
-            out[ray[density_at(each, points) >= 0.5], number] = True
+        for number in np.argsort(levels):  # what is not met at a level is not met at a higher one
+            met = density_at(opaque[number], points) >= 0.5
+            ray, points = ray[met], points[met]
+            out[ray, number] = True
     return out
 
 
