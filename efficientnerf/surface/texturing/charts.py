@@ -45,11 +45,13 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
     chart = np.full(len(faces), -1, np.int64)
     count = grow(order, beside, normals, smooth, areas, LEAST, LIMIT, 0, chart)
     chart = _joined(chart, beside, normals, areas)
+    changed = np.arange(len(faces))  # faces of charts that are not those of the round before
     for round_ in range(ROUNDS):
         found = flattened(vertices, faces, chart)
-        out = _misplaced(found, normals, vectors, texel / 2)
+        out = _misplaced(found, changed, normals, vectors, texel / 2)
         if not out.any():
             return found
+        changed = np.flatnonzero(np.isin(found.chart, found.chart[out]))
         chart[out] = -1
         if round_ == ROUNDS - 1:
             chart[out] = chart.max(initial=-1) + 1 + np.arange(int(out.sum()))
@@ -105,16 +107,16 @@ def plane(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return right, np.cross(axes, right)
 
 
-def _misplaced(charts: Charts, normals: np.ndarray, vectors: np.ndarray, grid: float) -> np.ndarray:
-    """(F,) bool: faces that are folded over in their chart, or lie over another one."""
-    order = np.argsort(charts.chart, kind="stable")
+def _misplaced(charts: Charts, looked_at: np.ndarray, normals: np.ndarray, vectors: np.ndarray, grid: float) -> np.ndarray:
+    """(F,) bool: faces that are folded over in their chart, or lie over another one of those `looked_at` (N,), which are those of whole charts."""
+    order = looked_at[np.argsort(charts.chart[looked_at], kind="stable")]
     begin = np.searchsorted(charts.chart[order], np.arange(charts.count + 1))
     edge = np.diff(charts.corners, axis=1)
     area = edge[:, 0, 0] * edge[:, 1, 1] - edge[:, 0, 1] * edge[:, 1, 0]
     alone = np.bincount(charts.chart)[charts.chart] == 1
     out = (area <= 0.25 * LEAST * np.linalg.norm(vectors, axis=1)) & ~alone & (normals != 0).any(1)
     far = np.zeros((charts.count, 2))
-    np.maximum.at(far, charts.chart, charts.corners.max(1))
+    np.maximum.at(far, charts.chart[order], charts.corners[order].max(1))
     marked = np.zeros(len(order), bool)
     overlapping(np.ascontiguousarray(charts.corners[order] / grid), begin, np.ceil(far / grid).astype(np.int64) + 1, marked)
     out[order[marked]] = True
