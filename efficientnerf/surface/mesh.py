@@ -159,9 +159,9 @@ def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _folded(faces: np.ndarray) -> np.ndarray:
     """(F,) faces that cancel with another face on the same three vertices, in pairs."""
-    ordered = np.sort(faces, 1)
-    _, group = np.unique(ordered, axis=0, return_inverse=True)
-    group = group.ravel()
+    ordered, count = np.sort(faces, 1), int(faces.max(initial=0)) + 1
+    _, edge = np.unique(ordered[:, 0] * count + ordered[:, 1], return_inverse=True)
+    _, group = np.unique(edge * count + ordered[:, 2], return_inverse=True)
     if len(group) == 0 or group.max() + 1 == len(faces):
         return np.zeros(len(faces), bool)
     place = faces.argmin(1)
@@ -188,8 +188,8 @@ def separate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
     readers that merge equal positions would join the sheets again. Edge collapse leaves such edges where a surface is thin.
     """
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
-    pairs, uses = np.unique(edges, axis=0, return_counts=True)
-    on_edges = np.unique(pairs[uses > 2])
+    key, uses = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_counts=True)
+    on_edges = np.unique(np.divmod(key[uses > 2], len(vertices)))
     if not len(on_edges):
         return vertices, faces
     faces, count = faces.copy(), len(vertices)
