@@ -3,6 +3,7 @@
 import hashlib
 import io
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -41,6 +42,7 @@ def companions(path: Path, picture: Picture, normal_map: bool) -> list[Path]:
     return [path.with_name(plain_stem(path) + suffix) for suffix in (EXTENSIONS[picture], *(("_normal.png",) if normal_map else ()))]
 
 
+@lru_cache(maxsize=1)  # several formats of one mesh follow each other
 def pictures_of(mesh: Mesh, picture: Picture) -> list[bytes]:
     """The same as bytes; none of a mesh without a texture."""
     if mesh.texture is None:
