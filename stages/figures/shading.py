@@ -71,7 +71,9 @@ def _front_samples(x: np.ndarray, y: np.ndarray, height: np.ndarray, size: int) 
     front = np.full((size, size), -1)
     # A sample covers two by two pixels, against holes where samples are sparse.
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        np.maximum.at(front, (row + i, column + j), np.arange(len(order)))
+        last = np.full((size, size), -1)
+        last[row + i, column + j] = np.arange(len(order))  # of several samples in a pixel the last stays
+        front = np.maximum(front, last)
     return np.where(front >= 0, order[front], -1) if len(order) else front
 
 

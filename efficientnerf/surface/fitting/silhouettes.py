@@ -90,7 +90,7 @@ def distance_inside(mask: np.ndarray) -> np.ndarray | None:
     """(H, W) float32 pixels from the edge of a silhouette, positive inside; None where it has no edge."""
     if mask.all() or not mask.any():
         return None
-    found = (cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (mask, ~mask))
+    inside, outside = (cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (mask, ~mask))
     # OpenCV's roots differ in the last bit from call to call; their squares are whole.
-    inside, outside = (np.sqrt(np.rint(np.square(distance, dtype=np.float64))) for distance in found)
-    return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
+    distance = np.sqrt(np.rint(np.square(inside + outside, dtype=np.float64)))  # one of the two is zero
+    return np.where(mask, distance - 0.5, 0.5 - distance).astype(np.float32)
