@@ -98,9 +98,10 @@ def _pixel_widths(tree: NerfTree, cameras: Sequence[Camera], centres: np.ndarray
     world = centres
     if tree.ndc is not None:
         world, side = tree.ndc.world(centres), sides * np.linalg.norm(_jacobians(tree, centres)[:, :, 0], axis=1)
+    columns, area = np.ascontiguousarray(world.T), side**2
     for camera in chosen:
-        k = camera.intrinsics
-        square += k["fx"] * k["fy"] * side**2 / np.maximum(np.square(world - camera.centre).sum(axis=1), side**2)
+        k, (x, y, z) = camera.intrinsics, columns - camera.centre[:, None]
+        square += k["fx"] * k["fy"] * area / np.maximum(x * x + y * y + z * z, area)
     return np.sqrt(square / len(chosen))
 
 
