@@ -27,15 +27,18 @@ def density_block(tree: NerfTree, low: tuple[int, int, int], high: tuple[int, in
     low_a, high_a = np.asarray(low), np.asarray(high)
     if (high_a < low_a).any():
         raise ValueError(f"density_block from {tuple(low)} to {tuple(high)}: the upper corner lies below the lower one")
-    axes = [np.arange(a, b) for a, b in zip(low_a, high_a, strict=True)]
-    inside = [(a >= 0) & (a < n) for a, n in zip(axes, tree.resolution, strict=True)]
-    out = np.zeros(tuple(high_a - low_a), np.float32)
-    i, j, k = (a[m] for a, m in zip(axes, inside, strict=True))
-    if not (len(i) and len(j) and len(k) and len(tree.density_values)):
-        return out
-    d = tree.brick
-    brick = tree.brick_index[np.ix_(i // d, j // d, k // d)]
-    local = ((i % d)[:, None, None] * d + (j % d)[:, None]) * d + (k % d)
-    index = np.where(brick >= 0, tree.voxel_index[np.maximum(brick, 0), local], -1)
-    out[np.ix_(*inside)] = np.where(index >= 0, tree.density_values[np.maximum(index, 0)], 0)
+    out, d = np.zeros(tuple(high_a - low_a), np.float32), int(tree.brick)
+    begin, end = (np.clip(corner, 0, tree.resolution) for corner in (low_a, high_a))  # inside of the grid
+    first = begin // d
+    brick = tree.brick_index[_box(first, -(-end // d))]  # (X, Y, Z)
+    index = tree.voxel_index[brick[brick >= 0]]  # (B, d^3)
+    if (end > begin).all() and len(index):
+        bricks = np.zeros((*brick.shape, d**3), np.float32)
+        bricks[brick >= 0] = np.where(index >= 0, tree.density_values[np.maximum(index, 0)], 0)
+        voxels = bricks.reshape(*brick.shape, d, d, d).transpose(0, 3, 1, 4, 2, 5).reshape(np.multiply(brick.shape, d))
+        out[_box(begin - low_a, end - low_a)] = voxels[_box(begin - first * d, end - first * d)]
     return out
+
+
+def _box(low: np.ndarray, high: np.ndarray) -> tuple[slice, ...]:
+    return tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))

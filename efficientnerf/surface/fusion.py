@@ -33,7 +33,9 @@ BLUR = 1.2  # voxels, standard deviation
 THIN = (-1.2, -0.5)  # least distance around a voxel: up to the first it is a part of something thick, from the second on of something thin
 CARVED = (0.5, 0.8)  # mean distance over the truncation: from the second on views see through a voxel, and it is no part of anything thin
 AROUND = 2  # voxels on either side that this is looked for in
-MARGIN = 4  # voxels that a block's values depend on beyond it
+NEAR = 2  # voxels beyond a block whose fused values its own depend on: AROUND, and as many of BLUR
+MARGIN = NEAR + 1  # whose densities
+_INNER = (slice(MARGIN - NEAR, NEAR - MARGIN),) * 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +92,7 @@ def fused_opacity(fusion: Fusion, opacity: np.ndarray, low: np.ndarray, bounds_m
     """(X, Y, Z) float32 values whose level 1/2 is the surface, from those of the densities, for voxels from `low` on. The outermost MARGIN are of no use."""
     wanted = maximum_filter(opacity > EMPTY, size=3).astype(np.uint8)
     wanted[opacity >= HAZE] = FILLED
+    wanted = np.pad(wanted[_INNER], MARGIN - NEAR)
     distance, weight = (np.zeros(opacity.shape, np.float32) for _ in range(2))
     for part in pieces(len(opacity), first=8):
         at = np.array([low[0] + part.start, low[1], low[2]], np.int64)

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_dilation, label
 from skimage.measure import marching_cubes
 
 from efficientnerf.asset.region import inside_distance
-from efficientnerf.surface.fusion import MARGIN, Fusion, fused_opacity
+from efficientnerf.surface.fusion import EMPTY, MARGIN, Fusion, fused_opacity
 from efficientnerf.surface.mesh import compact
 from efficientnerf.surface.volume import Volume
 
@@ -151,14 +151,16 @@ def isosurface(
     blocks = volume.filled_blocks([len(each) for each in starts], block)
     positions, faces, seams, joined, count = [], [], [], [], 0
     for done, number in enumerate(blocks):
+        progress(done + 1, len(blocks), "marching cubes")
         low = number * block - 1
         high = np.minimum(low + block, grid)  # the last sample, included
         margin = 0 if fusion is None else MARGIN
         opacity = _opacity(_filled_block(volume, low - margin, high + 1 + margin, threshold, enclosed), threshold)
+        if opacity.max() <= EMPTY:  # nothing is fused there
+            continue
         if fusion is not None:
             opacity = fused_opacity(fusion, opacity, low - margin, volume.bounds_min, volume.voxel)[margin:-margin, margin:-margin, margin:-margin]
         opacity = _dithered(_clipped(volume, opacity, low), low)
-        progress(done + 1, len(blocks), "marching cubes")
         if opacity.min() > 0.5 or opacity.max() < 0.5:
             continue
         local, triangles, _, _ = marching_cubes(opacity, 0.5, gradient_direction="ascent")  # "ascent" is the one that winds outward here
@@ -192,11 +194,14 @@ def _clipped(volume: Volume, opacity: np.ndarray, low: np.ndarray) -> np.ndarray
     if region is None:
         return opacity
 
-    corners = np.stack(np.meshgrid(*([0, side - 1] for side in opacity.shape), indexing="ij"), -1).reshape(-1, 3)
-    at = [np.asarray(volume.bounds_min) + (low + index + 0.5) * volume.voxel for index in (corners, np.argwhere(np.ones(opacity.shape, bool)))]
-    if inside_distance(region, at[0]).min() > region.fade / 2 + CLIP * volume.voxel:  # the region is convex
+    # The region is a column: distances are the lesser of those in plan and in height, each taken where the other is greatest.
+    middle = np.asarray(region.bounds, np.float64).mean(axis=0)
+    x, y, z = (start + (first + np.arange(side) + 0.5) * volume.voxel for start, first, side in zip(volume.bounds_min, low, opacity.shape))
+    plan = inside_distance(region, np.stack([*np.broadcast_arrays(x[:, None], y, middle[2])], -1).reshape(-1, 3)).reshape(*opacity.shape[:2], 1)
+    height = inside_distance(region, np.stack(np.broadcast_arrays(middle[0], middle[1], z), -1))
+    if min(plan.min(), height.min()) > region.fade / 2 + CLIP * volume.voxel:
         return opacity
-    beyond = (region.fade / 2 - inside_distance(region, at[1]).reshape(opacity.shape)) / volume.voxel
+    beyond = (region.fade / 2 - np.minimum(plan, height)) / volume.voxel
     return np.minimum(opacity, np.clip(0.5 - beyond / (2 * CLIP), 0, 1).astype(np.float32))
 
 

@@ -27,27 +27,42 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
     return right
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _inverse(depth, opacity, y, x):  # type: ignore[no-untyped-def]
-    """Inverse depth of a pixel; zero outside of the image and where it is not opaque."""
-    if y < 0 or x < 0 or y >= depth.shape[0] or x >= depth.shape[1] or not (opacity[y, x] >= OPAQUE and depth[y, x] > 0.0 and np.isfinite(depth[y, x])):
-        return 0.0
-    return 1.0 / np.float64(depth[y, x])
+@numba.njit(cache=True, error_model="numpy")
+def _inverses(depth, opacity, begin, end, radius):  # type: ignore[no-untyped-def]
+    """Inverse depths (end - begin + 2 radius, W + 2 radius) float64 of rows of an image and what is around them; zero outside of the image and where a pixel
+    is not opaque."""
+    height, width = depth.shape
+    out = np.zeros((end - begin + 2 * radius, width + 2 * radius))
+    for y in range(max(0, begin - radius), min(height, end + radius)):
+        for x in range(width):
+            if opacity[y, x] >= OPAQUE and depth[y, x] > 0.0 and np.isfinite(depth[y, x]):
+                out[y - begin + radius, x + radius] = 1.0 / np.float64(depth[y, x])
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _plane(depth, opacity, y, x, radius, band, even):  # type: ignore[no-untyped-def]
-    """The plane through a pixel and those around it that lie within `band` of it, by weighted least squares: w, a, b, confidence."""
-    w = _inverse(depth, opacity, y, x)
-    a = _slope(_inverse(depth, opacity, y, x - 1), w, _inverse(depth, opacity, y, x + 1))
-    b = _slope(_inverse(depth, opacity, y - 1, x), w, _inverse(depth, opacity, y + 1, x))
-    allowed = band if even else band * w * w
-    n = su = sv = suu = suv = svv = sw = suw = svw = sww = whole = 0.0
+def _shares(radius):  # type: ignore[no-untyped-def]
+    """What pixels around one count (2 radius + 1, 2 radius + 1), and the sum of that."""
+    out, whole = np.empty((2 * radius + 1, 2 * radius + 1)), 0.0
     for dv in range(-radius, radius + 1):
         for du in range(-radius, radius + 1):
             share = 1.0 / (1.0 + (du * du + dv * dv) / (0.5 * radius * radius))
+            out[dv + radius, du + radius] = share
             whole += share
-            other = _inverse(depth, opacity, y + dv, x + du)
+    return out, whole
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _plane(inverse, y, x, shares, whole, radius, band, even):  # type: ignore[no-untyped-def]
+    """The plane through a pixel and those around it that lie within `band` of it, by weighted least squares: w, a, b, confidence."""
+    w = inverse[y, x]
+    a = _slope(inverse[y, x - 1], w, inverse[y, x + 1])
+    b = _slope(inverse[y - 1, x], w, inverse[y + 1, x])
+    allowed = band if even else band * w * w
+    n = su = sv = suu = suv = svv = sw = suw = svw = sww = 0.0
+    for dv in range(-radius, radius + 1):
+        for du in range(-radius, radius + 1):
+            share, other = shares[dv + radius, du + radius], inverse[y + dv, x + du]
             beside = other - w
             if other > 0.0 and abs(beside - a * du - b * dv) <= allowed:
                 n, su, sv, sw = n + share, su + share * du, sv + share * dv, sw + share * beside
@@ -74,20 +89,23 @@ def fit_planes(depth, opacity, lens, begin, end, radius, band, even, out):  # ty
                     greatest inverse depth of the pixel and its neighbours, zero where all of them are seen through, infinite where one neither is nor is opaque
     """
     height, width = depth.shape
+    inverse = _inverses(depth, opacity, begin, end, radius)
+    shares, whole = _shares(radius)
     for task in numba.prange(end - begin):
         y = begin + interleaved(task, end - begin)
+        row = y - begin + radius  # of `inverse`
         for x in range(width):
             nearest = 0.0
             for v in range(max(0, y - 1), min(height, y + 2)):
                 for u in range(max(0, x - 1), min(width, x + 2)):
-                    here = _inverse(depth, opacity, v, u)
+                    here = inverse[row + v - y, u + radius]
                     if here <= 0.0 and not opacity[v, u] < FAINT:
                         here = np.inf
                     nearest = max(nearest, here)
             out[y, x, NEAREST] = nearest
             out[y, x, CONFIDENCE] = 0.0
-            if _inverse(depth, opacity, y, x) > 0.0:
-                w, a, b, confidence = _plane(depth, opacity, y, x, radius, band, even)
+            if inverse[row, x + radius] > 0.0:
+                w, a, b, confidence = _plane(inverse, row, x + radius, shares, whole, radius, band, even)
                 middle = w + a * (lens[2] - x - 0.5) + b * (lens[3] - y - 0.5)
                 out[y, x, W], out[y, x, A], out[y, x, B] = w, a, b
                 out[y, x, LENGTH] = np.sqrt((a * lens[0]) ** 2 + (b * lens[1]) ** 2 + middle * middle)
@@ -122,28 +140,34 @@ def fuse(first, low, voxel, depth_scale, wanted, planes, cameras, lenses, trunca
     weight      (X, Y, Z) float32 sum of the views' confidences; zero where none sees it
     """
     height, width = planes.shape[1], planes.shape[2]
-    rows = wanted.shape[1]
+    rows, depth = wanted.shape[1], wanted.shape[2]
     for task in numba.prange(wanted.shape[0] * rows):
         i, j = divmod(interleaved(task, wanted.shape[0] * rows), rows)
-        for k in range(wanted.shape[2]):
-            if wanted[i, j, k] == 0:
-                continue
-            px, py, pz = first[0] + (low[0] + i + 0.5) * voxel, first[1] + (low[1] + j + 0.5) * voxel, first[2] + (low[2] + k + 0.5) * voxel
-            total = sums = behind = 0.0
-            for c in range(len(cameras)):
-                m = cameras[c]
-                w = m[3, 0] * px + m[3, 1] * py + m[3, 2] * pz + m[3, 3]
-                z = (m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]) / w
+        asked = np.flatnonzero(wanted[i, j])
+        if len(asked) == 0:
+            continue
+        px, py = first[0] + (low[0] + i + 0.5) * voxel, first[1] + (low[1] + j + 0.5) * voxel
+        total, sums, behind = np.zeros(depth), np.zeros(depth), np.zeros(depth)
+        for c in range(len(cameras)):
+            m, lens = cameras[c], lenses[c]
+            x0, y0 = m[0, 0] * px + m[0, 1] * py, m[1, 0] * px + m[1, 1] * py
+            z0, w0 = m[2, 0] * px + m[2, 1] * py, m[3, 0] * px + m[3, 1] * py
+            for k in asked:
+                pz = first[2] + (low[2] + k + 0.5) * voxel
+                w = w0 + m[3, 2] * pz + m[3, 3]
+                x, y, z = x0 + m[0, 2] * pz + m[0, 3], y0 + m[1, 2] * pz + m[1, 3], z0 + m[2, 2] * pz + m[2, 3]
+                least = truncation * voxel * depth_scale
+                if w != 1.0:  # not in the world
+                    x, y, z, least = x / w, y / w, z / w, least / (w * w)
                 if not (w > 0.0 and z > 1e-6):
                     continue
-                x, y = (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]) / w, (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]) / w
-                u, v = lenses[c, 0] * x / z + lenses[c, 2], lenses[c, 1] * y / z + lenses[c, 3]
+                u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
                 if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
                     continue
                 column, row = int(u), int(v)
                 pixel = planes[c, row, column]
-                if pixel[NEAREST] == 0.0 or 1.0 / pixel[NEAREST] - z > truncation * voxel * depth_scale / (w * w):
-                    total, sums = total + 1.0, sums + truncation
+                if pixel[NEAREST] == 0.0 or 1.0 / pixel[NEAREST] - z > least:
+                    total[k], sums[k] = total[k] + 1.0, sums[k] + truncation
                     continue
                 if pixel[CONFIDENCE] <= 0.0:
                     continue
@@ -151,13 +175,14 @@ def fuse(first, low, voxel, depth_scale, wanted, planes, cameras, lenses, trunca
                 cosine = across / (pixel[LENGTH] * np.sqrt(x * x + y * y + z * z))
                 if cosine < STEEPEST:
                     continue
-                s = (1.0 - across) / (_slope_of_plane(pixel, column, row, m, w, lenses[c]) * voxel)
+                s = (1.0 - across) / (_slope_of_plane(pixel, column, row, m, w, lens) * voxel)
                 if s <= -truncation:
-                    behind += pixel[CONFIDENCE] if s > -DEEPEST * truncation else 0.0
+                    behind[k] += pixel[CONFIDENCE] if s > -DEEPEST * truncation else 0.0
                 elif s <= truncation:
                     share = pixel[CONFIDENCE] * cosine * (1.0 if s >= 0.0 else 1.0 + s / truncation)
-                    total, sums = total + share, sums + share * s
-            if wanted[i, j, k] == FILLED and behind > ENOUGH and total < 0.1 * behind:
-                total, sums = total + behind, sums - truncation * behind
-            if total > 0.0:
-                distance[i, j, k], weight[i, j, k] = sums / total, total
+                    total[k], sums[k] = total[k] + share, sums[k] + share * s
+        for k in asked:
+            if wanted[i, j, k] == FILLED and behind[k] > ENOUGH and total[k] < 0.1 * behind[k]:
+                total[k], sums[k] = total[k] + behind[k], sums[k] - truncation * behind[k]
+            if total[k] > 0.0:
+                distance[i, j, k], weight[i, j, k] = sums[k] / total[k], total[k]
