@@ -47,3 +47,18 @@ def test_an_even_choice_of_points_gives_the_cameras_of_all(monkeypatch: pytest.M
     every, some = errors
     assert errors[every] < errors[some] < 3 * errors[every] < 0.003
     assert points[some] == pytest.approx(points[every], rel=0.03)
+
+
+def test_points_behind_a_camera_are_dropped() -> None:
+    """One of them makes the mean error as large as can be."""
+    pycolmap = import_pycolmap()
+    model, images, _ = made_model()
+    image = model.images[min(model.reg_image_ids())]
+    frame = model.frames[image.frame_id]
+    frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 1.0, 0.0, 0.0])), np.zeros(3)) * frame.rig_from_world  # looks away
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() > 1e6
+    mapping.bundle_adjust(pycolmap, model, set(), iterations=1)
+    assert model.compute_mean_reprojection_error() < 5
+    assert image.num_points3D == 0
+    assert model.compute_num_observations() == (len(images) - 1) * 800
