@@ -29,6 +29,7 @@ from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training.pretraining import FAR, SETTINGS, SOURCES, WHITE, PosedImages, pretrain
 from stages.evaluate.views import evenly_spaced, subsample, subsample_camera
 from stages.io.field_file import write_tensors
+from stages.io.png import read_png
 from workflows.paper.priors import PRIORS, pretrained
 
 HELD_OUT = 10
@@ -43,7 +44,7 @@ def read_scene(folder: Path, shrink: int = 1) -> PosedImages:
         pose = pose_from_opengl(np.array(frame["transform_matrix"]))
         camera = Camera(frame["file_path"], document["w"], document["h"], "PINHOLE", lens, pose)
         cameras.append(resized(camera, camera.width // shrink, camera.height // shrink))
-        image = cv2.cvtColor(cv2.imread(str(folder / frame["file_path"]), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA)
+        image = read_png(folder / frame["file_path"])
         images.append(cv2.resize(image, (cameras[-1].width, cameras[-1].height), interpolation=cv2.INTER_AREA))
     return PosedImages(BoundedSpace(np.array(MIDDLE) + np.array([[-1.0], [1.0]])), cameras, np.stack(images))
 
