@@ -19,7 +19,7 @@ from pipeline.errors import BadInput, CorruptArtifact, Interrupted, PipelineErro
 from pipeline.hashes import Hashes
 from pipeline.manifest import ABSENT, Manifest, Request
 from pipeline.run import Run
-from pipeline.stage import Stage, settings_dict, settings_from
+from pipeline.stage import Stage, hints_of, settings_dict, settings_from
 from pipeline.text import printable
 
 _CHANGES_SHOWN = 4
@@ -145,7 +145,8 @@ def _cut_short(stage: Stage, run: Run, request: Request | None) -> tuple[str, st
 
 def _request(stage: Stage, run: Run, recorded: Manifest | None, hashes: Hashes) -> tuple[Request | None, PipelineError | None, str | None]:
     """(the request of a run now, or None; then the error that prevents it; a note)."""
-    settings: Any = settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name)
+    known = hints_of(stage.settings)  # a run of another version may have more: `enerf run` leaves those out, with a warning
+    settings: Any = settings_from(stage.settings, {name: value for name, value in run.settings.get(stage.name, {}).items() if name in known}, where=stage.name)
     inputs = {}
     for need in stage.needs:
         try:

@@ -91,6 +91,13 @@ def test_a_source_that_can_no_longer_be_read_is_a_change(done: Run) -> None:
     assert (decision.state, decision.reason) == ("stale", "inputs changed: transforms.json: has no frames")
 
 
+def test_settings_of_another_version_are_no_settings(done: Run) -> None:
+    done.update(settings={**done.settings, "list": {**done.settings.get("list", {}), "removed_since": 3}})
+    assert set(states(done).values()) == {"fresh"}
+    set_one(done, "list", upper=True)
+    assert why_run(LIST, done) == "settings changed: upper false -> true"
+
+
 @pytest.mark.parametrize("name", ["count.txt", "log.jsonl"])
 def test_an_altered_output_is_corrupt_and_a_file_too_many_is_not(done: Run, name: str) -> None:
     path = done.folder("count") / name
