@@ -59,7 +59,8 @@ def write_volume(tree: NerfTree, path: Path, frame: SourceFrame = CAPTURE_IS_Z_U
 def grids_of(tree: NerfTree, frame: SourceFrame, path: Path) -> list[Grid]:
     """Density and colour of each cascade that holds something."""
     if tree.ndc is not None:
-        raise UsageError(f"{path}: the asset's grid is of normalised device coordinates, which no volume has. Export its points or a mesh instead.")
+        remedy = "Export its points or a mesh instead, or train with --set poses.space=contracted."
+        raise UsageError(f"{path}: the asset's grid is of normalised device coordinates, which no volume has. {remedy}")
     back, inner, found = frame.world_from_capture.inverse().matrix(), None, []
     for number, cascade in enumerate(cascades_of(tree)):
         part = cascade_tree(tree, number) if tree.outer else tree
