@@ -67,10 +67,13 @@ def views_of_rays(views: SourceViews, at: Tensor, directions: Tensor, count: int
 
     at (R, 3) any point of each ray, world; directions (R, 3)
     """
-    at = at + ((views.low + views.extent / 2 - at) * directions).sum(-1, keepdim=True) * directions
-    offset = at[:, None] - views.centre  # (R, V, 3)
-    along = (offset * directions[:, None]).sum(-1)
-    squared = (offset**2).sum(-1)
+    # Distances along the ray, and to its point nearest to the middle, by products of matrices: rays times views times 3 numbers are slow where each point has
+    # a ray of its own.
+    middle = views.low + views.extent / 2
+    at, centre = at - middle, views.centre - middle
+    at = at - (at * directions).sum(-1, keepdim=True) * directions
+    along = -directions @ centre.T  # (R, V)
+    squared = (at**2).sum(-1, keepdim=True) - 2 * at @ centre.T + (centre**2).sum(-1)
     own = (squared - along**2 < OWN**2 * squared.clamp(min=1)) & (along > 0)
     cosine = torch.where(own, -2.0, along / squared.sqrt().clamp(min=1e-9))
     return cosine.topk(count, dim=1).indices

@@ -1,5 +1,7 @@
 """Updates of the density voxels in training: with the coarse field's densities on the rays of a step, and at random voxels now and then."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -10,7 +12,7 @@ from efficientnerf.rendering.compositing import activate
 from efficientnerf.sampling.occupancy import apply_decay, cell_of, random_cells, reset_cells, sweep_cells, update
 
 SWEEP_PARTS = 8  # updates of the warm-up that together query every voxel
-BLOCK = 2**17  # voxels that are queried at a time
+BLOCK = 2**14  # voxels that are queried at a time
 
 
 @torch.no_grad()
@@ -47,10 +49,9 @@ def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> N
 
 
 @torch.no_grad()
-def sweep_occupancy(m: Model, sweeps: int, seed: int = 0) -> None:
-    """Query every voxel `sweeps` times, at random points, for a coarse field that knows the scene before it is trained."""
-    for sweep in range(sweeps):
-        _update_at_cells(m, *sweep_cells(m.voxels, 0, 1, seed * sweeps + sweep))
+def sweep_occupancy(m: Model, seed: int = 0) -> None:
+    """Set every voxel to the density at a random point in it, for a coarse field that knows the scene before it is trained."""
+    _update_at_cells(replace(m, voxels=replace(m.voxels, beta=1.0)), *sweep_cells(m.voxels, 0, 1, seed))
     reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
 
 

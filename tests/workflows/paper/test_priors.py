@@ -38,7 +38,6 @@ def test_a_finetuning_is_measured_once(method: str, tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(priors, "pretrained", untrained)
     monkeypatch.setattr(priors, "UNIFORM", 16)
-    monkeypatch.setattr(priors, "SWEEPS", 1)
     data, said = ball(tmp_path / "ball"), list[str]()
     request = Request(data, tmp_path / "out", 0.001, say=said.append)
     settings = settings_of(Row("priors"), 1e-5)
