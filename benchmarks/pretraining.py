@@ -10,6 +10,7 @@ blended from the nearest views by warping without depth.
 
 import argparse
 import json
+import math
 import os
 import time
 from dataclasses import replace
@@ -49,16 +50,17 @@ def read_scene(folder: Path, shrink: int = 1) -> PosedImages:
     return PosedImages(BoundedSpace(np.array(MIDDLE) + np.array([[-1.0], [1.0]])), cameras, np.stack(images))
 
 
-def train(scenes: list[PosedImages], method: str, out: Path, steps: int, seed: int) -> None:
+def train(scenes: list[PosedImages], method: str, out: Path, begin: Path | None, steps: int, minutes: float, seed: int) -> None:
     torch.manual_seed(seed)
-    prior = PRIORS[method]()
+    prior = pretrained(method, begin) if begin else PRIORS[method]()
     begun, used, errors = time.perf_counter(), time.process_time(), []
-    for step, error in enumerate(pretrain(prior, scenes, steps, seed), 1):
+    for step, error in enumerate(pretrain(prior, scenes, steps, seed, minutes=minutes), 1):
         errors.append(error)
-        if step % 25 == 0 or step == steps:
+        if step % 100 == 0:
             write_tensors(prior.state_dict(), {"prior": method}, out)
             wall, cpu = time.perf_counter() - begun, time.process_time() - used
             print(f"step {step}: {-10 * np.log10(np.mean(errors[-100:])):.2f} dB, {wall:.0f} s, {cpu:.0f} s of a core", flush=True)
+    write_tensors(prior.state_dict(), {"prior": method}, out)
 
 
 def warped(sources: SourceViews, camera: Camera) -> np.ndarray:
@@ -82,10 +84,10 @@ def measure(scenes: list[PosedImages], method: str, weights: Path, views: int) -
     found: dict[str, list[float]] = {"uniform": [], "efficient": [], "warped": []}
     for scene in scenes:
         for target in evenly_spaced(len(scene.cameras), views):
-            sources, camera = scene.sources(target, SOURCES), subsample_camera(scene.cameras[target], 2)
+            (sources, references), camera = scene.sources(target, SOURCES), subsample_camera(scene.cameras[target], 2)
             truth = subsample(scene.over_white(np.array([target]))[0], 2)
             with torch.no_grad():
-                prior.observe(sources, torch.zeros(1, dtype=torch.int64))
+                prior.observe(sources, references)
             for sampling in ("uniform", "efficient"):
                 m = model(scene.space, replace(SETTINGS, sampling=sampling), WHITE, fields=(prior.coarse, prior.fine))
                 found[sampling].append(psnr(np.clip(FieldRenderer(m, 0.0, FAR).render(camera).colour, 0, 1), truth))
@@ -100,6 +102,8 @@ def main() -> None:
     parser.add_argument("method", choices=list(PRIORS))
     parser.add_argument("weights", type=Path)
     parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--minutes", type=float, default=math.inf, help="end sooner, the learning rate falling by then")
+    parser.add_argument("--begin", type=Path, help="weights to begin with")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--shrink", type=int, default=1, help="how many times smaller the images to train on are")
     parser.add_argument("--views", type=int, default=2, help="views of each scene to measure on")
@@ -107,7 +111,8 @@ def main() -> None:
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)))
     folders = sorted(given.scenes.glob("drawn_*"))
     if given.what == "train":
-        train([read_scene(folder, given.shrink) for folder in folders[:-HELD_OUT]], given.method, given.weights, given.steps, given.seed)
+        scenes = [read_scene(folder, given.shrink) for folder in folders[:-HELD_OUT]]
+        train(scenes, given.method, given.weights, given.begin, given.steps, given.minutes, given.seed)
     else:
         print(json.dumps(measure([read_scene(folder) for folder in folders[-HELD_OUT:]], given.method, given.weights, given.views)))
 

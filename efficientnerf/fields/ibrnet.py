@@ -18,6 +18,7 @@ Adapted to valid and pivotal sampling (EfficientNeRF, section 3), and to two cor
 
 import itertools
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -125,6 +126,8 @@ class IbrNetField(SourceViewField):
 
 class IbrNet(nn.Module):
     """The network for all scenes: features, and both fields."""
+
+    most_elsewhere: ClassVar[int] = 0  # in training over scenes: it looks at the views nearest to a ray alone
 
     def __init__(self) -> None:
         super().__init__()

@@ -7,12 +7,15 @@
 Adapted to scenes that are seen from all round, to valid and pivotal sampling (EfficientNeRF, section 3), and to two cores:
 
 - The planes are swept through the scene's box rather than through the frustum of one view, so that the volume has grid coordinates like all fields and
-  density voxels. On a whole scene it is the mean of the volumes of several reference views, each with the two views nearest to it.
+  density voxels. On a whole scene it is a mean of the volumes of several reference views, each with the two views nearest to it. Each counts in a voxel by
+  a confidence that the network gives with the encoding: what is hidden from three views would else drown what three others see.
 - The colour is a blend of the three views' plus a correction by the MLP, before the sigmoid, in place of the MLP's alone: it needs less training.
 - Valid samples alone go through the coarse field, a light MLP; pivotal ones alone through the fine one. The coarse field does not train the volume.
 - Density depends on the views' colours, hence on the ray. Density voxels take the momentum over many rays: `SourceViewField.density`.
 - Finetuning on a scene trains the volume and both MLPs, as in the paper's section 3.4.
 """
+
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -91,21 +94,24 @@ class CoarseMvsNerfField(MvsNerfField):
 class MvsNerf(nn.Module):
     """The network for all scenes: features, cost volume's encoding, and both fields."""
 
+    most_elsewhere: ClassVar[int] = 2  # reference views far from the target in training over scenes, at most
+
     def __init__(self) -> None:
         super().__init__()
         self.features = FeatureNetwork(FEATURES)
-        self.encoder = VolumeNetwork(FEATURES + 7, ENCODING)
+        self.encoder = VolumeNetwork(FEATURES + 7, ENCODING + 1)
         self.fine = MvsNerfField(64, 4)
         self.coarse = CoarseMvsNerfField(self.fine, 32, 2)
 
     def observe(self, views: SourceViews, references: Tensor) -> None:
-        """Let both fields look up these source views, and the mean of the volumes of some of them (T,), each with the two nearest to it."""
-        total: Tensor | float = 0.0
+        """Let both fields look up these source views, and the weighted mean of the volumes of some of them (T,), each with the two nearest to it."""
+        volumes = []
         for reference in references:
             near = views.chosen(views.nearest(views.centre[reference], VIEWS))
-            total = total + self.encoder(cost_volume(near, self.features(near.colour), SIDE))
+            volumes.append(self.encoder(cost_volume(near, self.features(near.colour), SIDE)))
         self.fine.views = self.coarse.views = views
-        self.fine.volume = total / len(references)  # type: ignore[assignment]
+        encoding, confidence = torch.stack(volumes).split([ENCODING, 1], -1)
+        self.fine.volume = (torch.softmax(confidence, 0) * encoding).sum(0)  # type: ignore[assignment]
 
     def settle(self) -> None:
         """After `observe`, before finetuning: the volume becomes a parameter."""

@@ -6,6 +6,8 @@ coarse and pivotal ones without density voxels, so that the same weights serve b
 R rays, V views of a scene.
 """
 
+import math
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,19 +16,19 @@ import torch
 from torch import Tensor
 
 from efficientnerf.fields.ibrnet import IbrNet
-from efficientnerf.fields.mvsnerf import MvsNerf
+from efficientnerf.fields.mvsnerf import VIEWS, MvsNerf
 from efficientnerf.fields.source_views import SourceViews, source_views
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model, render_rays
 from efficientnerf.training.losses import colour_losses
 from efficientnerf.training.optimiser import Adam, ParameterGroup
-from efficientnerf.training.schedule import Schedule
 from efficientnerf.training.settings import TrainSettings
 
 WHITE = (1.0, 1.0, 1.0)
 RAYS = 96
 SOURCES = 4  # photographs that a target is rendered from
+RAMP = 20  # steps until the learning rate is whole
 COVERED_SHARE = 0.75  # of the rays, those that the alpha of the target covers
 SETTINGS = TrainSettings(
     field="nerf", num_coarse_samples=32, num_importance_samples=0, samples_per_pivot=4, max_pivots=8, exploration_fraction=0.05, background_color="scene",
@@ -49,29 +51,43 @@ class PosedImages:
         pixels = self.images[index].astype(np.float32) / np.float32(255)
         return pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
 
-    def sources(self, target: int, count: int) -> SourceViews:
-        """The `count` views nearest to a view, itself left out."""
-        others = np.delete(np.arange(len(self.cameras)), target)
+    def nearest(self, view: int, count: int) -> np.ndarray:
+        """(count,) the other views whose directions from the middle are closest to that of a view, the closest first."""
+        others = np.delete(np.arange(len(self.cameras)), view)
         centre = np.array([camera.centre for camera in self.cameras]) - self.space.centre
-        cosine = centre[others] @ centre[target] / np.linalg.norm(centre[others], axis=1)
-        near = others[np.argsort(-cosine)[:count]]
-        return source_views(self.space, [self.cameras[n] for n in near], self.over_white(near))
+        cosine = centre[others] @ centre[view] / np.linalg.norm(centre[others], axis=1)
+        near: np.ndarray = others[np.argsort(-cosine)[:count]]
+        return near
+
+    def sources(self, target: int, count: int, elsewhere: Sequence[int] = ()) -> tuple[SourceViews, Tensor]:
+        """Source views for a view that is not among them: the `count` nearest to it, and the VIEWS nearest to each of some other views. And which of them
+        (1 + len(elsewhere),) are the nearest to each."""
+        groups = [self.nearest(target, count), *(near[near != target][:VIEWS] for near in (self.nearest(each, VIEWS + 1) for each in elsewhere))]
+        chosen = list(dict.fromkeys(int(each) for group in groups for each in group))
+        views = source_views(self.space, [self.cameras[n] for n in chosen], self.over_white(np.array(chosen)))
+        return views, torch.tensor([chosen.index(int(group[0])) for group in groups])
 
 
-def pretrain(prior: Prior, scenes: Sequence[PosedImages], steps: int, seed: int = 0, learning_rate: float = 3e-3) -> Iterator[float]:
-    """Train, yielding the fine colours' mean squared error after each step. All scenes have boxes of one size."""
+def pretrain(
+    prior: Prior, scenes: Sequence[PosedImages], steps: int, seed: int = 0, learning_rate: float = 3e-3, minutes: float = math.inf
+) -> Iterator[float]:
+    """Train, yielding the fine colours' mean squared error after each step, to whichever comes first of steps and minutes: the learning rate has then fallen to
+    a tenth. All scenes have boxes of one size."""
     m = model(scenes[0].space, SETTINGS, WHITE, fields=(prior.coarse, prior.fine))
     uniform = model(scenes[0].space, replace(SETTINGS, sampling="uniform"), WHITE, fields=(prior.coarse, prior.fine))
     adam = Adam([ParameterGroup(dict(prior.named_parameters()))], beta2=0.99, epsilon=1e-8)
-    schedule = Schedule(steps, learning_rate=learning_rate, lr_final_ratio=0.1, ramp_steps=20)
-    for number in range(1, steps + 1):
+    begun, share, number = time.monotonic(), 0.0, 0
+    while share < 1:
+        number += 1
         rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, number]))
         scene = scenes[int(rng.integers(len(scenes)))]
         target = int(rng.integers(len(scene.cameras)))
-        prior.observe(scene.sources(target, SOURCES), torch.zeros(1, dtype=torch.int64))
+        elsewhere = rng.integers(len(scene.cameras), size=rng.integers(prior.most_elsewhere + 1)) if prior.most_elsewhere else ()
+        prior.observe(*scene.sources(target, SOURCES, elsewhere))
         loss, fine = _loss(m if number % 2 else uniform, scene, target, rng)
         loss.backward()
-        adam.step(number, schedule.learning_rate_at(number))
+        adam.step(number, learning_rate * min(1, number / RAMP) * 0.1**share)
+        share = max(number / steps, (time.monotonic() - begun) / (60 * minutes))
         yield fine
 
 

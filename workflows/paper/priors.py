@@ -43,7 +43,9 @@ Sampling = Literal["uniform", "efficient"]
 BOTH: tuple[Sampling, Sampling] = ("uniform", "efficient")
 WEIGHTS = Path(__file__).parent / "weights"
 UNIFORM = 128  # samples of a ray: MVSNeRF's, and IBRNet's 64 + 64
-SHARE_OF_ITERATIONS = 0.1  # of those of the other rows, which begin from nothing
+SHARE_OF_ITERATIONS = 0.3  # of those of the other rows, which begin from nothing
+# Before its activation: valid is a voxel above it. A voxel that a surface cuts is empty in part, so that its mean is below zero, where the paper prunes.
+LEAST_DENSITY = -1.5
 REFERENCES = 6  # views whose volumes MVSNeRF encodes, spread over the scene
 CHECKS = (0.0, 0.1, 0.25, 0.5, 1.0)  # shares of the steps after which test views are rendered
 SEEDS = (0, 1)
@@ -153,6 +155,7 @@ def observed(
         prior.observe(sources, torch.tensor(evenly_spaced(len(views), REFERENCES)))
     prior.settle()
     m = model(space, settings, background, fields=(prior.coarse, prior.fine))
+    m.voxels.threshold = LEAST_DENSITY
     if m.prunes:
         sweep_occupancy(m, settings.seed)
     return m

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.fields.ibrnet import IbrNet, RayAttention, moments, normalised
-from efficientnerf.fields.mvsnerf import SIDE, MvsNerf, cost_volume
+from efficientnerf.fields.mvsnerf import ENCODING, SIDE, MvsNerf, cost_volume
 from efficientnerf.fields.source_views import SourceViews, as_logit, bilinear, look_up, source_views, trilinear
 from efficientnerf.geometry.cameras import project, rays
 from efficientnerf.geometry.spaces import BoundedSpace
@@ -246,13 +246,36 @@ def test_a_settled_field_is_a_field_of_a_model_and_renders(prior: Prior) -> None
     assert SIDE % 4 == 0
 
 
-def test_a_sweep_blends_the_density_at_every_voxel_into_it(prior: Prior) -> None:
+def test_a_sweep_sets_every_voxel_to_the_density_at_a_point_in_it(prior: Prior) -> None:
     m = model(BOX, SETTINGS, WHITE, fields=(prior.coarse, prior.fine))
-    _, points = sweep_cells(m.voxels, 0, 1, 0)
+    _, points = sweep_cells(m.voxels, 0, 1, 3)
     with torch.no_grad():
-        expected = 0.9 * m.voxels.values.flatten() + 0.1 * m.coarse.density(points)
-    sweep_occupancy(m, 1)
-    torch.testing.assert_close(m.voxels.values.flatten(), expected)
+        expected = m.coarse.density(points)
+        nothing = not (expected > m.voxels.threshold).any()
+    sweep_occupancy(m, 3)
+    torch.testing.assert_close(m.voxels.values.flatten(), torch.full_like(expected, m.voxels.start) if nothing else expected)
+
+
+def test_a_voxel_takes_the_encoding_of_the_reference_view_that_is_confident() -> None:
+    """Of a network that gives each reference view its own constant encoding and confidence."""
+    torch.manual_seed(0)
+    net, said = MvsNerf(), iter([(1.0, 0.0), (5.0, 2.0)])
+    net.encoder.forward = lambda cost: torch.tensor([*[(of := next(said))[0]] * ENCODING, of[1]]).expand(*cost.shape[:3], -1)  # type: ignore[method-assign]
+    net.observe(views(), torch.tensor([0, 2]))
+    share = 1 / (1 + math.exp(-2))
+    torch.testing.assert_close(net.fine.volume, torch.full((SIDE, SIDE, SIDE, ENCODING), share * 5 + (1 - share)))
+
+
+def test_source_views_for_a_target_leave_it_out_and_name_the_nearest_of_each_group() -> None:
+    images = np.stack([picture(camera) for camera in CAMERAS])
+    scene = PosedImages(BoundedSpace(np.array([[-1.0] * 3, [1.0] * 3])), CAMERAS, images)
+    for target, elsewhere in ((0, ()), (1, (0, 1, 2))):
+        found, references = scene.sources(target, 2, elsewhere)
+        centres = [tuple(np.round(c, 4)) for c in found.centre.numpy()]
+        assert len(set(centres)) == len(centres)
+        assert tuple(np.round(CAMERAS[target].centre.astype(np.float32), 4)) not in centres
+        assert len(references) == 1 + len(elsewhere)
+        assert references[0] == 0
 
 
 def test_training_over_scenes_reaches_every_parameter(prior: Prior) -> None:
