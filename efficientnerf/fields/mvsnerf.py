@@ -111,7 +111,7 @@ class MvsNerf(nn.Module):
             volumes.append(self.encoder(cost_volume(near, self.features(near.colour), SIDE)))
         self.fine.views = self.coarse.views = views
         encoding, confidence = torch.stack(volumes).split([ENCODING, 1], -1)
-        self.fine.volume = (torch.softmax(confidence, 0) * encoding).sum(0)  # type: ignore[assignment]
+        self.fine.volume = (torch.softmax(confidence, 0) * encoding).sum(0)
 
     def settle(self) -> None:
         """After `observe`, before finetuning: the volume becomes a parameter."""

@@ -82,8 +82,8 @@ def pretrain(
         rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, number]))
         scene = scenes[int(rng.integers(len(scenes)))]
         target = int(rng.integers(len(scene.cameras)))
-        elsewhere = rng.integers(len(scene.cameras), size=rng.integers(prior.most_elsewhere + 1)) if prior.most_elsewhere else ()
-        prior.observe(*scene.sources(target, SOURCES, elsewhere))
+        elsewhere = rng.integers(len(scene.cameras), size=rng.integers(prior.most_elsewhere + 1))
+        prior.observe(*scene.sources(target, SOURCES, elsewhere.tolist()))
         loss, fine = _loss(m if number % 2 else uniform, scene, target, rng)
         loss.backward()
         adam.step(number, learning_rate * min(1, number / RAMP) * 0.1**share)
