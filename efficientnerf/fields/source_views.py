@@ -3,6 +3,7 @@
 N points, R rays, V source views, K views of a ray, W x H pixels of a view.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -125,7 +126,7 @@ def as_logit(colour: Tensor) -> Tensor:
     return torch.logit(colour.clamp(DARKEST, 1 - DARKEST))
 
 
-class SourceViewField(nn.Module):
+class SourceViewField(nn.Module, ABC):
     """A field (`efficientnerf.fields.field`) whose density and colour depend on the source views, which are chosen for each ray."""
 
     activation = "exp"
@@ -133,9 +134,9 @@ class SourceViewField(nn.Module):
     gradient_buffers: ClassVar[dict[str, GradientBuffer]] = {}
     views: SourceViews
 
+    @abstractmethod
     def along_rays(self, points: Tensor, directions: Tensor, first: Tensor) -> Tensor:
         """(N, 4): raw density, and the colour's logits."""
-        raise NotImplementedError
 
     def harmonics(self, directions: Tensor) -> Tensor:
         return torch.ones_like(directions[:, :1])  # the colour depends on the direction by itself

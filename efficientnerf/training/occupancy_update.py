@@ -12,7 +12,8 @@ from efficientnerf.rendering.compositing import activate
 from efficientnerf.sampling.occupancy import apply_decay, cell_of, random_cells, reset_cells, sweep_cells, update
 
 SWEEP_PARTS = 8  # updates of the warm-up that together query every voxel
-BLOCK = 2**14  # voxels that are queried at a time
+BLOCK = 2**17  # voxels that are queried at a time
+SWEPT = 2**14  # the same in a sweep: what source views say of more does not fit the cache
 
 
 @torch.no_grad()
@@ -51,14 +52,14 @@ def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> N
 @torch.no_grad()
 def sweep_occupancy(m: Model, seed: int = 0) -> None:
     """Set every voxel to the density at a random point in it, for a coarse field that knows the scene before it is trained."""
-    _update_at_cells(replace(m, voxels=replace(m.voxels, beta=1.0)), *sweep_cells(m.voxels, 0, 1, seed))
+    _update_at_cells(replace(m, voxels=replace(m.voxels, beta=1.0)), *sweep_cells(m.voxels, 0, 1, seed), SWEPT)
     reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
 
 
-def _update_at_cells(m: Model, cell: Tensor, point: Tensor) -> None:
-    for begin in range(0, len(cell), BLOCK):
-        part = point[begin : begin + BLOCK]
-        update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + BLOCK])
+def _update_at_cells(m: Model, cell: Tensor, point: Tensor, block: int = BLOCK) -> None:
+    for begin in range(0, len(cell), block):
+        part = point[begin : begin + block]
+        update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + block])
 
 
 def update_at_points(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:
