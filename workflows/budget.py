@@ -1,4 +1,4 @@
-"""How `--budget` is shared by the stages that train: the field first, then the asset."""
+"""How `--budget` is shared by the stages that train: the field, the asset, and its Gaussians."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +17,7 @@ FEW_PIXELS_TRAIN_SHARE = 0.6  # of scenes with surroundings and few pixels, whic
 FEW_PIXELS = 16e6  # of all photographs at working size
 WITHOUT_SURROUNDINGS = ("blender", "llff")  # formats of objects before a constant background, and of forward-facing captures
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
+SPLATS_SHARE, MAX_SPLATS = 0.15, 120.0  # of the budget, and seconds: all steps of the Gaussians take no longer on two cores; docs/experiments/splats.md
 
 
 class PosesSettings(ImportSettings, Protocol):
@@ -28,13 +29,19 @@ class PosesSettings(ImportSettings, Protocol):
     def max_image_size(self) -> int: ...
 
 
-def share_budget(seconds: float, share: float) -> dict[str, float]:
-    """Stage -> its time_budget; they sum to `seconds`. share: of train, see `train_share`."""
+def share_budget(seconds: float, share: float, *, splats: bool) -> dict[str, float]:
+    """Stage -> its time_budget; they sum to `seconds`.
+
+    share   of what train and bake have together, for train: see `train_share`
+    splats  whether the run makes Gaussians
+    """
+    parts = {"splats": min(SPLATS_SHARE * seconds, MAX_SPLATS)} if splats else {}
+    seconds -= sum(parts.values())
     if seconds <= MIN_TRAIN + MIN_BAKE:
         train = seconds * MIN_TRAIN / (MIN_TRAIN + MIN_BAKE)
     else:
         train = min(max(share * seconds, MIN_TRAIN), seconds - MIN_BAKE)
-    return {"train": train, "bake": seconds - train}
+    return {"train": train, "bake": seconds - train, **parts}
 
 
 def train_share(sources: Sequence[Path], poses: PosesSettings) -> float:

@@ -33,10 +33,13 @@ class NothingToShow(ValueError):
     """No voxel shows in any picture."""
 
 
-def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, progress: Progress | None = None) -> Gaussians:
+def gaussians_of_asset(
+    tree: NerfTree, views: Sequence[View], budget: Budget, progress: Progress | None = None, time_used: Callable[[], float] | None = None
+) -> Gaussians:
     """Gaussians that show what the tree shows.
 
-    views     what they are fitted to, and whose cameras say which voxels show
+    views      what they are fitted to, and whose cameras say which voxels show
+    time_used  see `refitted`
 
     Raises NothingToShow, and ValueError without views.
     """
@@ -47,6 +50,9 @@ def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, pr
         if progress is not None:
             progress(done, budget.steps + 1, text)
 
+    def passed() -> float:
+        return 0.0 if time_used is None else min(time_used(), 1.0)
+
     said(0, "merging voxels")
     begun = max(1, int(START * budget.count)) if budget.steps else budget.count
     gaussians = merged(tree, [view.camera for view in views], begun, budget.degree)
@@ -55,7 +61,7 @@ def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, pr
     said(1, "fitting Gaussians")
     fitted = refitted(
         gaussians, views, budget.steps, most=budget.count, background=tree.background, seed=budget.seed,
-        reached=lambda step, error: said(step + 1, "fitting Gaussians"),
+        reached=lambda step, error: said(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used,
     )  # fmt: skip
     if not len(fitted):
         raise NothingToShow("no Gaussian is left that shows in any picture")

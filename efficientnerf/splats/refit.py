@@ -28,6 +28,7 @@ LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS
 SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the error is, up to the most allowed
 # Of so many steps and more: when that is done, and the share, of the most transparent, that is left out for it each time. 3DGS-MCMC relocates dead ones.
 MANY_STEPS = 1200
+TIMED = 8  # steps after which it is known how many fit into the time allowed
 RELOCATE_AT, RELOCATED = (0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.64), 0.05
 SPLIT_APART, SPLIT_SHARE = 0.5, 0.7  # of the longest standard deviation: distance of the halves from the middle, and their own
 
@@ -56,25 +57,35 @@ class View:
 
 def refitted(
     gaussians: Gaussians, views: Sequence[View], steps: int, *, most: int = 0, background: tuple[float, float, float] | None = None, seed: int = 0,
-    reached: Callable[[int, float], None] | None = None,
+    reached: Callable[[int, float], None] | None = None, time_used: Callable[[], float] | None = None,
 ) -> Gaussians:  # fmt: skip
     """The Gaussians after so many steps, without those that no longer show.
 
     most        Gaussians up to whose number some are divided on the way; 0: none is
     background  sRGB colour behind pictures without alpha; None: these are opaque
     reached     called after each step, with their number and the picture's mean squared error of a channel
+    time_used   the share of the time allowed that has passed: it ends the steps at 1, and rates and divisions follow it where it is ahead of the steps
     """
     values, degree = values_of(gaussians), gaussians.degree
     count, sums = len(gaussians), np.zeros((0, raster.SUMS), np.float32)
     moments = np.zeros((len(values), fitting.GRADIENTS + values.shape[1], LANES), np.float32)
     records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
-    shares, relocated = (RELOCATE_AT, RELOCATED) if steps >= MANY_STEPS else (SPLIT_AT, 0.0)
-    splits = {int(share * steps) for share in shares} - {0} if most else set()
+    used = began = 0.0 if time_used is None else time_used()
+    times, relocated = _divisions(steps)
     order: list[int] = []
     for number in range(steps):
+        if time_used is not None:
+            used = time_used()
+            if used >= 1:
+                break
+            if number == TIMED:
+                times, relocated = _divisions(min(steps, int(TIMED * (1 - began) / max(used - began, 1e-9))))
+                times = tuple(share for share in times if share > max(used, number / steps))
         if not order:
             order = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 5, number])).permutation(len(views)).tolist()
-        if number in splits:
+        due = sum(int(share * steps) <= number or share <= used for share in times)
+        times = times[due:]
+        if due and number and most:
             values, moments, count = _divided(values, moments, errors[:count], most, relocated)
             records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
         whole = views[order.pop()]
@@ -87,11 +98,16 @@ def refitted(
         lost = np.zeros(len(pairs.begin) - 1)
         for tiles in pieces(len(lost)):
             raster.fit_tiles(tiles, records, pairs, picture, sums, lost)
-        fitting.step(values, moments, lens, degree, pairs.first, sums, _rates(number / max(steps - 1, 1)), errors)
+        fitting.step(values, moments, lens, degree, pairs.first, sums, _rates(max(number / max(steps - 1, 1), used)), errors)
         if reached is not None:
             reached(number + 1, float(lost.sum()) / max(3 * int(picture.mask.sum()), 1))
     fitted = gaussians_from(values, count)
     return fitted.subset(fitted.opacities >= LEAST_OPACITY)
+
+
+def _divisions(steps: int) -> tuple[tuple[float, ...], float]:
+    """When Gaussians are divided, as shares of so many steps, and the share that is left out for it each time."""
+    return (RELOCATE_AT, RELOCATED) if steps >= MANY_STEPS else (SPLIT_AT, 0.0)
 
 
 def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: int, relocated: float = 0.0) -> tuple[np.ndarray, np.ndarray, int]:

@@ -49,12 +49,14 @@ def gaussians_of(
 
     Raises StageFailed where nothing shows.
     """
+    began, seconds = time.monotonic(), resolved(settings.time_budget)
     if captured is None or settings.pictures == "asset" or settings.region == "foreground":
         views = renders(tree, render_cameras(tree), progress)
     else:
         views = photographs(captured[0], load_scene(*captured), captured[1])
     try:
-        return gaussians_of_asset(tree, views, budget_of(settings, [view.camera.width * view.camera.height for view in views]), progress)
+        budget = budget_of(settings, [view.camera.width * view.camera.height for view in views])
+        return gaussians_of_asset(tree, views, budget, progress, None if seconds is None else lambda: (time.monotonic() - began) / seconds)
     except NothingToShow as error:
         raise StageFailed(f"splats: {error}. Train longer, or bake the asset again.") from error
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Seed, setting
+from efficientnerf.settings import Auto, Count, Off, Seconds, Seed, setting
 from pipeline.stage import ByName, Stage
 from stages.artifacts import SplatsInputs, needs_of
 
@@ -32,6 +32,12 @@ class SplatsSettings:
         "Number of training steps, each on an image or on rows of a large one; 0: none; auto: eight passes over all pixels, 600 to 1800 steps.",
         advanced=True,
     )
+    time_budget: Seconds | Off = setting(
+        "off",
+        "Time for the stage, but for a few seconds of writing: fewer steps than iterations are taken where these take longer; off: all are taken.",
+        unit="seconds",
+        advanced=True,
+    )
     pictures: Literal["photographs", "asset"] = setting(
         "photographs",
         "Images that they are trained on: the training photographs (photographs), or renders of the asset (asset), which are always used if region is"
@@ -41,4 +47,4 @@ class SplatsSettings:
     seed: Seed = setting(0, "Seed of the order of the images.", advanced=True)
 
 
-STAGE = Stage(name="splats", version=8, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))
+STAGE = Stage(name="splats", version=9, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))

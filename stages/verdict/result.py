@@ -337,7 +337,8 @@ def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[R
         return []
     sentence = f"The 3D Gaussians are far behind the asset: {metrics['splats']['psnr']:.1f} dB, {blur_in_words(figures['splats_blur'])}."
     picture = f"{SplatsOutputs.stage}/{SplatsOutputs.preview}"
-    return [ResultProblem("splats", "usable", sentence, "They are too few, or too few steps fitted them.", "Raise splats.count or splats.iterations.", picture)]
+    remedy = "Raise splats.count or splats.iterations, or give more time (--budget, splats.time_budget)."
+    return [ResultProblem("splats", "usable", sentence, "They are too few, or too few steps fitted them.", remedy, picture)]
 
 
 def _only_of_this(blur: float | None, figures: Mapping[str, Any]) -> bool:

@@ -58,6 +58,8 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
     for stage in ("train", "bake"):
         budget = resolved(settings[stage].time_budget)
         found[stage] = found[stage] if budget is None else budget
+    if (budget := resolved(settings["splats"].time_budget)) is not None:
+        found["splats"] = min(found["splats"], budget)
     return {stage: round(seconds, 1) for stage, seconds in found.items()}
 
 

@@ -22,19 +22,35 @@ def source(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
+@pytest.mark.parametrize("splats", [True, False])
 @pytest.mark.parametrize("share", [FEW_PIXELS_TRAIN_SHARE, TRAIN_SHARE])
-def test_both_parts_make_up_the_budget(share: float) -> None:
-    former = {"train": 0.0, "bake": 0.0}
+def test_the_parts_make_up_the_budget(share: float, splats: bool) -> None:
+    former = {"train": 0.0, "bake": 0.0} | ({"splats": 0.0} if splats else {})
     for seconds in (0.5, 10.0, MIN_TRAIN + MIN_BAKE, 36.0, 60.0, 240.0, 600.0, 1e5):
-        parts = share_budget(seconds, share)
+        parts = share_budget(seconds, share, splats=splats)
+        assert parts.keys() == former.keys()
         assert sum(parts.values()) == pytest.approx(seconds)
         assert all(parts[stage] >= former[stage] > -1 for stage in former), "a longer budget shortens no part"
-        if seconds >= MIN_TRAIN + MIN_BAKE:
+        both = parts["train"] + parts["bake"]
+        if both >= MIN_TRAIN + MIN_BAKE:
             assert parts["train"] >= MIN_TRAIN - 1e-9
             assert parts["bake"] >= MIN_BAKE - 1e-9
         if seconds >= 240:
-            assert parts["train"] == pytest.approx(share * seconds)
+            assert parts["train"] == pytest.approx(share * both)
         former = parts
+
+
+def test_runs_that_make_no_gaussians_keep_no_time_for_them(source: Path, tmp_path: Path) -> None:
+    def budgets(**options: object) -> dict[str, object]:
+        settings = plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="preview", budget="10m", **options)).run.settings  # type: ignore[arg-type]
+        return {stage: settings[stage]["time_budget"] for stage in ("train", "bake", "splats")}
+
+    assert sum(budgets().values()) == pytest.approx(600)  # type: ignore[arg-type]
+    assert budgets(until="splats") == budgets()
+    for options in ({"until": "bake"}, {"sets": ("splats.make=off",)}):
+        found = budgets(**options)
+        assert found["splats"] == "off"
+        assert found["train"] + found["bake"] == pytest.approx(600)  # type: ignore[operator]
 
 
 def test_the_share_follows_the_pixels_of_the_source(source: Path, tmp_path: Path) -> None:
@@ -50,7 +66,7 @@ def test_the_share_follows_the_pixels_of_the_source(source: Path, tmp_path: Path
     many = _photographs(tmp_path / "many" / "images", 20, (4000, 2000))
 
     def share(folder: Path, *sets: str, **more: object) -> float:
-        planned = plan_run(tmp_path / "run", WORKFLOW, Options(source=folder, preset="tiny", budget="10m", sets=sets, **more))  # type: ignore[arg-type]
+        planned = plan_run(tmp_path / "run", WORKFLOW, Options(source=folder, preset="tiny", budget="10m", sets=sets, until="bake", **more))  # type: ignore[arg-type]
         return float(planned.run.settings["train"]["time_budget"]) / 600
 
     assert share(source) == share(tmp_path / "empty") == FEW_PIXELS_TRAIN_SHARE

@@ -38,6 +38,7 @@ class Options:
     table: Table = field(default_factory=dict)  # settings of a fleet's scene, as its manifest has them
     seed: int | None = None
     budget: str | None = None
+    until: str | None = None
     target_mib: float | None = None
     frames: int | None = None
     lens: str | None = None
@@ -117,7 +118,9 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
             settings.put("poses", name, [value], origin)
     sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
     if options.budget is not None:
-        parts = share_budget(seconds_of(options.budget), train_share(sources, settings.resolved()["poses"]))
+        values, names = settings.resolved(), [stage.name for stage in workflow.stages]
+        makes = values["splats"].make != "off" and (options.until not in names or names.index(options.until) >= names.index("splats"))
+        parts = share_budget(seconds_of(options.budget), train_share(sources, values["poses"]), splats=makes)
         for stage, seconds in parts.items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:

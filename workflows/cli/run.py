@@ -46,7 +46,7 @@ GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 @device_option
 @memory_option
 @click.option("--seed", type=int, help="Random seed of all stages.")
-@click.option("--budget", metavar="TIME", help="Time for training and baking, such as 90s, 10m or 1h; sets train.time_budget and bake.time_budget.")
+@click.option("--budget", metavar="TIME", help="Time for training field, asset and Gaussians, as 90s, 10m or 1h; sets time_budget of train, bake and splats.")
 @click.option("--target-mib", type=float, metavar="N", help="Maximum size of the asset in MiB; sets bake.max_mib.")
 @click.option("--frames", type=int, metavar="N", help="Maximum number of frames from videos, 150 by default; sets poses.frames.")
 @click.option("--mask", "mask_from", metavar="HOW",
@@ -82,7 +82,7 @@ def run(
     The result is graded good, usable, poor or failed. The first line and RUN/evaluate/verdict.json show the grade and what to do. The exit code is 0 for
     every grade, unless --fail-on is given.
     """
-    options |= {"format": options.pop("format_name"), "source": sources[0] if sources else None, "also": sources[1:]}
+    options |= {"format": options.pop("format_name"), "until": until, "source": sources[0] if sources else None, "also": sources[1:]}
     plan = plan_run(run_folder, workflow(), Options(**options))
     return _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run, fail_on=fail_on, jobs=jobs)
 

@@ -56,7 +56,8 @@ class Choice:
         preset = read_preset(self.preset or DEFAULT_PRESET, workflow.presets).table
         (poses,) = (stage.settings for stage in workflow.stages if stage.name == "poses")
         stated: Any = settings_from(poses, {**preset.get("poses", {}), **self.settings.get("poses", {})}, where="poses")
-        parts = share_budget(self.budget, train_share(sources, stated))
+        splats = {**preset.get("splats", {}), **self.settings.get("splats", {})}.get("make") != "off"
+        parts = share_budget(self.budget, train_share(sources, stated), splats=splats)
         return {**self.settings, **{stage: {**self.settings.get(stage, {}), "time_budget": seconds} for stage, seconds in parts.items()}}
 
 

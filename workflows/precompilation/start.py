@@ -31,6 +31,7 @@ SMALLER: Table = {
     "mesh": {"texture_size": 256},
     "train": {"time_budget": "off"},
     "bake": {"time_budget": "off", "max_mib": "auto"},
+    "splats": {"time_budget": "off"},
     "evaluate": {"lpips": "off"},
 }
 

@@ -1,5 +1,6 @@
 """From trees to Gaussians: what is merged, and that fitting brings it nearer to the pictures."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -183,6 +184,22 @@ def test_the_same_pictures_give_the_same_bytes_and_what_cannot_be_seen_stays() -
     assert one.harmonics.tobytes() == two.harmonics.tobytes()
     assert (one.means[-1] == begun.means[-1]).all()
     assert np.abs(one.means[:-1] - begun.means[: len(one) - 1]).max() > 0
+
+
+def test_the_refit_ends_with_its_time_and_learning_rates_and_divisions_follow_it() -> None:
+    """With time for all steps, the bytes are those without a limit."""
+    views = photographs(ball(16, 0), ring(3))
+    begun = merging.merged(ball(16, 0), ring(3), 100, 0)
+
+    def run(a_step: float, steps: int = 40) -> tuple[Gaussians, int]:
+        clock, taken = itertools.count(), []
+        found = refitted(begun, views, steps, most=150, reached=lambda number, _: taken.append(number), time_used=lambda: next(clock) * a_step)
+        return found, len(taken)
+
+    (ample, all_steps), (short, some), (none, no_steps) = run(0.0), run(1 / 12), run(2.0)
+    assert (all_steps, some, no_steps) == (40, 11, 0)
+    assert ample.means.tobytes() == refitted(begun, views, 40, most=150).means.tobytes()
+    assert len(short) > len(begun) >= len(none), "they are divided although a quarter of 40 steps is all that was taken"
 
 
 def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkeypatch: pytest.MonkeyPatch) -> None:

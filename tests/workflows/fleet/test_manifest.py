@@ -70,7 +70,7 @@ def test_toml(place: Path) -> None:
     assert (table.preset, table.seed, table.sources) == ("preview", 5, (str(place / "shoots/b"), str(place / "shoots/c.mp4")))
     assert table.settings["train"]["iterations"] == 200
     assert table.settings["poses"] == {"format": "photographs"}
-    assert table.settings["train"]["time_budget"] + table.settings["bake"]["time_budget"] == pytest.approx(600)
+    assert sum(table.settings[stage]["time_budget"] for stage in ("train", "bake", "splats")) == pytest.approx(600)
 
 
 @pytest.mark.parametrize(("separator", "mark"), [(",", ""), (";", "\ufeff"), ("\t", "")])
