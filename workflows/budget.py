@@ -17,7 +17,7 @@ FEW_PIXELS_TRAIN_SHARE = 0.6  # of scenes with surroundings and few pixels, whic
 FEW_PIXELS = 16e6  # of all photographs at working size
 WITHOUT_SURROUNDINGS = ("blender", "llff")  # formats of objects before a constant background, and of forward-facing captures
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
-SPLATS_SHARE, MAX_SPLATS = 0.15, 120.0  # of the budget, and seconds: all steps of the Gaussians take no longer on two cores; docs/experiments/splats.md
+SPLATS_SHARE, MAX_SPLATS = 0.15, 600.0  # of the budget, and seconds, in which two cores take all steps of any capture; docs/experiments/splats.md
 
 
 class PosesSettings(ImportSettings, Protocol):

@@ -29,7 +29,8 @@ class SplatsSettings:
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
     iterations: Count | Auto = setting(
         "auto",
-        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: eight passes over all pixels, 600 to 1800 steps.",
+        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: eight passes over all pixels, 600 to 1800 steps; with"
+        " time_budget sixteen, up to 8000 steps, if they fit.",
         advanced=True,
     )
     time_budget: Seconds | Off = setting(
