@@ -4,6 +4,9 @@ beyond all grids, and which rays should be opaque. The field is rendered once; t
 P rays, M samples, C views, L cascades.
 """
 
+from __future__ import annotations
+
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +18,8 @@ import torch
 from efficientnerf.asset.bake import Visibility, spread_pixels
 from efficientnerf.backends.numba.bricks import boxes_of_samples, greatest_around, weigh_voxels
 from efficientnerf.backends.pieces import pieces
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import rays as camera_rays
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering import environment
 from efficientnerf.rendering.compositing import activate, ray_of_sample
@@ -22,15 +27,16 @@ from efficientnerf.training.pixels import Pixels
 
 RAYS_PER_BLOCK = 8192  # that are rendered at once
 RAYS_PER_PASS = 2**15  # whose samples a kernel is given at once
+PAST_BORDERS = 0.2  # of the sides of an image. docs/experiments/whole-scene.md
 
 Grid = tuple[tuple[int, int, int], float, np.ndarray]  # coarse cells along x, y, z; side of a voxel; corner (3,)
 
 
 @dataclass(frozen=True, eq=False)
 class FieldSamples:
-    """Fine samples of a field along training rays: those that weigh more than a threshold."""
+    """Fine samples of a field along training rays, and along others that pass the borders of their images: those that weigh more than a threshold."""
 
-    # pixel, view: (P,) int64 and int32: which training pixel of which view
+    # pixel, view: (P,) int64 and int32: which training pixel of which view; of rays past borders, which come last, -1 less the view
     pixel: np.ndarray
     view: np.ndarray
     origin: np.ndarray  # (C, 3) float32 centres of the views
@@ -45,6 +51,23 @@ class FieldSamples:
     weight: np.ndarray
     thickness: np.ndarray
     colour: np.ndarray  # (M, 3) uint8
+
+    @property
+    def training(self) -> FieldSamples:
+        """Those of training pixels."""
+        return self.part(0, int(np.count_nonzero(self.pixel >= 0)))
+
+    @property
+    def past_borders(self) -> FieldSamples:
+        """Those of rays that pass the borders of images."""
+        return self.part(int(np.count_nonzero(self.pixel >= 0)), len(self.pixel))
+
+    def part(self, begin: int, end: int) -> FieldSamples:
+        """Those of some rays; the arrays are shared."""
+        of_rays = {name: getattr(self, name)[begin:end] for name in ("pixel", "view", "direction", "opacity", "behind")}
+        part = slice(int(self.first[begin]), int(self.first[end]))
+        of_samples = {name: getattr(self, name)[part] for name in ("start", "extent", "weight", "thickness", "colour")}
+        return FieldSamples(origin=self.origin, first=self.first[begin : end + 1] - part.start, **of_rays, **of_samples)
 
     def points(self, samples: np.ndarray, ray: np.ndarray) -> np.ndarray:
         """World points (n, 3) in the middle of some samples, of which the rays are given."""
@@ -63,28 +86,59 @@ class FieldSamples:
 
 
 @torch.no_grad()
-def field_samples(m: Model, pixels: Pixels, count: int, threshold: float, done: Callable[[int, int], None]) -> FieldSamples:
-    """The samples of about `count` training pixels, evenly spread, that weigh more than `threshold`."""
+def field_samples(
+    m: Model, pixels: Pixels, count: int, threshold: float, done: Callable[[int, int], None], cameras: Sequence[Camera] = (), past: int = 0
+) -> FieldSamples:
+    """The samples of about `count` training pixels, evenly spread, that weigh more than `threshold`; then of about `past` rays from the `cameras` of the
+    training images that pass the borders of these by up to PAST_BORDERS of their sides."""
     chosen = spread_pixels(pixels, count)
-    rays: list[tuple[np.ndarray, ...]] = []
+    within = (pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])[:4] for begin in range(0, len(chosen), RAYS_PER_BLOCK))
+    view, beyond = rays_past_borders(pixels, cameras, past)
+    total = len(chosen) + len(view)
+    shown: list[tuple[np.ndarray, ...]] = []
     samples: list[tuple[np.ndarray, ...]] = []
-    for begin in range(0, len(chosen), RAYS_PER_BLOCK):
-        bundle = pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])
-        origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
+    rendered = 0
+    for bundle in itertools.chain(within, beyond):
+        origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle)
         behind = m.behind(directions)
         outputs = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
         fine = outputs.fine
         keep = outputs.fine_weight > threshold
         counts = torch.bincount(ray_of_sample(fine.first, len(fine.start))[keep], minlength=len(near))
-        rays.append((bundle[1], outputs.fine_opacity.cpu().numpy(), behind.cpu().numpy().astype(np.float16), counts.cpu().numpy()))
+        shown.append((bundle[1], outputs.fine_opacity.cpu().numpy(), behind.cpu().numpy().astype(np.float16), counts.cpu().numpy()))
         thickness = activate(outputs.fine_raw[:, 0], m.fine.activation) * fine.length
         colour = (outputs.fine_rgb[keep].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         samples.append((*(part[keep].cpu().numpy() for part in (fine.start, fine.extent, outputs.fine_weight, thickness)), colour))
-        done(min(len(chosen), begin + RAYS_PER_BLOCK), len(chosen))
-    direction, opacity, sky, counts_of = (np.concatenate(part) for part in zip(*rays, strict=True))
+        rendered += len(near)
+        done(rendered, total)
+    direction, opacity, sky, counts_of = (np.concatenate(part) for part in zip(*shown, strict=True))
     first = np.concatenate([[0], np.cumsum(counts_of)]).astype(np.int64)
-    joined = [np.concatenate(part) for part in zip(*samples, strict=True)]
-    return FieldSamples(chosen, pixels.view_of(chosen).astype(np.int32), pixels.centre, direction, opacity, sky, first, *joined)
+    pixel, of = np.concatenate([chosen, -1 - view]), np.concatenate([pixels.view_of(chosen), view]).astype(np.int32)
+    return FieldSamples(pixel, of, pixels.centre, direction, opacity, sky, first, *(np.concatenate(part) for part in zip(*samples, strict=True)))
+
+
+def rays_past_borders(pixels: Pixels, cameras: Sequence[Camera], count: int) -> tuple[np.ndarray, Iterator[tuple[np.ndarray, ...]]]:
+    """The views (n,) int64 of about `count` rays beyond the borders of their images, evenly spread, view by view and row by row, and blocks of their origins,
+    directions, near and far."""
+    rng = np.random.Generator(np.random.Philox(key=0, counter=[0, 0, 1, 0]))
+    side = 1 + 2 * PAST_BORDERS
+    drawn = round(count * side**2 / (side**2 - 1) / max(len(cameras), 1))
+    places = []
+    for camera in cameras:
+        place = rng.random((drawn, 2)) * side - PAST_BORDERS
+        place = place[((place < 0) | (place > 1)).any(axis=1)]
+        places.append(place[np.argsort(place[:, 1], kind="stable")] * (camera.width, camera.height))
+    view = np.repeat(np.arange(len(cameras)), [len(place) for place in places])
+
+    def blocks() -> Iterator[tuple[np.ndarray, ...]]:
+        for number, (camera, place) in enumerate(zip(cameras, places, strict=True)):
+            for begin in range(0, len(place), RAYS_PER_BLOCK):
+                origins, directions = camera_rays(camera, place[begin : begin + RAYS_PER_BLOCK])
+                slant = np.maximum(directions @ camera.forward, 1e-3)  # near and far are measured along the view axis
+                planes = pixels.near[number] / slant, pixels.far[number] / slant
+                yield tuple(np.asarray(part, np.float32) for part in (origins, directions, *planes))
+
+    return view, blocks()
 
 
 def surface_points(samples: FieldSamples) -> np.ndarray:

@@ -17,6 +17,7 @@ from stages.artifacts import BakeInputs
 from stages.bake.plan import Bake, SceneBake, bake_plan, coarse_cells
 from stages.bake.settings import BakeSettings
 from stages.bake.voxels import Voxels
+from stages.bake.whole_scene import PAST_SHARE
 from stages.cores import count_cores
 from stages.io.field_file import load_renderer
 from stages.io.refined_cameras import load_scene
@@ -69,7 +70,7 @@ def needed(
     stored    whether the pixels are in a file
     """
     pixels, harmonics = pixels_needed(views, channels, stored=stored), harmonics_count(plan.degree)
-    rays = min(settings.visibility_rays, count_pixels(tuple(views)))
+    rays = _rays(plan, settings, views)
     return Need({
         PIXELS: pixels[PIXELS],
         "voxels": max(voxels_needed(voxels, harmonics, packed=plan.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
@@ -79,6 +80,12 @@ def needed(
         "the field": 3 * 4 * parameters(m.settings) + DENSITY_VOXEL * m.voxels.side**3 // 4,
         "libraries": libraries(device),
     })  # fmt: skip
+
+
+def _rays(plan: Bake, settings: BakeSettings, views: Sequence[View]) -> int:
+    """That voxels are chosen by."""
+    count = min(settings.visibility_rays, count_pixels(tuple(views)))
+    return count + isinstance(plan, SceneBake) * int(PAST_SHARE * count)
 
 
 def most_needed(settings: BakeSettings, plan: Bake, m: Model, views: Sequence[View], channels: int, voxels: int, *, stored: bool, device: str) -> Need:
@@ -126,7 +133,7 @@ def memory_needed(known: Known) -> Need:
 def space_needed(known: Known) -> int:
     """The field's samples, the values of the voxels as they are baked, a checkpoint of their refinement, two while it is replaced, and the asset."""
     own, (plan, _, views) = known.settings["bake"], _before(known)
-    rays = min(own.visibility_rays, count_pixels(views))
+    rays = _rays(plan, own, views)
     values, voxels = 4 * (1 + 3 * harmonics_count(plan.degree)), min(plan.most_voxels, SHOWN * rays)
     checkpoints = 1 if plan.refine_steps is not None and plan.refine_steps * own.refine_rays_per_batch < SHORT else 2
     asset = min(int(plan.mib * MIB), 2 * bytes_per_voxel(plan.layout, plan.degree) * voxels)

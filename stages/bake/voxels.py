@@ -78,6 +78,8 @@ def choose_voxels(job: Job, plan: Bake, m: Model, s: Scene, pixels: Pixels) -> V
         choice = affordable_resolution(choice, lambda at: sum(map(len, at_resolution(at)[3])), lambda at: int(OVERSHOOT * capacity(at)))
     _, grids, seen, indices = at_resolution(choice.resolution)
     indices = heaviest_of(job, seen, grids, indices, MAX_OVERSHOOT * capacity(choice.resolution))
+    if isinstance(shown, Cascades):
+        seen, indices = shown.with_surfaces_past_borders(grids, indices, int(MAX_OVERSHOOT * capacity(choice.resolution)))
     indices = [shown.kept(part, grid) for part, grid in zip(indices, grids, strict=True)]
     voxels = Voxels(choice, grids, indices, sum(len(one.cells) for one in seen), shown.surroundings(grids, seen, indices))
     if not voxels.count:

@@ -1,6 +1,7 @@
 """The cascades of an unbounded scene and their voxels, its foreground region, and its environment map.
 
-The field is rendered along training rays once (`efficientnerf.asset.field_samples`). Their end points give the foreground region, which the innermost
+The field is rendered along training rays once (`efficientnerf.asset.field_samples`), and along rays past the borders of their images. The training rays' end
+points give the foreground region, which the innermost
 cascade covers; the cascades around it hold nearly all that the photographs show, and the rest goes to the environment map.
 
 N voxels, P rays.
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.asset.bake import Visibility
+from efficientnerf.asset.bake import Visibility, chosen_voxels
 from efficientnerf.asset.field_samples import (
     FieldSamples,
     Grid,
@@ -42,6 +43,9 @@ from stages.train.priors import filled_points
 # in those that are partly as close, such as a wall behind the cameras, is baked. docs/experiments/near-cameras.md
 BAKED_CLEARANCE = 0.5
 MUCH_SMALLER = 0.6  # scene bounds, of the foreground region's longest side. docs/experiments/whole-scene.md
+# Where no training image looks, but the next view, which lies between no two of them, may: what the field shows there is baked too. Rays past the borders of
+# training images, of those within; and weight of a voxel in which one of them ends. docs/experiments/whole-scene.md
+PAST_SHARE, END_WEIGHT = 0.3, 0.02
 FOREGROUND_RAYS = 2**18  # that the foreground region is found from
 CENTRES_PER_BLOCK = 2**20
 KINDS = {
@@ -59,7 +63,7 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
 class Surroundings:
     """What only the asset of an unbounded scene has.
 
-    samples      what the field shows along training rays
+    samples      what the field shows along training rays and past the borders of their images
     region       the foreground
     seen         for each grid (N, 2) what rays saw of its voxels (`efficientnerf.asset.field_samples.seen_weights`)
     environment  (H, 2 H, 3) what lies beyond all grids
@@ -79,19 +83,35 @@ class Cascades:
         own = job.settings
         self.samples = rendered_once(
             job, "samples", FieldSamples, KINDS, lambda found: fits(found, pixels),
-            lambda progress: field_samples(m, pixels, own.visibility_rays, own.weight_threshold, progress),
+            lambda progress: field_samples(
+                m, pixels, own.visibility_rays, own.weight_threshold, progress,
+                [view.camera for view in scene.views_of(s, "train")], int(PAST_SHARE * min(own.visibility_rays, pixels.usable_count)),
+            ),
         )  # fmt: skip
         job.safe_point()
-        self.region = region_of(self.samples, pixels, s, job.inputs["poses"])
+        self.region = region_of(self.samples.training, pixels, s, job.inputs["poses"])
         self.bounds = innermost_box(self.region, s.bounds) if plan.box is None else plan.box
-        self.count = cascades_needed(self.samples, self.bounds, *plan.cascades)
+        self.count = cascades_needed(self.samples.training, self.bounds, *plan.cascades)
         self.finest = plan.resolution if plan.fixed else finest_of_cascades(s, self.bounds, self.count, plan.brick_size, plan.max_resolution)
 
     def grids(self, resolution: int) -> list[Grid]:
         return nested_grids(self.bounds, resolution, self.plan.brick_size, self.count, None if self.plan.box is None else self.plan.box[0])
 
     def visibility(self, grids: list[Grid]) -> list[Visibility]:
-        return cascade_visibility(self.samples, grids, self.plan.brick_size, self.job.settings.weight_threshold)
+        return cascade_visibility(self.samples.training, grids, self.plan.brick_size, self.job.settings.weight_threshold)
+
+    def with_surfaces_past_borders(self, grids: list[Grid], indices: list[np.ndarray], most: int) -> tuple[list[Visibility], list[np.ndarray]]:
+        """What all rays show of the voxels of these grids, and `indices` with the voxels in which rays past the borders of images end: those of greatest
+        weight, so that there are about `most` in all."""
+        brick, threshold = self.plan.brick_size, END_WEIGHT
+        past = cascade_visibility(self.samples.past_borders, grids, brick, END_WEIGHT)
+        weights = np.sort(np.concatenate([one.greatest[one.greatest > END_WEIGHT] for one in past]))
+        room = max(0, most - sum(map(len, indices)))
+        if len(weights) > room:
+            threshold = float(weights[-room - 1])
+        ends = [chosen_voxels(one, shape, brick, threshold, 0) for one, (shape, _, _) in zip(past, grids, strict=True)]
+        both = [_union(one, other, shape, brick) for one, other, (shape, _, _) in zip(indices, ends, grids, strict=True)]
+        return cascade_visibility(self.samples, grids, brick, self.job.settings.weight_threshold), both
 
     def kept(self, indices: np.ndarray, grid: Grid) -> np.ndarray:
         """The voxels that are not close to the path of the training cameras, and that are not poorly seen."""
@@ -113,10 +133,18 @@ class Cascades:
     def surroundings(self, grids: list[Grid], seen: list[Visibility], indices: list[np.ndarray]) -> Surroundings:
         """What is baked besides these voxels."""
         samples, brick = self.samples, self.plan.brick_size
-        mean = self.pixels.images[samples.pixel[:: max(1, len(samples.pixel) // 4096)]][:, :3].mean(axis=0) / 255.0
+        some = samples.training.pixel
+        mean = self.pixels.images[some[:: max(1, len(some) // 4096)]][:, :3].mean(axis=0) / 255.0
         environment = environment_beyond(samples, boxes_of(grids, brick), self.plan.environment_size, mean)
         weights = [seen_weights(one, part, shape, brick) for one, part, (shape, _, _) in zip(seen, indices, grids, strict=True)]
         return Surroundings(samples, self.region, weights, environment)
+
+
+def _union(one: np.ndarray, other: np.ndarray, shape: tuple[int, int, int], brick: int) -> np.ndarray:
+    """Coordinates (N, 3) int32 of the voxels of either, in the order of the grid."""
+    size = tuple(side * brick for side in shape)
+    flat = np.union1d(*(np.ravel_multi_index(tuple(part.T.astype(np.int64)), size) for part in (one, other)))
+    return np.stack(np.unravel_index(flat, size), axis=-1).astype(np.int32)
 
 
 def innermost_box(region: Region, scene_bounds: np.ndarray) -> np.ndarray:
@@ -164,5 +192,7 @@ def fits(samples: FieldSamples, pixels: Pixels) -> bool:
     if any(getattr(samples, name).shape != shape for name, shape in shapes.items()):
         return False
     ordered = samples.first[0] == 0 and samples.first[-1] == count and (np.diff(samples.first) >= 0).all()
-    inside = not rays or (samples.pixel.min() >= 0 and samples.pixel.max() < len(pixels))
-    return bool(ordered and inside and np.array_equal(samples.view, pixels.view_of(samples.pixel)))
+    known = np.clip(samples.pixel, 0, len(pixels) - 1)
+    views = np.where(samples.pixel < 0, -1 - samples.pixel, pixels.view_of(known))
+    inside = (samples.pixel < len(pixels)).all() and (views < len(pixels.centre)).all() and (np.diff(samples.pixel < 0) >= 0).all()
+    return bool(ordered and inside and np.array_equal(samples.view, views))

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from efficientnerf.asset.bake import chosen_voxels, spread_pixels, voxel_values
 from efficientnerf.asset.cascades import cascade_grids, nested, voxel_coordinates
 from efficientnerf.asset.components import unsupported_components
 from efficientnerf.asset.field_samples import (
+    PAST_BORDERS,
     FieldSamples,
     cascade_visibility,
     density_as_seen,
@@ -19,7 +21,9 @@ from efficientnerf.asset.field_samples import (
 )
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.cameras import project
 from efficientnerf.model import Model
+from efficientnerf.model import render_rays as model_rays
 from efficientnerf.rendering import environment
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.surroundings import GROUND, RADIUS, WALL, around, photographs, surroundings
@@ -179,3 +183,25 @@ def test_small_parts_go_unless_three_photographs_show_them(made: Made) -> None:
         assert unsupported_components(scene, keep, 0.02, seen_by(views, of))[speck].all() == dropped
     assert not unsupported_components(scene, keep, 0.0, seen_by(0)).any()
     assert unsupported_components(scene, keep, 0.02, seen_by(0)).sum() == 1  # the far voxel stays, though nobody's ray ends there
+
+
+def test_rays_past_the_borders_of_images_come_last_and_show_what_lies_there(made: Made) -> None:
+    m, pixels, samples = made
+    cameras = around()
+    every = field_samples(m, pixels, 10**6, 1e-3, lambda done, total: None, cameras, 3000)
+    for name in vars(samples):
+        np.testing.assert_array_equal(getattr(every.training, name), getattr(samples, name))
+    past = every.past_borders
+    assert 0.8 * 3000 < len(past.pixel) < 1.2 * 3000
+    np.testing.assert_array_equal(past.pixel, -1 - past.view)
+    assert set(past.view.tolist()) == set(range(len(cameras)))
+    for number, camera in enumerate(cameras):
+        rays = past.view == number
+        place = project(camera, camera.centre + past.direction[rays].astype(np.float64))[0] / (camera.width, camera.height)
+        assert ((place < 1e-4) | (place > 1 - 1e-4)).any(axis=1).all()
+        assert np.abs(place - 0.5).max() < 0.5 + PAST_BORDERS + 1e-4
+    bundle = (pixels.centre[past.view], past.direction, np.full(len(past.view), 0.2, np.float32), np.full(len(past.view), 60.0, np.float32))
+    origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in bundle)
+    slant = torch.from_numpy(np.array([camera.forward for camera in cameras], np.float32)[past.view]).mul(directions).sum(dim=1)
+    seen = model_rays(m, origins, directions, near / slant, far / slant, torch.full_like(near, 0.5), m.behind(directions))
+    np.testing.assert_allclose(past.opacity, seen.fine_opacity.detach(), atol=1e-3)

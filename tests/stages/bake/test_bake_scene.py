@@ -12,6 +12,7 @@ import pytest
 
 from efficientnerf.asset import field_samples, format
 from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.rendering.field_renderer import FieldRenderer
@@ -155,6 +156,28 @@ def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_
     assert found["restored"] < 0.2 * found["pruned"]
     assert 0 < found["voxels_restored"] <= dropped[0]
     assert any("holes" in event.get("text", "") and "restored" in event["text"] for event in events)
+
+
+def test_what_lies_just_past_the_borders_of_images_is_baked(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the field shows it, for the next view; within the size that an asset may have."""
+    s = load(inputs["poses"])
+    poses = tmp_path / "poses"
+    shutil.copytree(inputs["poses"], poses)
+    save(replace(s, views=tuple(replace(view, split="train" if number in (0, 3) else "test") for number, view in enumerate(s.views))), poses)
+    own = s.views[0].camera
+    params = (own.params[0], own.params[1] + 0.15 * own.width, own.params[2] + 0.15 * own.height)
+    wide = replace(own, width=round(1.3 * own.width), height=round(1.3 * own.height), params=params)
+    few = {**inputs, "poses": poses}
+    asset, _ = baked(tmp_path / "with", few, max_mib=0.5)
+    monkeypatch.setattr(whole_scene, "PAST_SHARE", 0.0)
+    without, _ = baked(tmp_path / "without", few, max_mib=0.5)
+    seen = FieldRenderer(surroundings(), 0.2, 60.0).render(wide).opacity > 0.9
+    past = np.ones(seen.shape, bool)
+    past[int(0.14 * own.height) : int(1.16 * own.height), int(0.14 * own.width) : int(1.16 * own.width)] = False
+    ring = seen & past
+    assert ring.sum() > 50
+    assert render(asset, wide).opacity[ring].mean() > 0.9 > 0.8 > render(without, wide).opacity[ring].mean()
+    assert (tmp_path / "with" / "out" / BakeOutputs.asset).stat().st_size <= 2**19
 
 
 def test_nothing_is_baked_where_the_cameras_pass(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
