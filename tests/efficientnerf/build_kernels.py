@@ -20,6 +20,7 @@ from triton.compiler import ASTSource
 from triton.runtime.jit import JITFunction
 
 GENERATIONS = (80, 90)  # compute capability: A100 and RTX 30 run code for 8.0, H100 and H200 that for 9.0
+DEGREES = (0, 2, 4)  # of harmonics: none, the usual, the most
 TYPES = {
     torch.float32: "*fp32", torch.float16: "*fp16", torch.int64: "*i64", torch.int32: "*i32", torch.int8: "*i8", torch.uint8: "*u8", torch.bool: "*i1",
 }  # fmt: skip
@@ -97,7 +98,7 @@ def images() -> None:
     from tests.efficientnerf.trees import random_cascades, random_tree
 
     camera = Camera("view", 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), np.eye(4))
-    for degree in range(5):
+    for degree in DEGREES:
         tree = cuda_tree.device_tree(random_tree(0, degree=degree, brick=4), "cpu")
         cuda_tree.render_image(tree, camera, background=(1.0, 1.0, 1.0))
         if degree == 2:
@@ -112,7 +113,7 @@ def fit() -> None:
     from tests.efficientnerf.trees import random_cascades, random_tree
 
     rays = tree_gradients.Rays(torch.zeros(8, 3), torch.ones(8, 3), torch.ones(8, 3))
-    trees = [random_tree(0, degree=degree, brick=4) for degree in range(5)]
+    trees = [random_tree(0, degree=degree, brick=4) for degree in DEGREES]
     for tree in [*trees, random_tree(0, degree=2, brick=4, lookup="nearest"), random_cascades(0, degree=2, brick=4)]:
         g, count, width = tree_gradients.device_grid(tree, "cpu"), len(tree.density_values), 3 * tree.harmonics_count
         values, squares = (torch.zeros(count), torch.zeros(count, width)), (torch.zeros(count), torch.zeros(count))

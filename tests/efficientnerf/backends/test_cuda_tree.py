@@ -114,8 +114,9 @@ def test_palettes_are_decoded() -> None:
     coded = replace(tree, harmonics=codes)
     plain = replace(tree, harmonics=codes.decoded())
     origins, directions = rays_at(tree, 40)
-    for name in ("colour", "opacity"):
-        assert np.array_equal(getattr(device_rays(coded, origins, directions), name), getattr(device_rays(plain, origins, directions), name))
+    by_codes, by_values = (device_rays(each, origins, directions) for each in (coded, plain))
+    assert np.array_equal(by_codes.colour, by_values.colour)
+    assert np.array_equal(by_codes.opacity, by_values.opacity)
 
 
 def test_rays_of_another_frame_have_the_colours_along_those_of_the_world() -> None:
@@ -128,7 +129,7 @@ def test_rays_of_another_frame_have_the_colours_along_those_of_the_world() -> No
     agree(Rendering(*(t.cpu().numpy() for t in found)), Rendering(*render_rays(tree, origins, directions, looking)), faces=0.02)
 
 
-@pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(1, 3, 1, "trilinear"), (2, 1, 0, "trilinear"), (3, 4, 2, "trilinear"), (3, 2, 1, "nearest")])
+@pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(1, 3, 1, "trilinear"), (3, 4, 2, "trilinear"), (3, 2, 1, "nearest")])
 def test_rays_through_cascades_are_those_of_the_torch_function(count: int, brick: int, degree: int, lookup: str) -> None:
     tree = replace(random_cascades(count, count=count, brick=brick, degree=degree, lookup=lookup), environment=None)
     origins, directions = nested_rays(tree, 80)
@@ -145,7 +146,7 @@ def test_rays_through_cascades_are_those_of_the_torch_function(count: int, brick
 def test_images_of_cascades_lie_over_the_environment_or_the_background(supersample: int, background: tuple[float, float, float] | None) -> None:
     tree = random_cascades(2, degree=1, share=0.3)
     tree = replace(tree, density_values=tree.density_values / 4)
-    side = 10 // supersample
+    side = 8 // supersample
     camera = replace(looking(tree, side), model="PINHOLE", params=(0.6 * side, 0.55 * side, 0.5 * side, 0.6 * side))
     found = device_image(tree, camera, background=background, supersample=supersample)
     agree(found, render(tree, camera, background=background, supersample=supersample), faces=0.05)  # normals beside the face of a box

@@ -43,7 +43,7 @@ def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opa
     assert (found[1] != 0).mean() > 0.15
 
 
-@pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(2, 2, 1, "trilinear"), (3, 3, 0, "trilinear"), (3, 2, 1, "nearest")])
+@pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(3, 3, 1, "trilinear"), (3, 2, 1, "nearest")])
 def test_values_and_gradients_through_cascades_are_those_of_autograd(count: int, brick: int, degree: int, lookup: str) -> None:
     tree = replace(random_cascades(count, count=count, brick=brick, degree=degree, lookup=lookup), environment=None)
     tree = replace(tree, density_values=tree.density_values / 8)
@@ -101,7 +101,7 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
 
 
 def fitted(
-    targets: Targets, tree: NerfTree, until: list[int], rays: int = 16, steps: int = 4, total_variation: float = 0.0
+    targets: Targets, tree: NerfTree, until: list[int], rays: int = 16, steps: int = 3, total_variation: float = 0.0
 ) -> tuple[RefinementState, list[float]]:
     """Steps in one go, or in several with the state fetched in between, as a checkpoint does."""
     o = initial_state(tree)
@@ -129,15 +129,15 @@ def test_steps_are_those_of_the_cpu(tree: NerfTree, total_variation: float) -> N
     on_host = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     on_device = on_host.sent(DEVICE)
     assert on_device.on_device
-    ours, errors = fitted(on_device, tree, [4], total_variation=total_variation)
-    theirs, wanted = fitted(on_host, tree, [4], total_variation=total_variation)
+    ours, errors = fitted(on_device, tree, [3], total_variation=total_variation)
+    theirs, wanted = fitted(on_host, tree, [3], total_variation=total_variation)
     assert (ours.visits == theirs.visits).mean() > 0.99
     assert len(np.unique(theirs.visits)) > 2
     for name in ("density", "sh", "square_density", "square_sh"):
         a, b = getattr(ours, name), getattr(theirs, name)
         assert (np.abs(a - b) > 1e-3 * np.abs(b) + 1e-3 * np.abs(b).max()).mean() < 0.02, name
     assert errors[0] == pytest.approx(wanted[0], rel=1e-5)
-    assert errors == [errors[0]] * 4  # nothing later has arrived
+    assert errors == [errors[0]] * 3  # nothing later has arrived
     assert error(ours.result(), on_device, 60, 0) == pytest.approx(error(theirs.result(), on_host, 60, 0), rel=1e-2)
 
 
@@ -153,7 +153,7 @@ def test_voxels_beside_are_a_step_away(tree: NerfTree) -> None:
 
 def test_interrupted_or_not_the_bytes_are_the_same() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0)).sent(DEVICE)
-    whole, apart = (fitted(targets, ball_tree(8), until)[0] for until in ([4], [1, 3, 4]))
+    whole, apart = (fitted(targets, ball_tree(4), until)[0] for until in ([3], [1, 3]))
     for name in STATE:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 
