@@ -18,13 +18,14 @@ from efficientnerf.backends.kernel_cache import cache_folder, first_private
 from pipeline import files
 from pipeline.errors import CorruptArtifact
 from pipeline.hashes import CHUNK
-from pipeline.manifest import read_manifest
+from pipeline.manifest import DISTRIBUTION, read_manifest
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs, SplatsInputs, SplatsOutputs, needs_of
 from stages.viewer.html import LARGEST
 
 VIEWER, ASSET_VIEWER = "viewer.html", "viewer_asset.html"
 PAGES = ("report.html", VIEWER, ASSET_VIEWER)  # of a run
+UNSIGNED = "0.1.0"  # the version whose pages have no such line
 KEY = 32  # bytes, as many as a SHA-256 has
 _LINE = re.compile(rb"<!-- enerf ([0-9a-f]{64}) ([0-9a-f]{64}) -->\n")
 _LENGTH = len("<!-- enerf   -->\n") + 2 * 64
@@ -51,7 +52,26 @@ def is_own(path: Path) -> bool:
 
 def altered_pages(run: Path) -> list[str]:
     """The names of those pages of a run that are not as they were written."""
-    return [name for name in PAGES if os.path.lexists(run / name) and not is_as_written(run / name)]
+    found = [name for name in PAGES if os.path.lexists(run / name) and not is_as_written(run / name)]
+    return [name for name in found if _has_line(run / name)] if found and _versions(run) == {UNSIGNED} else found
+
+
+def _versions(run: Path) -> set[str]:
+    """Of this program, that made the artifacts of a run; empty where one cannot be read."""
+    try:
+        return {read_manifest(path.parent).versions.get(DISTRIBUTION, "") for path in run.glob("*/manifest.json")}
+    except (CorruptArtifact, OSError):
+        return set()
+
+
+def _has_line(path: Path) -> bool:
+    """Whether a page ends as a signed one does. True for what is no plain file."""
+    try:
+        with open(files.open_plain(path, follow=False), "rb") as file:
+            file.seek(-min(_LENGTH, os.fstat(file.fileno()).st_size), os.SEEK_END)
+            return b"<!-- enerf " in file.read()
+    except OSError:
+        return True
 
 
 def _read(path: Path) -> tuple[str, str] | None:

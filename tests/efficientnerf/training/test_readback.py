@@ -135,7 +135,7 @@ def test_padded_steps_learn_what_counted_ones_do_and_no_line_of_them_waits(strat
     """The whole step by the CUDA kernels, interpreted: padded from the fourth step on, and counted exactly. Losses, counts and voxels are the same."""
     steps, voxels, waits = {}, {}, {}
     for exact in (2, 1000):
-        m = model_of(strategy, iterations=7)
+        m = model_of(strategy, iterations=6)
         steps[exact], waits[exact] = watched(loop.train(loop.trainer(m), pixels(3, 8), readback=quick_readback(exact)))
         voxels[exact] = m.voxels.values
     assert waits[2] == []
@@ -182,7 +182,7 @@ def watched(running: Iterator[loop.Progress]) -> tuple[list[loop.Progress], list
 def test_no_line_of_a_step_on_photographs_waits(interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """With exposures, sparse depth and exploration."""
     monkeypatch.setattr(dispatch, "composite", compositing.composite)
-    m = model_of("contracted", iterations=7, exploration_fraction=0.1)
+    m = model_of("contracted", iterations=6, exploration_fraction=0.1)
     origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
     sparse_depth = SparseDepthRays(origins, directions, np.full(8, 3.0, np.float32))
     running = loop.train(loop.trainer(m, exposure_of(cameras(3, 8))), pixels(3, 8), sparse_depth, readback=quick_readback())

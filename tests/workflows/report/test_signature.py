@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline import manifest
 from tests.workflows.command import Enerf
 from workflows.report import signature
 from workflows.report.signature import PAGES, is_as_written, is_own, write_page
@@ -86,8 +87,9 @@ def test_without_a_place_for_a_key_pages_are_known_to_this_process_alone(page: P
     assert not is_own(page)
 
 
-def test_an_altered_page_is_reported_and_made_again(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+def test_an_altered_page_is_reported_and_made_again(enerf: Enerf, toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = tmp_path / "run"
+    monkeypatch.setattr(manifest, "tool_versions", lambda: (("efficientnerf", "0.2.0"),))
     assert enerf("run", toys, "--out", run).code == 0
     assert enerf("verify", run).code == 0
     for name in PAGES:
@@ -98,6 +100,17 @@ def test_an_altered_page_is_reported_and_made_again(enerf: Enerf, toys: Path, tm
         assert enerf("run", "--out", run).code == 0
         assert enerf("verify", run).code == 0
         assert not (run / name).exists() or is_own(run / name)
+
+
+def test_a_page_of_the_version_that_signed_none_is_no_damage(enerf: Enerf, toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    monkeypatch.setattr(manifest, "tool_versions", lambda: (("efficientnerf", "0.1.0"),))
+    assert enerf("run", toys, "--out", run).code == 0
+    signed = (run / "report.html").read_bytes()
+    (run / "report.html").write_bytes(b"<!doctype html>")
+    assert enerf("verify", run).code == 0
+    (run / "report.html").write_bytes(b"?" + signed)
+    assert enerf("verify", run).code == 4
 
 
 @pytest.mark.parametrize("command", [("run", "--out"), ("report",), ("stage", "train")])
