@@ -74,7 +74,7 @@ def test_listings_that_cannot_be_written_end_with_3(toys: Path, tmp_path: Path) 
     codes = [0]
     listed = [["status", run], ["presets"], ["--help"]]
     for arguments in (*listed, ["verify", run], ["report", run], ["run", "--out", run]):
-        for as_json in (False, True) if arguments != ["--help"] else (False,):
+        for as_json in (False, True) if arguments in listed[:2] else (False,):
             cases += [{**streams, "arguments": arguments + ["--json"] * as_json} for streams in FEW]
             codes += [expected(streams, as_json=as_json, listing=arguments in listed) for streams in FEW]
     for case, code, result in zip(cases, codes, called(toys, cases), strict=True):
@@ -98,7 +98,7 @@ def test_what_is_opened_does_not_take_the_place_of_a_closed_stream(toys: Path, t
         assert b"stray" not in b"".join(path.read_bytes() for path in others)
 
 
-LOCALES = ({"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, {"LC_ALL": "C"})
+LOCALES = ({"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"})
 
 
 @pytest.mark.parametrize("locale", LOCALES)
