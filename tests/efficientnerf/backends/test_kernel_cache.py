@@ -82,7 +82,7 @@ def write(package: Path, sources: dict[str, str]) -> None:
 
 def run(package: Path, program: str = PROGRAM, **environment: str) -> dict[str, Any]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
-    environment = {**kept, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(package.parent), "PYTHONSAFEPATH": "1", **environment}
+    environment = {**kept, "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(package.parent), "PYTHONSAFEPATH": "1", **environment}
     done = subprocess.run([sys.executable, "-c", program], env=environment, cwd=package.parent, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return {**json.loads(done.stdout), "stderr": done.stderr}
