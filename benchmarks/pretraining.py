@@ -31,7 +31,7 @@ from efficientnerf.training.pretraining import FAR, SETTINGS, SOURCES, WHITE, Po
 from stages.evaluate.views import evenly_spaced, subsample, subsample_camera
 from stages.io.field_file import write_tensors
 from stages.io.png import read_png
-from workflows.paper.priors import PRIORS, pretrained
+from workflows.paper.pretrained import NETWORKS, pretrained_network
 
 HELD_OUT = 10
 
@@ -52,15 +52,15 @@ def read_scene(folder: Path, shrink: int = 1) -> PosedImages:
 
 def train(scenes: list[PosedImages], method: str, out: Path, begin: Path | None, steps: int, minutes: float, seed: int) -> None:
     torch.manual_seed(seed)
-    prior = pretrained(method, begin) if begin else PRIORS[method]()
+    network = pretrained_network(method, begin) if begin else NETWORKS[method]()
     begun, used, errors = time.perf_counter(), time.process_time(), []
-    for step, error in enumerate(pretrain(prior, scenes, steps, seed, minutes=minutes), 1):
+    for step, error in enumerate(pretrain(network, scenes, steps, seed, minutes=minutes), 1):
         errors.append(error)
         if step % 100 == 0:
-            write_tensors(prior.state_dict(), {"prior": method}, out)
+            write_tensors(network.state_dict(), {"network": method}, out)
             wall, cpu = time.perf_counter() - begun, time.process_time() - used
             print(f"step {step}: {-10 * np.log10(np.mean(errors[-100:])):.2f} dB, {wall:.0f} s, {cpu:.0f} s of a core", flush=True)
-    write_tensors(prior.state_dict(), {"prior": method}, out)
+    write_tensors(network.state_dict(), {"network": method}, out)
 
 
 def warped(sources: SourceViews, camera: Camera) -> np.ndarray:
@@ -80,16 +80,16 @@ def warped(sources: SourceViews, camera: Camera) -> np.ndarray:
 
 def measure(scenes: list[PosedImages], method: str, weights: Path, views: int) -> dict[str, float]:
     """Mean PSNR over held-out views, every second pixel of every second row: of the network with both samplings, and of the nearest views warped."""
-    prior = pretrained(method, weights)
+    network = pretrained_network(method, weights)
     found: dict[str, list[float]] = {"uniform": [], "efficient": [], "warped": []}
     for scene in scenes:
         for target in evenly_spaced(len(scene.cameras), views):
             (sources, references), camera = scene.sources(target, SOURCES), subsample_camera(scene.cameras[target], 2)
             truth = subsample(scene.over_white(np.array([target]))[0], 2)
             with torch.no_grad():
-                prior.observe(sources, references)
+                network.observe(sources, references)
             for sampling in ("uniform", "efficient"):
-                m = model(scene.space, replace(SETTINGS, sampling=sampling), WHITE, fields=(prior.coarse, prior.fine))
+                m = model(scene.space, replace(SETTINGS, sampling=sampling), WHITE, fields=(network.coarse, network.fine))
                 found[sampling].append(psnr(np.clip(FieldRenderer(m, 0.0, FAR).render(camera).colour, 0, 1), truth))
             found["warped"].append(psnr(warped(sources, camera), truth))
     return {name: float(np.mean(values)) for name, values in found.items()}
@@ -99,7 +99,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["train", "measure"])
     parser.add_argument("scenes", type=Path)
-    parser.add_argument("method", choices=list(PRIORS))
+    parser.add_argument("method", choices=list(NETWORKS))
     parser.add_argument("weights", type=Path)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--minutes", type=float, default=math.inf, help="end sooner, the learning rate falling by then")

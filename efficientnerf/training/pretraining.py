@@ -35,7 +35,7 @@ SETTINGS = TrainSettings(
     occupancy_rule="momentum", occupancy_resolution=8,
 )  # fmt: skip
 FAR = 100.0  # beyond every box
-Prior = IbrNet | MvsNerf
+SourceViewNetwork = IbrNet | MvsNerf
 
 
 @dataclass(frozen=True)
@@ -69,21 +69,21 @@ class PosedImages:
 
 
 def pretrain(
-    prior: Prior, scenes: Sequence[PosedImages], steps: int, seed: int = 0, learning_rate: float = 3e-3, minutes: float = math.inf
+    network: SourceViewNetwork, scenes: Sequence[PosedImages], steps: int, seed: int = 0, learning_rate: float = 3e-3, minutes: float = math.inf
 ) -> Iterator[float]:
     """Train, yielding the fine colours' mean squared error after each step, to whichever comes first of steps and minutes: the learning rate has then fallen to
     a tenth. All scenes have boxes of one size."""
-    m = model(scenes[0].space, SETTINGS, WHITE, fields=(prior.coarse, prior.fine))
-    uniform = model(scenes[0].space, replace(SETTINGS, sampling="uniform"), WHITE, fields=(prior.coarse, prior.fine))
-    adam = Adam([ParameterGroup(dict(prior.named_parameters()))], beta2=0.99, epsilon=1e-8)
+    m = model(scenes[0].space, SETTINGS, WHITE, fields=(network.coarse, network.fine))
+    uniform = model(scenes[0].space, replace(SETTINGS, sampling="uniform"), WHITE, fields=(network.coarse, network.fine))
+    adam = Adam([ParameterGroup(dict(network.named_parameters()))], beta2=0.99, epsilon=1e-8)
     begun, share, number = time.monotonic(), 0.0, 0
     while share < 1:
         number += 1
         rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, number]))
         scene = scenes[int(rng.integers(len(scenes)))]
         target = int(rng.integers(len(scene.cameras)))
-        elsewhere = rng.integers(len(scene.cameras), size=rng.integers(prior.most_elsewhere + 1))
-        prior.observe(*scene.sources(target, SOURCES, elsewhere.tolist()))
+        elsewhere = rng.integers(len(scene.cameras), size=rng.integers(network.most_elsewhere + 1))
+        network.observe(*scene.sources(target, SOURCES, elsewhere.tolist()))
         loss, fine = _loss(m if number % 2 else uniform, scene, target, rng)
         loss.backward()
         adam.step(number, learning_rate * min(1, number / RAMP) * 0.1**share)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from workflows.paper import priors
+from workflows.paper import pretrained
 from workflows.paper.result import PAPER, Request, Result
 from workflows.paper.runs import CONVERGED_PSNR, Figures, Row, measured, scenes, settings_of
 
@@ -135,7 +135,7 @@ def modules(request: Request) -> Result:
 
 
 def strategies(request: Request) -> Result:
-    """Table 6: NeRF, and NeRF-SH, which PlenOctree trains, from nothing; IBRNet and MVSNeRF finetuned (`workflows.paper.priors`)."""
+    """Table 6: NeRF, and NeRF-SH, which PlenOctree trains, from nothing; IBRNet and MVSNeRF finetuned (`workflows.paper.pretrained`)."""
     cases: list[tuple[str, str, str, dict[str, Any], float, float]] = [
         ("NeRF", "uniform", "nerf-uniform", {**NERF, "sampling": "uniform"}, 41.0, 30.06),
         ("NeRF", "NeRF", "nerf", NERF, 56.0, 31.01),
@@ -144,7 +144,7 @@ def strategies(request: Request) -> Result:
         ("PlenOctree", "ours", "n4", {}, 6.0, 31.66),
     ]
     pace = [column for column in PACE if not column.endswith(PAPER)]
-    columns = ["method", "sampling", "training, hours", "training, hours" + PAPER, *pace, priors.EQUAL, "PSNR", "PSNR" + PAPER]
+    columns = ["method", "sampling", "training, hours", "training, hours" + PAPER, *pace, pretrained.EQUAL, "PSNR", "PSNR" + PAPER]
     rows = [Row(name, changes) for _, _, name, changes, *_ in cases]
     means, curves = _means(request, rows)
     table = [
@@ -152,7 +152,7 @@ def strategies(request: Request) -> Result:
         | {"PSNR": _mean(f.psnr for f in figures), "PSNR" + PAPER: psnr, **{name: _pace(figures, None)[name] for name in pace}}
         for (field, sampling, _, _, hours, psnr), figures in zip(cases, means, strict=True)
     ]
-    finetuned = priors.rows(request, scenes(_data(request)), settings_of(Row("priors"), request.scale))
+    finetuned = pretrained.rows(request, scenes(_data(request)), settings_of(Row("pretrained"), request.scale))
     notes = [
         "Uniform: 64 + 128 even samples through the fine network alone, the number that the paper's times imply (41 h to 56 h as 192 to 256 evaluations).",
         "Our sampling is N4 with the lightweight coarse network.",

@@ -18,7 +18,7 @@ from efficientnerf.model import model
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.sampling.occupancy import sweep_cells
 from efficientnerf.training.occupancy_update import sweep_occupancy
-from efficientnerf.training.pretraining import SETTINGS, WHITE, PosedImages, Prior, pretrain
+from efficientnerf.training.pretraining import SETTINGS, WHITE, PosedImages, SourceViewNetwork, pretrain
 from tests.efficientnerf.balls import cameras, picture
 
 BOX = BoundedSpace(np.array([[-1.0, -0.8, -0.9], [1.0, 0.8, 0.9]]))
@@ -178,16 +178,16 @@ def test_the_cost_volume_is_that_of_a_loop_over_voxels() -> None:
 
 
 @pytest.fixture(params=[IbrNet, MvsNerf])
-def prior(request: pytest.FixtureRequest) -> Prior:
+def network(request: pytest.FixtureRequest) -> SourceViewNetwork:
     torch.manual_seed(0)
-    out: Prior = request.param()
+    out: SourceViewNetwork = request.param()
     out.observe(views(), torch.tensor([0, 2]))
     return out
 
 
-def test_rays_do_not_depend_on_the_others_of_their_bundle(prior: Prior) -> None:
+def test_rays_do_not_depend_on_the_others_of_their_bundle(network: SourceViewNetwork) -> None:
     points, directions, first = bundle()
-    for field in (prior.coarse, prior.fine):
+    for field in (network.coarse, network.fine):
         whole = field.along_rays(points, directions, first)
         alone = [
             field.along_rays(points[first[r] : first[r + 1]], directions[r : r + 1], torch.tensor([0, int(first[r + 1] - first[r])]))
@@ -197,25 +197,25 @@ def test_rays_do_not_depend_on_the_others_of_their_bundle(prior: Prior) -> None:
         assert field.along_rays(points[:0], directions, torch.zeros_like(first)).shape == (0, 4)
 
 
-def test_colours_blend_those_of_the_source_views_and_a_colour_survives_its_logit(prior: Prior) -> None:
+def test_colours_blend_those_of_the_source_views_and_a_colour_survives_its_logit(network: SourceViewNetwork) -> None:
     colour = torch.rand(4, 3)
     torch.testing.assert_close(torch.sigmoid(as_logit(colour)), colour, atol=2e-3, rtol=0)
     points, directions, first = bundle()
     grey = SourceViews(torch.full_like(views().colour, 0.25), *(getattr(views(), n) for n in ("pixels_from_world", "centre", "low", "extent")))
-    prior.observe(grey, torch.tensor([0]))
-    if isinstance(prior, IbrNet):  # MVSNeRF's colour is corrected by its network
-        found = torch.sigmoid(prior.fine.along_rays(points, directions, first)[:, 1:])
+    network.observe(grey, torch.tensor([0]))
+    if isinstance(network, IbrNet):  # MVSNeRF's colour is corrected by its network
+        found = torch.sigmoid(network.fine.along_rays(points, directions, first)[:, 1:])
         torch.testing.assert_close(found, torch.full((len(points), 3), 0.25), atol=1e-4, rtol=0)
 
 
-def test_gradients_are_those_of_differences(prior: Prior) -> None:
+def test_gradients_are_those_of_differences(network: SourceViewNetwork) -> None:
     """Of every parameter that the fine field has or sees, along a random direction."""
     points, directions, first = bundle()
-    parameters = [p for name, p in prior.named_parameters() if not name.startswith("coarse")]
+    parameters = [p for name, p in network.named_parameters() if not name.startswith("coarse")]
 
     def total() -> Tensor:
-        prior.observe(views(), torch.tensor([0]))
-        return prior.fine.along_rays(points, directions, first).sum()
+        network.observe(views(), torch.tensor([0]))
+        return network.fine.along_rays(points, directions, first).sum()
 
     loss = total()
     gradients = torch.autograd.grad(loss, parameters)
@@ -233,12 +233,12 @@ def test_gradients_are_those_of_differences(prior: Prior) -> None:
     assert (found[0] - found[1]) / 4e-3 == pytest.approx(expected, rel=0.1, abs=0.1)
 
 
-def test_a_settled_field_is_a_field_of_a_model_and_renders(prior: Prior) -> None:
-    prior.settle()
-    m = model(BOX, SETTINGS, WHITE, fields=(prior.coarse, prior.fine))
+def test_a_settled_field_is_a_field_of_a_model_and_renders(network: SourceViewNetwork) -> None:
+    network.settle()
+    m = model(BOX, SETTINGS, WHITE, fields=(network.coarse, network.fine))
     names = [name for name, _ in m.parameters()]
     assert len(names) == len(set(names))
-    assert ("fine.volume" in names) == isinstance(prior, MvsNerf)
+    assert ("fine.volume" in names) == isinstance(network, MvsNerf)
     assert m.coarse.density(torch.rand(5, 3)).shape == (5,)
     image = FieldRenderer(m, 0.0, 10.0).render(CAMERAS[0]).colour
     assert image.shape == (CAMERAS[0].height, CAMERAS[0].width, 3)
@@ -246,8 +246,8 @@ def test_a_settled_field_is_a_field_of_a_model_and_renders(prior: Prior) -> None
     assert SIDE % 4 == 0
 
 
-def test_a_sweep_sets_every_voxel_to_the_density_at_a_point_in_it(prior: Prior) -> None:
-    m = model(BOX, SETTINGS, WHITE, fields=(prior.coarse, prior.fine))
+def test_a_sweep_sets_every_voxel_to_the_density_at_a_point_in_it(network: SourceViewNetwork) -> None:
+    m = model(BOX, SETTINGS, WHITE, fields=(network.coarse, network.fine))
     _, points = sweep_cells(m.voxels, 0, 1, 3)
     with torch.no_grad():
         expected = m.coarse.density(points)
@@ -278,12 +278,12 @@ def test_source_views_for_a_target_leave_it_out_and_name_the_nearest_of_each_gro
         assert references[0] == 0
 
 
-def test_training_over_scenes_reaches_every_parameter(prior: Prior) -> None:
+def test_training_over_scenes_reaches_every_parameter(network: SourceViewNetwork) -> None:
     images = np.stack([picture(camera) for camera in CAMERAS])
     scene = PosedImages(BoundedSpace(np.array([[-1.0] * 3, [1.0] * 3])), CAMERAS, images)
-    before = {name: p.detach().clone() for name, p in prior.named_parameters()}
-    assert np.isfinite(list(pretrain(prior, [scene], 2))).all()
-    assert {name for name, p in prior.named_parameters() if (p == before[name]).all()} == set()
+    before = {name: p.detach().clone() for name, p in network.named_parameters()}
+    assert np.isfinite(list(pretrain(network, [scene], 2))).all()
+    assert {name for name, p in network.named_parameters() if (p == before[name]).all()} == set()
 
 
 def test_source_views_need_a_pinhole_and_a_box() -> None:

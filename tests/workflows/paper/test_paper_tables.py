@@ -9,9 +9,9 @@ import pytest
 from tests.workflows.paper.scenes import ball
 from workflows.cli.main import main
 from workflows.paper import document as paper
-from workflows.paper import priors, tables
+from workflows.paper import pretrained, tables
 from workflows.paper.document import PAPER, Request
-from workflows.paper.priors import Finetuned
+from workflows.paper.pretrained import Finetuned
 from workflows.paper.runs import Figures, Row, _pace, settings_of
 
 
@@ -58,8 +58,8 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         return Finetuned(0.1, 1.0, 10.0, 20.0, [1.0, 2.0, 3.0], [15.0, 20.0, 25.0 if sampling == "uniform" else 24.0])
 
     monkeypatch.setattr(tables, "measured", measured)
-    monkeypatch.setattr(priors, "finetuned", finetuned)
-    monkeypatch.setattr(priors, "weights_of", lambda method: tmp_path)
+    monkeypatch.setattr(pretrained, "finetuned", finetuned)
+    monkeypatch.setattr(pretrained, "weights_of", lambda method: tmp_path)
     ball(tmp_path / "scenes" / "chair")
     paper.make(number, Request(tmp_path / "scenes", tmp_path / "out", 0.001))
     document = json.loads((tmp_path / "out" / f"table_{number}.json").read_text())
@@ -68,7 +68,7 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
     assert (tmp_path / "out" / f"table_{number}.png").exists()
     if number == "6":
         assert [row["method"] for row in document["rows"]] == ["NeRF"] * 3 + ["IBRNet"] * 2 + ["MVSNeRF"] * 2 + ["PlenOctree"] * 2
-        assert [row.get(priors.EQUAL) for row in document["rows"][3:5]] == [2.8, 3.0]
+        assert [row.get(pretrained.EQUAL) for row in document["rows"][3:5]] == [2.8, 3.0]
     if number == "5":
         assert document["rows"][0]["method"] == "NeRF"
         for column in ("less time %", "less time %" + PAPER):

@@ -25,7 +25,7 @@ from efficientnerf.model import Model, model
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training import loop
 from efficientnerf.training.occupancy_update import sweep_occupancy
-from efficientnerf.training.pretraining import Prior
+from efficientnerf.training.pretraining import SourceViewNetwork
 from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
 from pipeline.run import NAME, Run
@@ -38,7 +38,7 @@ from stages.train.data import depth_range, pixels_of
 from workflows import asset
 from workflows.paper.result import PAPER, Request, Result
 
-PRIORS: dict[str, type[IbrNet] | type[MvsNerf]] = {"ibrnet": IbrNet, "mvsnerf": MvsNerf}
+NETWORKS: dict[str, type[IbrNet] | type[MvsNerf]] = {"ibrnet": IbrNet, "mvsnerf": MvsNerf}
 Sampling = Literal["uniform", "efficient"]
 BOTH: tuple[Sampling, Sampling] = ("uniform", "efficient")
 WEIGHTS = Path(__file__).parent / "weights"
@@ -81,11 +81,11 @@ def weights_of(method: str) -> Path:
     return WEIGHTS / f"{method}.safetensors"
 
 
-def pretrained(method: str, path: Path | None = None) -> Prior:
+def pretrained_network(method: str, path: Path | None = None) -> SourceViewNetwork:
     """The network of a method with its weights; None: those of this package."""
-    prior = PRIORS[method]()
-    prior.load_state_dict(read_tensors(path or weights_of(method))[0])
-    return prior
+    network = NETWORKS[method]()
+    network.load_state_dict(read_tensors(path or weights_of(method))[0])
+    return network
 
 
 def finetuning_settings(train: dict[str, Any], sampling: Sampling, seed: int) -> TrainSettings:
@@ -102,24 +102,24 @@ def finetuning_settings(train: dict[str, Any], sampling: Sampling, seed: int) ->
 
 def finetuned(request: Request, data: Path, method: str, sampling: Sampling, settings: dict[str, dict[str, Any]], seed: int) -> Finetuned:
     """Finetune on a scene, or read what an earlier call found. `settings` are those of the other rows."""
-    folder = request.out / "runs" / data.name / "priors"
+    folder = request.out / "runs" / data.name / "pretrained"
     run = Run.open(folder) if (folder / NAME).exists() else Run.create(folder, data.resolve(), settings, device=request.device)
     with run.locked():
         run.update(source=data.resolve(), settings=settings)
         run_stages(run, [stage for stage in asset.STAGES if stage.name == "poses"], device=request.device, report=request.report)
     train = finetuning_settings(settings["train"], sampling, seed)
-    prior = pretrained(method)
-    key = {"weights": digest_of(dict(prior.state_dict())), "settings": dataclasses.asdict(train)}
+    network = pretrained_network(method)
+    key = {"weights": digest_of(dict(network.state_dict())), "settings": dataclasses.asdict(train)}
     kept = folder / f"{method}-{sampling}-{seed}.json"
     if kept.exists() and (found := json.loads(kept.read_text(encoding="utf-8")))["of"] == key:
         return Finetuned(**found["figures"])
     request.say(f"{data.name}, {method}, {sampling} sampling, seed {seed}: finetuning {train.iterations} steps")
-    out = _finetune(run.folder("poses"), prior, train)
+    out = _finetune(run.folder("poses"), network, train)
     write_json(kept, {"of": key, "figures": dataclasses.asdict(out)})
     return out
 
 
-def _finetune(folder: Path, prior: Prior, settings: TrainSettings) -> Finetuned:
+def _finetune(folder: Path, network: SourceViewNetwork, settings: TrainSettings) -> Finetuned:
     s = scene.load(folder)
     views, space = scene.views_of(s, "train"), space_of(s)
     pixels = pixels_of(folder, views)
@@ -129,7 +129,7 @@ def _finetune(folder: Path, prior: Prior, settings: TrainSettings) -> Finetuned:
     images = np.stack([ground_truth(folder, view, s.background).colour for view in views])
 
     used = time.process_time()
-    m = observed(prior, space, views, images, settings, s.background)
+    m = observed(network, space, views, images, settings, s.background)
     t = loop.trainer(m, cameras=[view.camera for view in views])
     spent = begun = time.process_time() - used
     renderer, due = FieldRenderer(m, near, far), [round(share * settings.iterations) for share in CHECKS]
@@ -147,14 +147,15 @@ def _finetune(folder: Path, prior: Prior, settings: TrainSettings) -> Finetuned:
 
 
 def observed(
-    prior: Prior, space: BoundedSpace, views: tuple[View, ...], images: np.ndarray, settings: TrainSettings, background: tuple[float, float, float] | None
-) -> Model:
+    network: SourceViewNetwork, space: BoundedSpace, views: tuple[View, ...], images: np.ndarray, settings: TrainSettings,
+    background: tuple[float, float, float] | None,
+) -> Model:  # fmt: skip
     """A model whose fields have seen the training views, (V, H, W, 3) in 0-1, before any step."""
     sources = source_views(space, [view.camera for view in views], images)
     with torch.no_grad():
-        prior.observe(sources, torch.tensor(evenly_spaced(len(views), REFERENCES)))
-    prior.settle()
-    m = model(space, settings, background, fields=(prior.coarse, prior.fine))
+        network.observe(sources, torch.tensor(evenly_spaced(len(views), REFERENCES)))
+    network.settle()
+    m = model(space, settings, background, fields=(network.coarse, network.fine))
     m.voxels.threshold = LEAST_DENSITY
     if m.prunes:
         sweep_occupancy(m, settings.seed)
@@ -172,7 +173,7 @@ def _psnr(renderer: FieldRenderer, folder: Path, views: tuple[View, ...], backgr
 
 def rows(request: Request, data: Sequence[Path], settings: dict[str, dict[str, Any]]) -> Result:
     """The rows of IBRNet and MVSNeRF: means over scenes and SEEDS; no columns."""
-    if not all(weights_of(method).exists() for method in PRIORS):
+    if not all(weights_of(method).exists() for method in NETWORKS):
         return Result([], [], [f"IBRNet and MVSNeRF are left out: python -m benchmarks.pretraining has made no weights in {WEIGHTS}."])
     steps = finetuning_settings(settings["train"], "uniform", 0).iterations
     table: list[dict[str, Any]] = []

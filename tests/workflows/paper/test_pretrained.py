@@ -9,10 +9,11 @@ import torch
 from benchmarks.pretraining import warped
 from efficientnerf.fields.source_views import source_views
 from efficientnerf.geometry.spaces import BoundedSpace
+from efficientnerf.training.pretraining import SourceViewNetwork
 from tests.efficientnerf.balls import cameras
 from tests.workflows.paper.scenes import ball
-from workflows.paper import priors
-from workflows.paper.priors import BOTH, CHECKS, Finetuned, finetuned
+from workflows.paper import pretrained
+from workflows.paper.pretrained import BOTH, CHECKS, Finetuned, finetuned
 from workflows.paper.result import Request
 from workflows.paper.runs import Row, settings_of
 
@@ -25,22 +26,22 @@ def test_the_curve_says_when_a_level_is_reached() -> None:
 
 
 def test_the_weights_of_this_package_load_and_are_small() -> None:
-    for method in priors.PRIORS:
-        assert not any(torch.isnan(p).any() for p in priors.pretrained(method).parameters())
-    assert sum(priors.weights_of(method).stat().st_size for method in priors.PRIORS) < 2 * 2**20
+    for method in pretrained.NETWORKS:
+        assert not any(torch.isnan(p).any() for p in pretrained.pretrained_network(method).parameters())
+    assert sum(pretrained.weights_of(method).stat().st_size for method in pretrained.NETWORKS) < 2 * 2**20
 
 
-@pytest.mark.parametrize("method", list(priors.PRIORS))
+@pytest.mark.parametrize("method", list(pretrained.NETWORKS))
 def test_a_finetuning_is_measured_once(method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def untrained(method: str) -> priors.Prior:
+    def untrained(method: str) -> SourceViewNetwork:
         torch.manual_seed(0)
-        return priors.PRIORS[method]()
+        return pretrained.NETWORKS[method]()
 
-    monkeypatch.setattr(priors, "pretrained", untrained)
-    monkeypatch.setattr(priors, "UNIFORM", 16)
+    monkeypatch.setattr(pretrained, "pretrained_network", untrained)
+    monkeypatch.setattr(pretrained, "UNIFORM", 16)
     data, said = ball(tmp_path / "ball"), list[str]()
     request = Request(data, tmp_path / "out", 0.001, say=said.append)
-    settings = settings_of(Row("priors"), 1e-5)
+    settings = settings_of(Row("pretrained"), 1e-5)
     found = [finetuned(request, data, method, sampling, settings, 0) for sampling in BOTH]
     assert len(said) == 2
     assert finetuned(request, data, method, "uniform", settings, 0) == found[0]
