@@ -1,14 +1,11 @@
 """Training pixels on a device: `efficientnerf.training.pixels` without looking them up on the host. R rays, C views, P pixels."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from efficientnerf.backends import dispatch
 from efficientnerf.backends.transfer import to_device
-from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.pixels import Pixels
 
 MEMORY_FRACTION = 0.5  # of the device's free memory: photographs that would take more stay on the host
@@ -21,18 +18,10 @@ class DevicePixels:
     def __init__(self, pixels: Pixels, device: str | torch.device) -> None:
         self.pixels, self.device = pixels, torch.device(device)
         self.offsets, self.width, self.near, self.far = (self._to_device(a) for a in (pixels.offsets, pixels.width, pixels.near, pixels.far))
-        self._send_cameras()
+        self.lens, self.knots, self.rotation = (self._to_device(a) for a in (pixels.lens, pixels.knots, pixels.rotation))
+        self.centre, self.lookup = self._to_device(pixels.centre), self._to_device(pixels.lookup)
         room = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else np.inf
         self.images = self._images_to_device() if pixels.images.nbytes <= MEMORY_FRACTION * room else None
-
-    def _send_cameras(self) -> None:
-        p = self.pixels
-        self.lens, self.knots, self.rotation, self.centre, self.lookup = (self._to_device(a) for a in (p.lens, p.knots, p.rotation, p.centre, p.lookup))
-
-    def set_cameras(self, cameras: Sequence[Camera]) -> None:
-        """See `Pixels.set_cameras`."""
-        self.pixels.set_cameras(cameras)
-        self._send_cameras()
 
     def _to_device(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)

@@ -23,9 +23,7 @@ from efficientnerf.backends import dispatch
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.sampling.samples import complete_rays
-from efficientnerf.training.alignment import is_due, refine_cameras
 from efficientnerf.training.batch import ray_batch, ray_count
-from efficientnerf.training.camera_refinement import CameraCorrections
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure.model import Exposure, exposure_loss, is_learned, places
 from efficientnerf.training.losses import colour_losses, distortion_loss, scale_gradients_by_distance
@@ -69,7 +67,6 @@ class Trainer:
     step: int = 0
     samples_per_ray: float = 0.0  # the running average that sets the number of rays
     exposure: Exposure | None = None  # of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
-    cameras: CameraCorrections | None = None  # corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
     checks: ViewChecks | None = None  # of the training views (`efficientnerf.training.view_checks.checks`), or None
 
 
@@ -78,7 +75,7 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
 
     exposure  of the training images, that is learned; None: none is
     schedule  None: that of the model's settings
-    cameras   of the training images, needed where they are refined or checked
+    cameras   of the training images, needed where they are checked
     """
     schedule = schedule or schedule_of(m.settings)
     groups = parameter_groups(m)
@@ -86,9 +83,8 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
         groups.append(ParameterGroup(exposure.parameters))
     # At first every interval counts as sampled, with as many pivots as allowed.
     samples = float(m.max_intervals + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
-    corrections = CameraCorrections.none(cameras) if m.settings.camera_refinement == "on" and cameras else None
     checks = ViewChecks.none(cameras) if m.settings.wrong_views == "auto" and cameras else None
-    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure, corrections, checks)
+    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure, checks)
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
@@ -96,9 +92,8 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
     moments = {f"adam.{k}.{name}": pair[k] for name, pair in t.adam.moments.items() for k in (0, 1)}
     progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
     exposure = {} if t.exposure is None else {name: values.detach() for name, values in t.exposure.parameters.items()}
-    cameras = {} if t.cameras is None else {f"cameras.{name}": torch.from_numpy(values) for name, values in t.cameras.state.items()}
     checks = {} if t.checks is None else {f"checks.{name}": torch.from_numpy(values) for name, values in t.checks.state.items()}
-    return models.state_of(t.model) | moments | exposure | cameras | checks | {"progress": progress}
+    return models.state_of(t.model) | moments | exposure | checks | {"progress": progress}
 
 
 def restore(t: Trainer, state: dict[str, Tensor]) -> None:
@@ -108,14 +103,9 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     if t.exposure is not None:
         for name, learned in t.exposure.parameters.items():
             learned.data.copy_(state[name])
-    if t.cameras is not None:
-        for name, values in t.cameras.state.items():
-            values[...] = state[f"cameras.{name}"].numpy()
     if t.checks is not None:
         for name, values in t.checks.state.items():
             values[...] = state[f"checks.{name}"].numpy()
-        if t.cameras is not None:
-            t.cameras.given = tuple(t.checks.cameras)
     for name, pair in t.adam.moments.items():
         for k in (0, 1):
             pair[k].copy_(state[f"adam.{k}.{name}"])
@@ -149,10 +139,8 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
     if readback is None and dispatch.on_device(m.voxels.values):
         readback = AsyncReadback()
     if t.checks is not None and t.checks.changed:
-        follow_checks(t.checks, pixels, t.cameras)
+        follow_checks(t.checks, pixels)
     source = DevicePixels(pixels, m.device) if m.device.type == "cuda" else pixels
-    if t.cameras is not None and t.step:
-        source.set_cameras(t.cameras.cameras)
     samples_per_pivot = 0
     while t.step < t.schedule.iterations:
         number = t.step + 1
@@ -189,8 +177,6 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         loss.backward()
         t.adam.step(number, t.schedule.learning_rate_at(number))
         update_occupancy(m, outputs, number, rng, padded=capacity is not None, may_wait=readback is None)
-        if t.cameras is not None and is_due(number, fraction):
-            refine_cameras(m, pixels, source, t.cameras, rng, None if exposure is None else exposure.detached)
 
         t.step = number
         yield _progress(t, rays, fine_loss, outputs, readback)

@@ -96,9 +96,6 @@ class TrainSettings:
         "Whether unbounded scenes learn the exposure and white balance of each photograph, and the vignetting and response of each camera; auto: where"
         " sparse points show that photographs differ.",
     )
-    camera_refinement: Literal["auto", "off", "on"] = setting(
-        "auto", "Whether training refines the poses and the focal length of the training cameras (on) or keeps them (off); auto: off.", advanced=True
-    )
     wrong_views: Literal["auto", "off"] = setting(
         "auto",
         "Whether training views whose cameras contradict the field and other evidence are left out, or get the pose that is found for them; auto: they are;"
@@ -150,7 +147,7 @@ class TrainSettings:
     on_failure: Literal["retry", "continue", "stop"] = setting(
         "retry",
         "What happens if held-out views show after a tenth of the steps that nothing was learned: short trials without near planes, masks or min_views, or"
-        " with exposure or camera_refinement, and a restart with the best (retry); only a warning (continue); or an error (stop).",
+        " with exposure, and a restart with the best (retry); only a warning (continue); or an error (stop).",
         advanced=True,
     )
     checkpoint_every: PositiveInt = setting(250, "Steps between checkpoints.", advanced=True)

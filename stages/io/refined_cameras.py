@@ -1,4 +1,4 @@
-"""cameras.json of the train stage: the training cameras as training left them, and the views that it left out, where it refined or left out any.
+"""cameras.json of the train stage: the training cameras as training left them, and the views that it left out, where it replaced or left out any.
 
 This is the one place that says what views, with what cameras, a field was trained on: what comes after uses `load_scene`.
 """
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from efficientnerf.geometry.cameras import MODELS, Camera
+from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import CorruptArtifact
 from pipeline.files import write_json
 from pipeline.text import printable
@@ -65,9 +65,6 @@ def as_trained(s: Scene, cameras: Mapping[str, Camera], left_out: Collection[str
 
 
 def _with_camera(s: Scene, view: View, camera: Camera) -> View:
-    """The view with another camera, its source camera as well."""
-    factor = camera.intrinsics["fx"] / view.camera.intrinsics["fx"]
-    source = view.source_camera
-    params = tuple(value * factor if name in ("f", "fx", "fy") else value for name, value in zip(MODELS[source.model], source.params, strict=True))
+    """The view with another camera, and its source camera with that one's pose."""
     pose = s.world_from_capture.inverse().pose(camera.world_from_camera)
-    return replace(view, camera=replace(camera, name=view.camera.name), source_camera=replace(source, params=params, world_from_camera=pose))
+    return replace(view, camera=replace(camera, name=view.camera.name), source_camera=replace(view.source_camera, world_from_camera=pose))

@@ -28,20 +28,17 @@ class TrainingChoices:
     masks              whether the views' masks are used
     min_views          whether `train.min_views` is
     exposure           whether exposure of the photographs is learned although the settings do not say so
-    camera_refinement  whether cameras are corrected, likewise
     """
 
     near: Literal["stated", "median", "off"] = "stated"
     masks: bool = True
     min_views: bool = True
     exposure: bool = False
-    camera_refinement: bool = False
 
     def settings(self, given: TrainSettings) -> TrainSettings:
         """The settings with these choices."""
         changes: dict[str, str] = {} if self.min_views else {"min_views": "off"}
         changes |= {"exposure": "on"} if self.exposure else {}
-        changes |= {"camera_refinement": "on"} if self.camera_refinement else {}
         return replace(given, **changes)  # type: ignore[arg-type]
 
     def scene(self, given: Scene) -> Scene:

@@ -24,7 +24,7 @@ MAX_RESOLUTION = 4096
 
 
 def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSettings:
-    """The settings with numbers for `log2_hashmap_size`, `finest_resolution` and `num_coarse_samples`, and with "on" or "off" for `camera_refinement`.
+    """The settings with numbers for `log2_hashmap_size`, `finest_resolution` and `num_coarse_samples`.
 
     pixels  of all training images
     """
@@ -39,5 +39,4 @@ def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSett
         log2_hashmap_size=resolved(settings.log2_hashmap_size) or log2_table,
         finest_resolution=resolved(settings.finest_resolution) or finest,
         num_coarse_samples=resolved(settings.num_coarse_samples) or space_of(s).num_coarse_samples,
-        camera_refinement=resolved(settings.camera_refinement) or "off",  # docs/experiments/photographs.md
     )

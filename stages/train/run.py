@@ -1,7 +1,7 @@
 """The train stage: a scene in, a trained field out.
 
 field.safetensors  both fields, the density voxels, what they mean; the schedule; the exposure of photographs where it was learned
-cameras.json       the training cameras, where they were refined or replaced, and the views that were left out
+cameras.json       the training cameras, where some were replaced, and the views that were left out
 choices.json       what training did otherwise than the scene and the settings state, where it learned nothing with them
 wrong_views.png    photographs and renders of these views
 report.json        steps and seconds
@@ -141,7 +141,7 @@ def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
 
 
 def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
-    """The training cameras, where they were refined or replaced, the views that were left out, and pictures of both; `folder` is the scene's."""
+    """The training cameras where some were replaced, the views that were left out, and pictures of both; `folder` is the scene's."""
     if (cameras := cameras_of(t)) is not None:
         refined_cameras.write(views, cameras, outputs.cameras, left_out_of(t, views))
         draw_wrong_views(outputs.wrong_views, t, views, folder, renderer)
@@ -162,7 +162,6 @@ def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[s
         "preview_psnr": None,
         "preview_ssim": None,
         **found,
-        "cameras": camera_changes(t),
         "priors": {prior.name: {"masked": round(prior.masked, 4), "contradicted": round(prior.contradicted, 4), "applied": prior.applied} for prior in priors},
         "exposure": exposure_facts(t.exposure),
         "occupied": t.model.voxels.occupied,
@@ -170,12 +169,3 @@ def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[s
         "finest_resolution": settings.finest_resolution,
     }
     path.write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def camera_changes(t: Trainer) -> dict[str, float] | None:
-    """How far the cameras were refined: mean and largest change, as each moves the middle of its image, and the focal length's factor."""
-    if t.cameras is None:
-        return None
-    c = t.cameras
-    pixels = np.array([camera.intrinsics["fx"] for camera in c.given])[:, None] * np.abs(c.pose[:, :2] - c.pose[:, [4, 3]] * [1, -1])
-    return {"mean_pixels": round(float(pixels.mean()), 4), "max_pixels": round(float(pixels.max()), 4), "focal_factor": round(float(np.exp(c.focal[0])), 6)}

@@ -228,7 +228,7 @@ def _cause(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: Came
     if points is not None and points["farther"] > MISSING:
         return (*_missing(points["farther"]), DEPTH)
     if points is not None and points["nearer"] > MISSING:
-        return f"Fog hangs before {100 * points['nearer']:.0f} % of the sparse points.", "Try train.camera_refinement=on and a longer training.", DEPTH
+        return f"Fog hangs before {100 * points['nearer']:.0f} % of the sparse points.", "Try a longer training.", DEPTH
     return "The network has learned too little.", "Give it more time (--budget, train.iterations) or --preset standard.", strip
 
 
@@ -306,7 +306,7 @@ def _of_sparse_points(metrics: Mapping[str, Any]) -> list[ResultProblem]:
         agreeing, nearer, farther = (f"{100 * points[name]:.0f} %" for name in ("agreeing", "nearer", "farther"))
         sentence = f"The asset's depth agrees with {agreeing} of the sparse points: it is nearer than {nearer} of them, farther than {farther}."
         cause = "Colours stand at a wrong depth: too few directions show the scene, or the cameras are off."
-        remedy = "Move sideways between photographs; try train.camera_refinement=on."
+        remedy = "Move sideways between photographs."
         found.append(ResultProblem("depth", grade, sentence, cause, remedy, DEPTH))
     return found
 

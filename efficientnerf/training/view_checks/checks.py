@@ -22,7 +22,6 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.model import Model
-from efficientnerf.training.camera_refinement import CameraCorrections
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.view_checks.pose_search import Search, find_pose, refine_pose
 from efficientnerf.training.view_checks.residuals import (
@@ -128,16 +127,10 @@ def check(c: ViewChecks, m: Model, pixels: Pixels, observed: Observations | None
     return not (same and np.array_equal(before[0], c.left_out))
 
 
-def follow_checks(c: ViewChecks, pixels: Pixels, corrections: CameraCorrections | None) -> None:
-    """Draw no pixels of views that are left out, and give views with replaced cameras these rays; their corrections by the refinement are reset."""
+def follow_checks(c: ViewChecks, pixels: Pixels) -> None:
+    """Draw no pixels of views that are left out, and give views with replaced cameras these rays."""
     pixels.leave_out(c.left_out)
-    if corrections is not None:
-        for n, (before, now) in enumerate(zip(corrections.given, c.cameras, strict=True)):
-            if not np.array_equal(before.world_from_camera, now.world_from_camera):
-                for values in (corrections.depth, corrections.pose, corrections.normal, corrections.right):
-                    values[n] = 0
-        corrections.given = tuple(c.cameras)
-    pixels.set_cameras(c.cameras if corrections is None else corrections.cameras)
+    pixels.set_cameras(c.cameras)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,13 @@
 """The pose of a photograph whose camera is far off, found by renders of the field. C views, N cells of a photograph.
 
 Starts are the camera as it stands, its own place with the directions of its neighbours, and the cameras whose renders look most like it. The
-shift of each start is found by correlation and taken as a rotation. The best are aligned as in `efficientnerf.training.camera_refinement`, without its prior,
-in ever smaller cells.
+shift of each start is found by correlation and taken as a rotation. The best are aligned in ever smaller cells (direct image alignment: Engel et al. 2018,
+"Direct Sparse Odometry"):
+
+    residual   I(u + P d) - c  ~  (I(u) - c) + grad I(u) P d
+
+    u  pixel, c colour and X point that are rendered there;  P = d project(X) / d correction;  d the correction (Gauss-Newton): a rotation vector in the
+       camera's axes, and a translation in units of its median depth
 """
 
 from collections.abc import Sequence
@@ -10,10 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.cameras import Camera, project, rays
 from efficientnerf.model import Model
-from efficientnerf.training.camera_refinement import FAR, HUBER, POSE, corrected, motion, rotation_matrix
-from efficientnerf.training.view_checks.residuals import NOISE, averaged, bundle_of, local_error, middles, rendered, shown
+from efficientnerf.training.view_checks.residuals import FAR, NOISE, averaged, bundle_of, local_error, middles, rendered, shown
 
 # docs/experiments/wrong-cameras.md
 PLACES = 4  # neighbours in place whose directions are tried, and cameras whose renders look like the photograph
@@ -23,6 +27,9 @@ CELLS = 400  # of a round
 FINER = (1, 2, 4)  # times as many cells along a side
 MAX_STEP = 0.1  # radians, or median depths, that a round moves a camera
 DAMPING = 1e-3  # of the equations' mean diagonal
+HUBER = 1.5  # robust standard deviations
+STEP = 1e-4  # of the finite differences
+POSE = 6  # numbers of a correction
 OVERLAP = 0.4  # of the cells have to meet where a picture is shifted
 
 
@@ -161,7 +168,7 @@ def align(s: Search, camera: Camera, image: np.ndarray, usable: np.ndarray, side
         step, depth = _step(camera, p, slope, shades, bundle[:, :3] + distance[:, None] * bundle[:, 3:6])
         if depth == 0:
             break
-        camera = corrected(camera, step, 0.0, depth)
+        camera = corrected(camera, step, depth)
         if np.abs(step).max() < 1e-5:
             break
     return camera
@@ -178,7 +185,7 @@ def _step(camera: Camera, photograph: np.ndarray, gradient: np.ndarray, shades: 
     gain = np.clip((spread * photograph).sum(0) / ((spread**2).sum(0) + len(shades) * NOISE**2), 0.2, 5)
     residual = photograph - (gain * spread + photograph.mean(0))
     with np.errstate(invalid="ignore"):
-        slope = np.einsum("nkx,nxp->nkp", gradient, motion(camera, unit, points)[..., :POSE])
+        slope = np.einsum("nkx,nxp->nkp", gradient, motion(camera, unit, points))
     good = np.isfinite(slope).all(axis=(1, 2))
     if good.sum() < 2 * POSE:
         return np.zeros(POSE), 0.0
@@ -189,3 +196,26 @@ def _step(camera: Camera, photograph: np.ndarray, gradient: np.ndarray, shades: 
     normal = np.einsum("np,nq->pq", weighted, slope)
     step = -np.linalg.solve(normal + (DAMPING * np.trace(normal) / POSE + 1e-12) * np.eye(POSE), np.einsum("np,n->p", weighted, residual.reshape(-1)))
     return step * min(1.0, MAX_STEP / max(float(np.abs(step).max()), 1e-12)), unit
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) of a rotation vector (3,) (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    cross = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]], np.float64)
+    a, b = (1 - angle**2 / 6, 0.5 - angle**2 / 24) if angle < 1e-4 else (np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2)
+    return np.asarray(np.eye(3) + a * cross + b * (cross @ cross), np.float64)
+
+
+def corrected(camera: Camera, pose: np.ndarray, depth: float) -> Camera:
+    """A camera with a correction (6,) of its pose; depth, the unit of its translation."""
+    rotation = camera.world_from_camera[:3, :3]
+    return _at(camera, rotation @ rotation_matrix(pose[:3]), camera.world_from_camera[:3, 3] + depth * rotation @ pose[3:])
+
+
+def motion(camera: Camera, depth: float, points: np.ndarray) -> np.ndarray:
+    """(N, 2, 6) how the projections of points (N, 3) move with a correction of the camera, in pixels."""
+    columns = []
+    for change in STEP * np.eye(POSE):
+        after, before = (project(corrected(camera, sign * change, depth), points)[0] for sign in (1, -1))
+        columns.append((after - before) / (2 * STEP))
+    return np.stack(columns, axis=-1)

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.model import UNSEEN, Model, render_rays
-from efficientnerf.training.alignment import surface_distance
+from efficientnerf.model import UNSEEN, Model, RayOutputs, render_rays
+from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.training.pixels import Pixels
 
 # docs/experiments/wrong-cameras.md
@@ -23,6 +24,7 @@ NOISE = 0.02  # standard deviation of colours that means nothing
 LOW_CONTRAST = 0.5  # of the median contrast, which a photograph counts as having at least: a plain wall's noise is no error
 NEIGHBOURS = 8
 ROWS_AT_A_TIME = 256  # of a photograph
+FAR = 1e4  # world units: where points are put that lie beyond all samples
 RAYS_AT_A_TIME, SAMPLES_AT_A_TIME = 4096, 2**19  # the latter where nothing is pruned
 SPREAD = 0.2  # of the logarithm of neighbours' errors, at least: photographs of one thing differ by as much
 
@@ -178,3 +180,14 @@ def standing_out(errors: np.ndarray, neighbours: np.ndarray, trusted: np.ndarray
             middles_of.append(middle)
         out[n], usual[n] = min(found), np.exp(max(middles_of))
     return out, usual
+
+
+def surface_distance(outputs: RayOutputs) -> Tensor:
+    """(R,) distance in the world at which half of a ray's light is gone; FAR where less is."""
+    first = outputs.fine.first
+    ray = ray_of_sample(first, len(outputs.fine.start))
+    gone = torch.cumsum(outputs.fine_weight.double(), dim=0)
+    gone = gone - torch.cat([gone.new_zeros(1), gone])[first[:-1]][ray]
+    middle = outputs.rays.world_distance(outputs.fine.start + outputs.fine.extent / 2, ray)
+    distance = torch.where(gone >= 0.5, middle, FAR)
+    return torch.full_like(outputs.fine_opacity, FAR).scatter_reduce(0, ray, distance, reduce="amin")

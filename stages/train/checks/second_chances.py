@@ -1,6 +1,6 @@
 """Second chances: where a run learns nothing, short trainings try changes that have rescued other captures.
 
-Each trial leaves out one of the priors that keep density away, or lets training correct errors of photographs and cameras. All begin from nothing, draw
+Each trial leaves out one of the priors that keep density away, or lets training correct errors of photographs. All begin from nothing, draw
 the same pixels, and are compared on the same pixels of the same held-out views. A trial that a kill cut short is done again; finished
 ones are not. docs/experiments/early-check.md
 """
@@ -66,8 +66,6 @@ def candidates(s: Scene, settings: TrainSettings) -> dict[str, TrainingChoices]:
         found["all of these off"] = priors
     if s.background is None and settings.exposure != "on":
         found["exposure"] = replace(own, exposure=True)
-    if settings.camera_refinement != "on":
-        found["camera refinement"] = replace(own, camera_refinement=True)
     return found
 
 
@@ -126,7 +124,7 @@ def _train(
 
 def _small(settings: TrainSettings) -> TrainSettings:
     """The settings of a trial: the given ones for what is learned, not for how much."""
-    kept = ("seed", "near_plane", "far_plane", "min_views", "exposure", "camera_refinement", "background_color")
+    kept = ("seed", "near_plane", "far_plane", "min_views", "exposure", "background_color")
     return replace(SMALL, **{name: getattr(settings, name) for name in kept})
 
 

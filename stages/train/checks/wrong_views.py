@@ -91,8 +91,6 @@ def left_out_of(t: Trainer, views: tuple[View, ...]) -> list[str]:
 
 def cameras_of(t: Trainer) -> list[Camera] | None:
     """The cameras of the training views where these are not all trained on as they came; else None."""
-    if t.cameras is not None:
-        return t.cameras.cameras
     return t.checks.cameras if t.checks is not None and t.checks.changed else None
 
 

@@ -10,7 +10,6 @@ import pytest
 from efficientnerf.geometry.cameras import Camera, project, rays
 from efficientnerf.model import Model
 from efficientnerf.training import loop
-from efficientnerf.training.camera_refinement import rotation_matrix, rotation_vector
 from efficientnerf.training.loop import Trainer, restore, state_of, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.view_checks import checks, residuals
@@ -24,7 +23,7 @@ from efficientnerf.training.view_checks.checks import (
     is_due,
     point_evidence,
 )  # fmt: skip
-from efficientnerf.training.view_checks.pose_search import best_shift, turned
+from efficientnerf.training.view_checks.pose_search import best_shift, corrected, motion, rotation_matrix, turned
 from efficientnerf.training.view_checks.residuals import cells_of, global_error, local_error
 from tests.efficientnerf import balls
 
@@ -86,7 +85,15 @@ def settled() -> Model:
 
 
 def angle(a: Camera, b: Camera) -> float:
-    return math.degrees(np.linalg.norm(rotation_vector(a.world_from_camera[:3, :3].T @ b.world_from_camera[:3, :3])))
+    return math.degrees(math.acos(np.clip((np.trace(a.world_from_camera[:3, :3].T @ b.world_from_camera[:3, :3]) - 1) / 2, -1, 1)))
+
+
+def test_motion_is_the_derivative_of_the_projection() -> None:
+    lens = replace(CAMERAS[0], model="RADIAL", params=(40.0, 15.0, 17.0, -0.05, 0.01))
+    points = balls.CENTRE + np.random.default_rng(1).uniform(-0.5, 0.5, (20, 3))
+    change = 1e-3 * np.random.default_rng(2).normal(size=6)
+    before, after = project(lens, points)[0], project(corrected(lens, change, 3.0), points)[0]
+    np.testing.assert_allclose(motion(lens, 3.0, points) @ change, after - before, atol=2e-3 * np.abs(after - before).max())
 
 
 def found(m: Model, cameras: list[Camera], pictures: list[np.ndarray], observed: Observations | None = None) -> ViewChecks:

@@ -96,7 +96,7 @@ CAUSES: dict[str, tuple[Any, str]] = {
     "by heart": (lambda found: found["train"].update(psnr=33.0), "Take more photographs"),
     "masked": (lambda found: found["sparse_points"].update(subject_farther=0.9), "train.min_views"),
     "empty": (lambda found: found["sparse_points"].update(farther=0.8, agreeing=0.15), "poses.masks=ignore"),
-    "fog": (lambda found: found["sparse_points"].update(nearer=0.8, agreeing=0.15), "train.camera_refinement"),
+    "fog": (lambda found: found["sparse_points"].update(nearer=0.8, agreeing=0.15), "longer training"),
     "nothing else": (lambda found: None, "--budget"),
 }
 

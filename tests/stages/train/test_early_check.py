@@ -146,7 +146,7 @@ def test_what_a_prior_deletes_comes_back_without_it(tmp_path: Path, change: Call
     assert found["chosen"] == chosen
     assert made.facts["early_check"]["chosen"] == chosen
     assert [check["learning"] for check in found["early_check"]] == [False, True]
-    assert {second_chances.AS_STATED, chosen, "camera refinement"} <= {trial["name"] for trial in found["second_chances"]}
+    assert {second_chances.AS_STATED, chosen} <= {trial["name"] for trial in found["second_chances"]}
     assert training_choices.load(made.out) == choices
     stated, used = scenes.load(made.inputs["poses"]), load_scene(made.inputs["poses"], made.out)
     assert choices.scene(stated).views[0].near == used.views[0].near
@@ -177,11 +177,11 @@ def test_a_training_that_is_stopped_anywhere_ends_with_the_same_bytes(tmp_path: 
 def test_candidates_are_what_would_change_anything(tmp_path: Path) -> None:
     photographs = scenes.load(poses(tmp_path / "photographs", photographs=True))
     names = second_chances.candidates(photographs, settings())
-    assert list(names) == [second_chances.AS_STATED, "near planes off", "min_views off", "all of these off", "exposure", "camera refinement"]
+    assert list(names) == [second_chances.AS_STATED, "near planes off", "min_views off", "all of these off", "exposure"]
     assert names["all of these off"] == TrainingChoices(near="off", min_views=False)
-    stated = settings(min_views="off", exposure="on", camera_refinement="on")
+    stated = settings(min_views="off", exposure="on")
     assert list(second_chances.candidates(photographs, stated)) == [second_chances.AS_STATED, "near planes off"]
     odd = replace(photographs, views=(*photographs.views[:-2], replace(photographs.views[-2], near=4.0), photographs.views[-1]))
     assert second_chances.candidates(odd, settings())["near planes at most their median"].scene(odd).views[-2].near == photographs.views[-2].near
-    own = TrainingChoices(near="off", masks=False, min_views=False, exposure=True, camera_refinement=True).settings(settings())
-    assert (own.min_views, own.exposure, own.camera_refinement) == ("off", "on", "on")
+    own = TrainingChoices(near="off", masks=False, min_views=False, exposure=True).settings(settings())
+    assert (own.min_views, own.exposure) == ("off", "on")
