@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from workflows.cli.main import enerf
 from workflows.cli.resolve import meaning, preset_names, read_preset, shown
 
 FOLDER = Path(__file__).parent
+COMMON = {"--debug": "Show the traceback of an error, and the output of libraries.", "--help": "Show this message and exit."}  # options of all commands
 NOTE = "<!-- Made from the code by `make docs`; changes belong there. -->"
 
 
@@ -77,19 +79,33 @@ def presets_section() -> list[str]:
 
 
 def command_section(command: click.Command, name: str, above: click.Context) -> list[str]:
-    """The help of a command, and of those under it."""
-    context = click.Context(command, info_name=name, parent=above, terminal_width=110, max_content_width=110)
-    lines = ["", f"{'#' * (2 + context.command_path.count(' ') - 1)} {context.command_path}", "", "```", command.get_help(context), "```"]
+    """What a command does and its options, a row each, and those under it."""
+    context = click.Context(command, info_name=name, parent=above, max_content_width=2**16)
+    usage = " ".join(command.get_usage(context).removeprefix("Usage: ").split())
+    lines = ["", f"{'#' * (1 + context.command_path.count(' '))} {context.command_path}", "", f"`{usage}`", "", *paragraphs(command)]
+    options = [each for each in command.params if isinstance(each, click.Option) and not COMMON.keys() & {*each.opts}]
+    records = [record for each in options if (record := each.get_help_record(context)) is not None]
+    if records:
+        lines += ["", "| option | meaning |", "|---|---|", *(f"| `{cell(option)}` | {cell(text)} |" for option, text in records)]
     if isinstance(command, click.Group):
         for inner in command.list_commands(context):
             lines += command_section(command.commands[inner], inner, context)
     return lines
 
 
+def paragraphs(command: click.Command) -> list[str]:
+    """The text of a command's help: a line for each paragraph; what is laid out stays as it is."""
+    lines = []
+    for part in inspect.cleandoc(command.help or "").split("\n\n"):
+        text = ["```", *part.splitlines()[1:], "```"] if part.startswith("\b") else [" ".join(part.split())]
+        lines += ["", *text] if lines else text
+    return lines
+
+
 def commands_page() -> str:
-    lines = [NOTE, "# Commands", ""]
-    context = click.Context(enerf, info_name="enerf", terminal_width=110, max_content_width=110)
-    lines += ["```", enerf.get_help(context), "```"]
+    context = click.Context(enerf, info_name="enerf", max_content_width=2**16)
+    lines = [NOTE, "# Commands", "", *paragraphs(enerf), "", enerf.epilog or "", "", "| option of every command | meaning |", "|---|---|"]
+    lines += [f"| `{option}` | {meaning} |" for option, meaning in COMMON.items()]
     for name in enerf.list_commands(context):
         command = enerf.get_command(context, name)
         assert command is not None
