@@ -14,7 +14,12 @@ from workflows.cli.main import enerf
 from workflows.cli.resolve import meaning, preset_names, read_preset, shown
 
 FOLDER = Path(__file__).parent
-COMMON = {"--debug": "Show the traceback of an error, and the output of libraries.", "--help": "Show this message and exit."}  # options of all commands
+COMMON = {  # options of all commands, and two of nearly all
+    "--help": "Show this message and exit.",
+    "--debug": "Show the traceback of an error, and the output of libraries.",
+    "--json": "JSON on standard output instead of text, where a command prints anything.",
+    "-q": "Show only warnings and errors, where a command shows progress (`--quiet`).",
+}
 NOTE = "<!-- Made from the code by `make docs`; changes belong there. -->"
 
 
@@ -68,13 +73,6 @@ def presets_section() -> list[str]:
     for preset in presets:
         values = [f"`{stage}.{name}={shown(value)}`" for stage, own in preset.own.items() for name, value in own.items()]
         lines.append(f"- **{preset.name}**: {preset.description}" + (f" As `{preset.inherits}`, but with {', '.join(values)}." if preset.inherits else ""))
-    columns = [preset for preset in presets if preset.inherits is None and preset.own]
-    lines += ["", "Values that presets change:", "", "| setting |" + "".join(f" {preset.name} |" for preset in columns), "|---|" + "---|" * len(columns)]
-    for stage in STAGES:
-        for info in describe_settings(stage.settings):
-            values = ["" if (value := preset.own.get(stage.name, {}).get(info.name)) is None else f"`{shown(value)}`" for preset in columns]
-            if any(values):
-                lines.append(f"| `{stage.name}.{info.name}` | " + " | ".join(values) + " |")
     return lines
 
 
@@ -104,7 +102,7 @@ def paragraphs(command: click.Command) -> list[str]:
 
 def commands_page() -> str:
     context = click.Context(enerf, info_name="enerf", max_content_width=2**16)
-    lines = [NOTE, "# Commands", "", *paragraphs(enerf), "", enerf.epilog or "", "", "| option of every command | meaning |", "|---|---|"]
+    lines = [NOTE, "# Commands", "", *paragraphs(enerf), "", enerf.epilog or "", "", "| common option | meaning |", "|---|---|"]
     lines += [f"| `{option}` | {meaning} |" for option, meaning in COMMON.items()]
     for name in enerf.list_commands(context):
         command = enerf.get_command(context, name)
