@@ -122,7 +122,6 @@ class MeshOutputs(Outputs):
     obj = Name("mesh.obj")  # the capture's frame
     material = Name("mesh.mtl")  # of the OBJ, where there is a texture
     texture = Name("mesh.png")  # the same
-    normal_map = Name("mesh_normal.png")  # the same, where it was asked for
     preview = Name("preview.png")
     check = Name("check.png")  # where it differs most from the asset: opacity, mesh, what is missed and added
     report = Name("report.json")  # counts, topology, bounds, area, volume, agreement with the asset

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from efficientnerf.asset.format import FormatError, describe, outline, serialize
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.surface.mesh import Mesh, moved
@@ -30,7 +28,7 @@ from stages.mesh.files import read_mesh
 from stages.mesh.memory import surface_needed
 from stages.mesh.run import SURFACE_SHARE, in_capture, mesh_of
 from stages.mesh.settings import STAGE, MeshSettings
-from stages.mesh.texture import largest_photograph, textured, with_relief
+from stages.mesh.texture import largest_photograph, textured
 from stages.points.memory import needed as points_needed
 from stages.points.run import points_of
 from stages.viewer.page import compact_bytes, viewer_page
@@ -57,7 +55,6 @@ class Export:
     as_splats  3D Gaussians instead of a mesh
     region, crop  of the asset; None: as the settings say
     texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
-    normal_map  next to the texture; None: as the settings say, where a file keeps it
     picture    how textures are stored
     spz_version  of files .spz
     limit      of memory
@@ -71,7 +68,6 @@ class Export:
     crop: Box | None = None
     force: bool = False
     texture: str | None = None
-    normal_map: bool | None = None
     picture: str = "png"
     spz_version: int = 4
     limit: Limit | None = None
@@ -148,13 +144,9 @@ def check(export: Export) -> None:
             raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
     if (export.picture != "png" and not export.keeps_textures) or (export.texture not in (None, "off") and not (export.is_coloured and not export.as_points)):
         raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
-    if export.normal_map and (export.as_points or export.texture == "off" or not export.keeps_textures):
-        raise UsageError("None of the files keeps a normal map: it belongs to a texture. Give a .glb, .obj, .usdz or .usdc, and leave out --texture off.")
     for path in (*export.surfaces, *export.volumes):
         export.format(path).refuse_without_package(path)
-    beside = [] if export.texture == "off" else [
-        each for path in export.surfaces for each in export.format(path).companions(path, export.picture, bool(export.normal_map))
-    ]
+    beside = [] if export.texture == "off" else [each for path in export.surfaces for each in export.format(path).companions(path, export.picture)]
     check_files([*export.files, *dict.fromkeys(beside)], force=export.force, inputs=[export.what])
 
 
@@ -195,8 +187,6 @@ def _surface(export: Export, wanted: Any, progress: Progress, points: int = 0) -
     region = export.region or (wanted.region if export.crop is None else "all")
     shown = export.keeps_textures or (export.is_coloured and (export.texture is not None or export.has_photographs))
     wanted = replace(wanted, region=region, texture=(export.texture or wanted.texture) if shown else "off")
-    relief = wanted.normal_map if export.normal_map is None else export.normal_map
-    wanted = replace(wanted, normal_map=relief and export.keeps_textures and wanted.texture != "off")
     made = None if export.crop is not None else _made_by_the_stage(export.what, wanted, export.keeps_textures)
     if made is not None:
         return made
@@ -250,14 +240,12 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
     if not decision.fresh or decision.manifest is None:
         return None
     made = settings_from(MeshSettings, decision.manifest.request.settings, where=STAGE.name)
-    plain = [settings_dict(replace(each, texture="off", texture_size=2048, normal_map=False)) for each in (made, wanted)]
-    if plain[0] != plain[1] or (wanted.normal_map and not made.normal_map):
+    plain = [settings_dict(replace(each, texture="off", texture_size=2048)) for each in (made, wanted)]
+    if plain[0] != plain[1]:
         return None
     if wanted.texture != "off" and (made.texture, made.texture_size) != (wanted.texture, wanted.texture_size):
         return None
     mesh = read_mesh(MeshOutputs.of_run(what))
-    if mesh.texture is not None and not wanted.normal_map:
-        mesh = replace(mesh, texture=replace(mesh.texture, normals=None))
     metadata, true = describe(BakeOutputs.of_run(what).asset), load_frame(what)
     frame = source_frame(metadata) if true is None else true.source_frame(metadata)
     if true is not None:
@@ -273,7 +261,7 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     inputs = MeshInputs(*(kind.of_run(export.what) for kind in (BakeOutputs, TrainOutputs, PosesOutputs)))  # type: ignore[arg-type]
     side = 0 if choice == "off" else wanted.texture_size
     remedy = "Take an asset of fewer voxels (enerf convert --resolution)" + (", or a smaller texture (--texture-size)." if side else ".")
-    need = surface_needed(tree, texture=side, pixels=largest_photograph(inputs, choice), dense=wanted.normal_map)
+    need = surface_needed(tree, texture=side, pixels=largest_photograph(inputs, choice))
     refuse_more_than(export.limit, str(export.what), need, remedy)
     share = 1.0 if choice == "off" else SURFACE_SHARE
 
@@ -283,18 +271,15 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     def texture(done: int, total: int, text: str) -> None:
         progress(round(1000 * (share + (1 - share) * done / max(total, 1))), 1000, text)
 
-    dense: list[tuple[np.ndarray, np.ndarray]] | None = [] if wanted.normal_map else None
-    mesh = textured(mesh_of(tree, wanted, surface, region=border, dense=dense), tree, inputs, choice, wanted.texture_size, texture)
-    return in_capture(mesh if dense is None else with_relief(mesh, dense, lambda: texture(1, 1, "normal map")), frame)
+    return in_capture(textured(mesh_of(tree, wanted, surface, region=border), tree, inputs, choice, wanted.texture_size, texture), frame)
 
 
 def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:
     written: list[Written] = []
     beside: set[Path] = set()
-    normal_map = mesh.texture is not None and mesh.texture.normals is not None
     for path in export.surfaces:
         kind = export.format(path)
-        others = [] if mesh.texture is None else kind.companions(path, export.picture, normal_map)
+        others = [] if mesh.texture is None else kind.companions(path, export.picture)
         for each in others:
             if each not in beside:  # else of another file of these, and the same
                 check_free(each, force=export.force)

@@ -63,7 +63,6 @@ def surface(
     shown: Shown | None = None,
     fusion: Fusion | None = None,
     silhouettes: Sequence[AssetView] = (),
-    dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
     progress: Progress = silent,
 ) -> Mesh:
     """The volume's surface as a closed, coloured mesh in the training frame.
@@ -76,7 +75,6 @@ def surface(
     shown          how much views of the world show of components: those that they do not show are removed; None: hollows and parts in them are
     fusion         depths of views, which decide where the surface is wherever they agree; None: the densities alone do
     silhouettes    views of the asset by pinhole cameras, whose silhouettes the surface gets where it is sharply curved
-    dense          is given vertices and faces as they were before decimation, in the training frame
     progress       called with (done, total, text); what it raises stops the work
 
     Of an `NdcVolume` it is the surface in normalised device coordinates (budget, rounds and sizes of components count there), in the world.
@@ -87,8 +85,6 @@ def surface(
     viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS  # the cameras are before the near plane, outside of the volume
     vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress, shown, fusion)
     facts["faces_before_decimation"] = len(triangles)
-    if dense is not None:
-        dense.append((vertices if ndc is None else ndc.ndc.world(vertices), triangles))
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # parts that decimation cut off
     if len(triangles):

@@ -13,11 +13,10 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Pictures on the faces of a mesh."""
+    """A picture on the faces of a mesh."""
 
     coordinates: np.ndarray  # (F, 3, 2) float64 of each face's corners, 0-1: u to the right, v up from the lower edge, as OBJ and USD count
     colours: np.ndarray  # (S, S, 3) uint8 sRGB, the top row first
-    normals: np.ndarray | None = None  # (S, S, 3) uint8 normal map in tangent space, y up as glTF's, or None
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ ALONG = 0.7  # cosine of a lid's normal to that of the border
 
 def scene_surface(
     tree: NerfTree, threshold: float | None, *, faces: int, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress,
-    shown: Shown | None = None, views: Sequence[AssetView] = (), region: Region | None = None, dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    shown: Shown | None = None, views: Sequence[AssetView] = (), region: Region | None = None,
 ) -> Mesh:  # fmt: skip
     """The surface of all cascades as one mesh; of a tree with one grid the same as `surface`. Arguments as there.
 
@@ -42,7 +42,7 @@ def scene_surface(
     if not tree.outer:
         return surface(
             volume_of(tree, region), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-            fusion=_fusion(0, tree, views, 1, progress), silhouettes=() if tree.ndc else views[::SKIPPED], dense=dense, progress=progress,
+            fusion=_fusion(0, tree, views, 1, progress), silhouettes=() if tree.ndc else views[::SKIPPED], progress=progress,
         )  # fmt: skip
     found, fused = [], _cascades_of_region(tree, region)
     sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
@@ -53,7 +53,7 @@ def scene_surface(
         try:
             mesh = surface(
                 volume_of(part, region), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints,
-                shown=shown, fusion=_fusion(number, part, views, fused, progress), silhouettes=views[::SKIPPED] if number == 0 else (), dense=dense,
+                shown=shown, fusion=_fusion(number, part, views, fused, progress), silhouettes=views[::SKIPPED] if number == 0 else (),
                 progress=progress,
             )  # fmt: skip
         except NoSurface:

@@ -107,12 +107,11 @@ def _read_texture(outputs: MeshOutputs, faces: np.ndarray, positions: np.ndarray
         turn = np.array(document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"], np.float64)[:3, :3]
         same = corners.shape == faces.shape and np.allclose(places[corners] @ turn, positions[faces], rtol=1e-5, atol=1e-5 * float(np.abs(positions).max()))
         at = np.clip(coordinates[corners], 0, 1)
-        lit = "normalTexture" in document["materials"][0]
     except (ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
         _refuse(path, f"not as it was written ({type(error).__name__})")
     if not same:
         _refuse(path, "its faces are not those of the PLY next to it")
-    return Texture(at, _picture(outputs.texture), _picture(outputs.normal_map) if lit else None)
+    return Texture(at, _picture(outputs.texture))
 
 
 def _accessor(document: Any, blob: bytes, index: int, kind: str, width: int) -> np.ndarray:

@@ -25,17 +25,14 @@ VOXEL, CELL, BRICK_VOXEL = 150, 8, 64
 PIXEL, BLOCK_VOXEL = 36, 120
 # Of a texel, with what it has seen of photographs; of a photograph's pixel with depth and edges.
 TEXEL, PHOTOGRAPH_PIXEL = 110, 60
-# Of a stored voxel, what a normal map is baked from: the surface before decimation with its normals, and cells in which its faces are found.
-DENSE_VOXEL, DENSE_CELLS = 250, 8 * 256**3
 # Of a vertex that is fitted to photographs: places and scores in them.
 FITTED_VERTEX = 1600
 # Bytes written: of a face in all files; of a texel in its own file and in GLB; of pictures. Faces of a voxel and texels of a photograph's pixel, at most.
 WRITTEN_FACE, WRITTEN_TEXEL, SHEET, FACES, TEXELS = 180, 3, 3 * MIB // 4, 4, 4
 
 
-def surface_needed(tree: NerfTree, texture: int = 0, pixels: int = 0, dense: bool = False, fitted: int = 0) -> Need:
-    """Memory to mesh a tree and to texture it: so many texels a side, photographs of so many pixels,
-    with a normal map where `dense`, and so many vertices fitted to photographs."""
+def surface_needed(tree: NerfTree, texture: int = 0, pixels: int = 0, fitted: int = 0) -> Need:
+    """Memory to mesh a tree and to texture it: so many texels a side, photographs of so many pixels, and so many vertices fitted to photographs."""
     views = CAPTURED + ORBIT + FUSED
     pool = pool_of(volume_of(tree))
     cells = [-(-side // pool) + 2 for side in tree.resolution]
@@ -47,8 +44,7 @@ def surface_needed(tree: NerfTree, texture: int = 0, pixels: int = 0, dense: boo
         "libraries": libraries() + SURFACES,
     }
     optional = {"the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
-                "the fit to photographs": (FITTED_VERTEX * fitted + MOST * min(pixels, LARGEST)) if fitted else 0,
-                "the normal map": (DENSE_VOXEL * len(tree.density_values) + DENSE_CELLS) if dense else 0}  # fmt: skip
+                "the fit to photographs": (FITTED_VERTEX * fitted + MOST * min(pixels, LARGEST)) if fitted else 0}  # fmt: skip
     return Need(terms | {what: count for what, count in optional.items() if count})
 
 
@@ -57,7 +53,7 @@ def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
     texture = 0 if settings.texture == "off" else settings.texture_size
     fitted = 0 if settings.photometric_refinement == "off" else _most_faces(tree, settings) // 2
     pixels = largest_photograph(inputs, "photographs" if fitted else settings.texture)
-    return surface_needed(tree, texture=texture, pixels=pixels, dense=settings.normal_map, fitted=fitted)
+    return surface_needed(tree, texture=texture, pixels=pixels, fitted=fitted)
 
 
 def _most_faces(tree: NerfTree, settings: MeshSettings) -> int:
@@ -73,5 +69,5 @@ def space_needed(known: Known) -> int:
     """Mesh files, textures and pictures."""
     own, views = known.settings["mesh"], views_of(load(known.inputs(MeshInputs).poses.folder), "train")
     faces = _most_faces(asset_of(known), own)
-    texels = 0 if own.texture == "off" else min(own.texture_size**2, TEXELS * count_pixels(views)) * (1 + own.normal_map)
+    texels = 0 if own.texture == "off" else min(own.texture_size**2, TEXELS * count_pixels(views))
     return SHEET + WRITTEN_FACE * faces + WRITTEN_TEXEL * texels

@@ -28,8 +28,8 @@ from stages.mesh.check import asset_views, checked, level_of, shown_by, warning_
 from stages.mesh.files import write_empty_meshes
 from stages.mesh.memory import needed
 from stages.mesh.refinement import refined_surface
-from stages.mesh.settings import MeshSettings, refuse_normal_map_without_texture
-from stages.mesh.texture import facts_of, textured, with_relief
+from stages.mesh.settings import MeshSettings
+from stages.mesh.texture import facts_of, textured
 from stages.mesh.timing import Stopwatch
 
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
@@ -39,14 +39,12 @@ SURFACE_SHARE = 0.7  # of the stage's time; the texture takes the rest
 
 def mesh_of(
     tree: NerfTree, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
-    dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Mesh:  # fmt: skip
     """The tree's surface in the training frame; `progress` takes (done, total, text). Raises UsageError where there is none at a density that was stated;
     else it has no faces then, and "no_surface" among its facts says why.
 
     views   is given those of the asset that say which components it shows
     region  that the surface is clipped to
-    dense   is given vertices and faces as they were before decimation
     """
     progress = whole_progress(progress, 1 + len(tree.outer))
     seen, fused = asset_views(tree, progress)
@@ -68,7 +66,6 @@ def mesh_of(
             shown=shown_by(seen, float(tree.voxel), tick),
             views=fused if threshold is None else (),
             region=region,
-            dense=dense,
             progress=progress,
         )
     except NoSurface as error:
@@ -162,7 +159,6 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
 @compiling_kernels
 def run(job: Job) -> None:
     outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
-    refuse_normal_map_without_texture(settings)
     watch = Stopwatch()
     whole = load(inputs.bake.asset)
     tree = restricted(whole, settings.region)
@@ -171,8 +167,7 @@ def run(job: Job) -> None:
     seen: list[AssetView] = []
     share = 1.0 if settings.texture == "off" else SURFACE_SHARE
     border = whole.region if settings.region == "foreground" else None
-    dense: list[tuple[np.ndarray, np.ndarray]] | None = [] if settings.normal_map else None
-    surface = mesh_of(tree, settings, watch.listening(lambda done, total, text: job.reached(share * done, total, text)), seen, border, dense)
+    surface = mesh_of(tree, settings, watch.listening(lambda done, total, text: job.reached(share * done, total, text)), seen, border)
     if "no_surface" in surface.facts:
         write_empty(outputs, surface, seen, frame, job)
         write_json(outputs.timings, watch.seconds)
@@ -180,8 +175,6 @@ def run(job: Job) -> None:
     surface = refined_surface(surface, seen, inputs, settings.photometric_refinement, job, watch)
     texture_progress = watch.listening(lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text))
     found = textured(surface, tree, inputs, settings.texture, settings.texture_size, texture_progress)
-    if dense is not None:
-        found = with_relief(found, dense, lambda: texture_progress(1, 1, "normal map"))
     job.safe_point()
     write_png(preview_of(found, tree.metadata, clipped=border is not None), outputs.preview)
     watch.lap("preview")

@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from efficientnerf.settings import Auto, Density, Fraction, setting
-from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, needs_of
 
@@ -48,22 +47,11 @@ class MeshSettings:
         "Maximum number of texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.",
         advanced=True,
     )
-    normal_map: bool = setting(
-        False,
-        "Also write a normal map, from the surface before decimation; materials are then lit, so that lights show its relief on top of the captured light.",
-        advanced=True,
-    )
 
     @property
     def faces(self) -> int:
         """`max_faces` as a number."""
         return int(str(self.max_faces).replace("k", "000"))
-
-
-def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
-    """Raise UsageError for a normal map on a mesh without texture coordinates."""
-    if settings.normal_map and settings.texture == "off":
-        raise UsageError("mesh.normal_map lies on the coordinates of a texture, and mesh.texture is off. Set one of them otherwise.")
 
 
 STAGE = Stage(
@@ -72,6 +60,5 @@ STAGE = Stage(
     settings=MeshSettings,
     needs=needs_of(MeshInputs),
     run=ByName("stages.mesh.run:run"),
-    check=lambda settings: refuse_normal_map_without_texture(settings["mesh"]),
     volatile=(MeshOutputs.timings,),
 )

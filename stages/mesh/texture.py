@@ -13,7 +13,6 @@ from efficientnerf.surface.shading import vertex_colours
 from efficientnerf.surface.texturing.asset import texture_of_asset
 from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.filling import texture_from
-from efficientnerf.surface.texturing.normal_map import Dense, with_normal_map
 from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, exposed_alike, photograph, survey, texels_wanted
 from stages.artifacts import MeshInputs
 from stages.io.refined_cameras import load_scene
@@ -66,13 +65,6 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
         "texels_per_pixel": texels.texels_per_pixel(),
     }
     return replace(mesh, texture=Texture(atlas.coordinates, texture_from(atlas, colours)), facts=mesh.facts | facts)
-
-
-def with_relief(mesh: Mesh, dense: list[tuple[np.ndarray, np.ndarray]], tick: Callable[[], None]) -> Mesh:
-    """The textured mesh with a normal map of what it was before decimation: vertices and faces of each cascade."""
-    first = np.cumsum([0, *(len(vertices) for vertices, _ in dense)])
-    faces = np.concatenate([part + start for (_, part), start in zip(dense, first)])
-    return with_normal_map(mesh, Dense(np.concatenate([vertices for vertices, _ in dense]), faces), tick)
 
 
 def largest_photograph(inputs: MeshInputs, choice: str) -> int:

@@ -24,7 +24,7 @@ from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.ply import VERTEX
 from stages.formats.exporters.writing import source_frame
 from stages.framing.true_frame import AS_CAPTURED, Ground, TrueFrame, save_frame
-from stages.mesh.files import read_mesh, read_vertices
+from stages.mesh.files import read_vertices
 from stages.mesh.settings import MeshSettings
 from stages.points import run as points
 from stages.points.settings import PointsSettings
@@ -133,7 +133,7 @@ def test_points_are_those_of_the_stage_on_its_mesh(run: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("change", "more"),
     [({"max_faces": 400}, {}), ({"texture_size": 512}, {}), ({}, {"texture": "asset"}), ({}, {"region": "all"}), ({"smoothing_iterations": 3}, {}),
-     ({"normal_map": True}, {}), ({}, {"normal_map": True}), ({}, {"crop": (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)}), ({}, {})],
+     ({}, {"crop": (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)}), ({}, {})],
 )  # fmt: skip
 def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     if not change and not more:  # what the stage has made is stale
@@ -142,32 +142,7 @@ def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dic
         export(run, "mesh.glb", chosen=settings(**change), **more)
 
 
-def test_a_normal_map_is_left_out_where_it_is_not_asked_for(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = replace(MADE, normal_map=True)
-    fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(made))))
-    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
-    outputs = MeshOutputs.of_run(run)
-    mesh = read_mesh(outputs)
-    assert mesh.texture is not None
-    mesh = replace(mesh, texture=replace(mesh.texture, normals=255 - mesh.texture.colours))
-    for file in (outputs.glb, outputs.obj):
-        MESH_EXPORTERS[file.suffix](mesh, file, source_frame(METADATA))
-    for wanted in (True, None, False):
-        folder = run.parent / str(wanted)
-        folder.mkdir()
-        with_map = wanted is not False
-        entries = export(run, f"{wanted}/mesh.glb", f"{wanted}/mesh.obj", chosen=settings(normal_map=True), normal_map=wanted)
-        assert (b"normalTexture" in (folder / "mesh.glb").read_bytes()) == with_map
-        assert (folder / "mesh_normal.png").is_file() == with_map
-        assert (str(folder / "mesh_normal.png") in entries[1]["beside"]) == with_map
-
-
-def test_a_normal_map_wants_a_texture_to_lie_beside(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for names, more in ((("a.ply",), {}), (("a.glb",), {"texture": "off"}), (("a.xyz",), {"as_points": True})):
-        with pytest.raises(UsageError):
-            export(run, *names, normal_map=True, **more)
-    (entry,) = export(run, "a.ply", chosen=settings(normal_map=True))
-    assert entry["faces"] == 12, "a file without a place for it takes the mesh as it is"
+def test_a_format_whose_package_is_missing_is_refused_before_any_is_written(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.formats.exporters.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[usd\]'"):
         export(run, "b.glb", "b.usdz")

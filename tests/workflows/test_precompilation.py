@@ -24,9 +24,9 @@ def settings(*sets: str) -> dict[str, dict[str, Any]]:
 
 
 def test_the_choices_of_the_run_are_compiled_at_the_sizes_of_a_small_one() -> None:
-    chosen = settings("train.field=mlp", "bake.layout=packed", "mesh.normal_map=true", "splats.make=on", "bake.resolution=512", "poses.up=z")
+    chosen = settings("train.field=mlp", "bake.layout=packed", "mesh.texture=asset", "splats.make=on", "bake.resolution=512", "poses.up=z")
     small, tiny = start.small_settings(chosen), start.small_settings(settings())
-    assert (small["train"]["field"], small["bake"]["layout"], small["mesh"]["normal_map"], small["splats"]["make"]) == ("mlp", "packed", True, "on")
+    assert (small["train"]["field"], small["bake"]["layout"], small["mesh"]["texture"], small["splats"]["make"]) == ("mlp", "packed", "asset", "on")
     assert small["poses"] == tiny["poses"]
     assert small["bake"]["resolution"] == tiny["bake"]["resolution"] < 64
     assert small["train"]["iterations"] == tiny["train"]["iterations"] < 100

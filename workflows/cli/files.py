@@ -56,11 +56,6 @@ Crop = tuple[float, float, float, float, float, float] | None
     "--texture", type=click.Choice(TEXTURES), help="Source of the texture, instead of mesh.texture; off: vertex colours only."
 )
 @click.option("--texture-size", metavar="N", help="Maximum number of texels along a side, instead of mesh.texture_size.")
-@click.option(
-    "--normal-map/--no-normal-map",
-    default=None,
-    help="A normal map with the detail lost in decimation, instead of mesh.normal_map; materials are then lit.",
-)
 @click.option("--jpeg", is_flag=True, help="Write textures as JPEG instead of PNG, for smaller files.")
 @click.option("--spz-version", type=click.Choice(("3", "4")), default="4", show_default=True, help="Version of .spz files; 3 for older programs and Spark.")
 @force_option

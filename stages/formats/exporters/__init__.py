@@ -36,9 +36,9 @@ class Format:
         self.refuse_without_package(path)
         getattr(import_module(f"{__name__}.{self.module}"), self.function)(what, path, frame, **options)
 
-    def companions(self, path: Path, picture: str = "png", normal_map: bool = False) -> list[Path]:
+    def companions(self, path: Path, picture: str = "png") -> list[Path]:
         """The files that it writes next to `path` where the mesh has a texture."""
-        found: list[Path] = import_module(f"{__name__}.{self.module}").companions(path, picture, normal_map) if self.beside else []
+        found: list[Path] = import_module(f"{__name__}.{self.module}").companions(path, picture) if self.beside else []
         return found
 
     def refuse_without_package(self, path: Path) -> None:

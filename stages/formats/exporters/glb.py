@@ -4,9 +4,7 @@ Axes     glTF's y is up. The mesh is turned by the shortest rotation that takes 
          (x, y, z) becomes (x, z, -y), one with y up stays, one with y down becomes (x, -y, -z). The matrix is in the node's extras.
 Texture  inside of the file, PNG or JPEG, sRGB as glTF has it. Vertices are split at the texture's seams alone. v counts from the upper edge in glTF.
 Colour   without a texture COLOR_0, which holds linear light by definition; 16 bits, because 8 linear bits band in the shadows.
-Light    the material is unlit: the colours already hold the light of the capture, and no viewer's lamps shall be added to it. With a normal map it is lit
-         instead (not metallic, rough): an unlit material ignores normal maps, and who asked for one means to light the mesh. Its tangents are MikkTSpace's,
-         those that a viewer would make, and written so that none has to.
+Light    the material is unlit: the colours already hold the light of the capture, and no viewer's lamps shall be added to it.
 Sides    a mesh with open edges is seen from both sides.
 
 Khronos, glTF 2.0 specification, sections 3.7.2.1 (attributes), 3.8 (textures) and 4.4 (binary); extension KHR_materials_unlit.
@@ -14,7 +12,6 @@ Khronos, glTF 2.0 specification, sections 3.7.2.1 (attributes), 3.8 (textures) a
 
 import json
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,8 +21,7 @@ import numpy as np
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
 from efficientnerf.surface.texturing.corners import split_at_seams
-from efficientnerf.surface.texturing.tangents import tangents
-from stages.formats.exporters.textures import MIME, Picture, open_faces, pictures_of
+from stages.formats.exporters.textures import MIME, Picture, open_faces, picture_of
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _KINDS = {"<f4": 5126, "<u2": 5123, "<u4": 5125}
@@ -89,7 +85,7 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
     rotation = gltf_from_capture(frame.up)
     buffer = Buffer()
     primitive = {**_geometry(mesh, rotation, buffer), "material": 0, "mode": 4}
-    write_document(_document(buffer, primitive, pictures_of(mesh, picture), picture, frame, open_faces(mesh.faces)), buffer, path)
+    write_document(_document(buffer, primitive, picture_of(mesh, picture), picture, frame, open_faces(mesh.faces)), buffer, path)
 
 
 def write_document(document: dict[str, Any], buffer: Buffer, path: Path) -> None:
@@ -116,9 +112,6 @@ def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: Buffer) -> dict[str, Any
     }
     if mesh.texture is not None:
         attributes["TEXCOORD_0"] = buffer.accessor(np.asarray(corners.coordinates * [1, -1] + [0, 1], "<f4"), VERTICES)
-        if mesh.texture.normals is not None:
-            frame = tangents(positions.astype(np.float64), normals.astype(np.float64), corners.coordinates.astype(np.float64), corners.faces)
-            attributes["TANGENT"] = buffer.accessor(np.asarray(frame, "<f4"), VERTICES)
     else:
         linear = np.concatenate([linear_from_srgb(np.clip(mesh.colours.astype(np.float64), 0, 1)), np.ones((len(mesh.colours), 1))], 1)
         attributes["COLOR_0"] = buffer.accessor(np.asarray(np.round(linear * 65535), "<u2"), VERTICES, normalized=True)
@@ -126,29 +119,22 @@ def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: Buffer) -> dict[str, Any
 
 
 def _document(
-    buffer: Buffer, primitive: dict[str, Any], pictures: Sequence[bytes], first: Picture, frame: SourceFrame, both_sides: bool
+    buffer: Buffer, primitive: dict[str, Any], colours: bytes | None, picture: Picture, frame: SourceFrame, both_sides: bool
 ) -> dict[str, Any]:
-    """The JSON part; pictures go into the buffer."""
-    lit = len(pictures) > 1
+    """The JSON part; the texture goes into the buffer."""
     material: dict[str, Any] = {"name": "captured light", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}}
-    images = [
-        {"bufferView": buffer.view(data), "mimeType": MIME[kind], "name": name}
-        for data, kind, name in zip(pictures, (first, "png"), ("colours", "normals"))
-    ]
+    images = [] if colours is None else [{"bufferView": buffer.view(colours), "mimeType": MIME[picture], "name": "colours"}]
     if images:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-    if lit:
-        material["normalTexture"] = {"index": 1}
-    else:
-        material["extensions"] = {"KHR_materials_unlit": {}}
+    material["extensions"] = {"KHR_materials_unlit": {}}
     return {
         "asset": {"version": "2.0", "generator": "efficientnerf"},
-        **({} if lit else {"extensionsUsed": ["KHR_materials_unlit"]}),
+        "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "surface", "mesh": 0, "extras": source_extras(frame)}],
         "meshes": [{"name": "surface", "primitives": [primitive]}],
         "materials": [material | ({"doubleSided": True} if both_sides else {})],
-        **({"textures": [{"source": n, "sampler": 0} for n in range(len(images))], "images": images,
+        **({"textures": [{"source": 0, "sampler": 0}], "images": images,
             "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}]} if images else {}),
     }  # fmt: skip

@@ -1,7 +1,7 @@
 """Wavefront OBJ as text. The capture's frame.
 
-Without a texture one file: `v x y z r g b` with sRGB colours 0-1 (the extension that most readers know), `vn`, `f v//vn`. With one, three or four: `v x y z`,
-`vt u v`, `vn`, `f v/vt/vn`; a material file (`map_Kd`, `norm` for a normal map; illum 0: the colour as it is) and the pictures. Readers part names at blanks
+Without a texture one file: `v x y z r g b` with sRGB colours 0-1 (the extension that most readers know), `vn`, `f v//vn`. With one, three: `v x y z`,
+`vt u v`, `vn`, `f v/vt/vn`; a material file (`map_Kd`; illum 0: the colour as it is) and the picture. Readers part names at blanks
 and know no encoding: the names of the other files are plain ASCII (`plain_stem`). The OBJ, which refers to the others, appears last.
 """
 
@@ -12,27 +12,27 @@ import numpy as np
 
 from efficientnerf.surface.mesh import Mesh
 from stages.formats.exporters import textures
-from stages.formats.exporters.textures import Picture, distinct_places, pictures_of, plain_stem
+from stages.formats.exporters.textures import Picture, distinct_places, picture_of, plain_stem
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, text_rows, write_files, write_parts
 
 _MATERIAL = "captured_light"
 
 
-def companions(path: Path, picture: Picture = "png", normal_map: bool = False) -> list[Path]:
-    """The files that are written next to an OBJ with a texture, in order: colours, the normal map where there is one, the material."""
-    return [*textures.companions(path, picture, normal_map), path.with_name(plain_stem(path) + ".mtl")]
+def companions(path: Path, picture: Picture = "png") -> list[Path]:
+    """The files that are written next to an OBJ with a texture, in order: colours, the material."""
+    return [*textures.companions(path, picture), path.with_name(plain_stem(path) + ".mtl")]
 
 
 def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
     """Write a mesh in the capture's frame. Raises BadInput."""
     check_mesh(mesh, path)
-    if mesh.texture is None:
+    texture = picture_of(mesh, picture)
+    if texture is None:
         write_parts(path, _coloured(mesh, frame))
         return
-    pictures = pictures_of(mesh, picture)
-    *names, material = companions(path, picture, len(pictures) > 1)
-    files: dict[Path, Iterable[bytes]] = {name: [data] for name, data in zip(names, pictures, strict=True)}
-    write_files({**files, material: [_material([name.name for name in names])], path: _textured(mesh, frame, material.name)})
+    colours, material = companions(path, picture)
+    files: dict[Path, Iterable[bytes]] = {colours: [texture], material: [_material(colours.name)], path: _textured(mesh, frame, material.name)}
+    write_files(files)
 
 
 def head(frame: SourceFrame) -> bytes:
@@ -59,6 +59,5 @@ def _textured(mesh: Mesh, frame: SourceFrame, material: str) -> Iterator[bytes]:
     yield from text_rows("f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([mesh.faces, number, mesh.faces], 2).reshape(-1, 9) + 1)
 
 
-def _material(pictures: list[str]) -> bytes:
-    maps = [f"{kind} {name}" for kind, name in zip(("map_Kd", "norm"), pictures)]
-    return "".join(f"{line}\n" for line in [f"newmtl {_MATERIAL}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 0", *maps]).encode("ascii")
+def _material(colours: str) -> bytes:
+    return f"newmtl {_MATERIAL}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\nmap_Kd {colours}\n".encode("ascii")

@@ -1,4 +1,4 @@
-"""The textures of exported meshes: pictures as files, and names that every reader takes."""
+"""The texture of an exported mesh: a picture as a file, and names that every reader takes."""
 
 import hashlib
 import io
@@ -37,18 +37,15 @@ def plain_stem(path: Path) -> str:
     return plain if plain == stem else f"{plain or '_'}-{hashlib.sha256(stem.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
 
 
-def companions(path: Path, picture: Picture, normal_map: bool) -> list[Path]:
-    """The files of a mesh's pictures that are written next to it: colours, and the normal map where there is one."""
-    return [path.with_name(plain_stem(path) + suffix) for suffix in (EXTENSIONS[picture], *(("_normal.png",) if normal_map else ()))]
+def companions(path: Path, picture: Picture) -> list[Path]:
+    """The file of a mesh's texture that is written next to it."""
+    return [path.with_name(plain_stem(path) + EXTENSIONS[picture])]
 
 
 @lru_cache(maxsize=1)  # several formats of one mesh follow each other
-def pictures_of(mesh: Mesh, picture: Picture) -> list[bytes]:
-    """The same as bytes; none of a mesh without a texture."""
-    if mesh.texture is None:
-        return []
-    normals = mesh.texture.normals
-    return [encoded(mesh.texture.colours, picture), *([] if normals is None else [encoded(normals, "png")])]
+def picture_of(mesh: Mesh, picture: Picture) -> bytes | None:
+    """The same as bytes; None of a mesh without a texture."""
+    return None if mesh.texture is None else encoded(mesh.texture.colours, picture)
 
 
 def distinct_places(texture: Texture) -> tuple[np.ndarray, np.ndarray]:

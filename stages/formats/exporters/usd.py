@@ -1,7 +1,7 @@
 """USD: USDC with the texture's picture next to it, or USDZ with it inside. Needs the package usd-core, which is the extra `usd`.
 
 Axes     y up, turned as for GLB (`gltf_from_capture`); a unit is stated to be a metre, and in the layer's custom data whether that is known.
-Light    UsdPreviewSurface that emits its colours and reflects nothing: they already hold the light of the capture. With a normal map it reflects them instead.
+Light    UsdPreviewSurface that emits its colours and reflects nothing: they already hold the light of the capture.
 Texture  the primvar `st`, of each face's corners; v counts from the lower edge. sRGB. Without a texture `displayColor`, which is linear.
 Sides    a mesh with open edges is seen from both sides.
 
@@ -23,7 +23,7 @@ import numpy as np
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
 from stages.formats.exporters.glb import gltf_from_capture
-from stages.formats.exporters.textures import Picture, companions, distinct_places, open_faces, pictures_of
+from stages.formats.exporters.textures import Picture, companions, distinct_places, open_faces, picture_of
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_files, write_parts
 
 ALIGNMENT = 64  # bytes, of the beginnings of a package's files
@@ -34,18 +34,17 @@ _PADDING = 0x1986  # the identifier of an extra field of a zip that holds nothin
 def write_usdc(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
     """Write a mesh given in the capture's frame, and its pictures next to it. Raises BadInput."""
     check_mesh(mesh, path)
-    pictures = pictures_of(mesh, picture)
-    names = companions(path, picture, len(pictures) > 1)[: len(pictures)]
-    layer = _layer(mesh, frame, [name.name for name in names])
-    write_files({**{name: [data] for name, data in zip(names, pictures, strict=True)}, path: [layer]})
+    texture, (name,) = picture_of(mesh, picture), companions(path, picture)
+    files = {} if texture is None else {name: [texture]}
+    write_files({**files, path: [_layer(mesh, frame, None if texture is None else name.name)]})
 
 
 def write_usdz(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
     """Write a mesh given in the capture's frame as one package. Raises BadInput."""
     check_mesh(mesh, path)
-    pictures = pictures_of(mesh, picture)
-    names = [name.name for name in companions(Path(LAYER), picture, len(pictures) > 1)][: len(pictures)]
-    write_parts(path, [package({LAYER: _layer(mesh, frame, names), **dict(zip(names, pictures, strict=True))})])
+    texture, (name,) = picture_of(mesh, picture), companions(Path(LAYER), picture)
+    files = {} if texture is None else {name.name: texture}
+    write_parts(path, [package({LAYER: _layer(mesh, frame, None if texture is None else name.name), **files})])
 
 
 def package(files: Mapping[str, bytes]) -> bytes:
@@ -62,8 +61,8 @@ def package(files: Mapping[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def _layer(mesh: Mesh, frame: SourceFrame, pictures: list[str]) -> bytes:
-    """The layer as a binary file; `pictures` are the files next to it that it refers to."""
+def _layer(mesh: Mesh, frame: SourceFrame, picture: str | None) -> bytes:
+    """The layer as a binary file; `picture` is the file next to it that it refers to."""
     from pxr import Tf, Usd, UsdGeom, Vt  # an extra
 
     stage = Usd.Stage.CreateInMemory()
@@ -80,7 +79,7 @@ def _layer(mesh: Mesh, frame: SourceFrame, pictures: list[str]) -> bytes:
     stage.SetDefaultPrim(root.GetPrim())
     shape = UsdGeom.Mesh.Define(stage, "/surface/mesh")
     _put_geometry(shape, mesh, rotation)
-    _put_material(stage, shape, pictures, normal_map=len(pictures) > 1)
+    _put_material(stage, shape, picture)
     with TemporaryDirectory() as folder:
         target = os.path.join(folder, LAYER)
         try:
@@ -117,7 +116,7 @@ def _put_geometry(shape: Any, mesh: Mesh, rotation: np.ndarray) -> None:
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(number.ravel(), np.int32)))
 
 
-def _put_material(stage: Any, shape: Any, pictures: list[str], normal_map: bool) -> None:
+def _put_material(stage: Any, shape: Any, picture: str | None) -> None:
     """UsdPreviewSurface, bound to the mesh."""
     from pxr import Gf, Sdf, UsdShade  # an extra
 
@@ -131,14 +130,13 @@ def _put_material(stage: Any, shape: Any, pictures: list[str], normal_map: bool)
     surface = shader("surface", "UsdPreviewSurface")
     for name, value in (("roughness", 1.0), ("metallic", 0.0), ("ior", 1.0)):
         surface.CreateInput(name, kinds.Float).Set(value)
-    if not normal_map:
-        surface.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
-        surface.CreateInput("useSpecularWorkflow", kinds.Int).Set(1)
-        surface.CreateInput("specularColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
-    colour = surface.CreateInput("diffuseColor" if normal_map else "emissiveColor", kinds.Color3f)
+    surface.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
+    surface.CreateInput("useSpecularWorkflow", kinds.Int).Set(1)
+    surface.CreateInput("specularColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
+    colour = surface.CreateInput("emissiveColor", kinds.Color3f)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
-    if not pictures:
+    if picture is None:
         vertex = shader("vertex_colours", "UsdPrimvarReader_float3")
         vertex.CreateInput("varname", kinds.String).Set("displayColor")
         colour.ConnectToSource(vertex.CreateOutput("result", kinds.Float3))
@@ -146,17 +144,10 @@ def _put_material(stage: Any, shape: Any, pictures: list[str], normal_map: bool)
     place = shader("place", "UsdPrimvarReader_float2")
     place.CreateInput("varname", kinds.String).Set("st")
     result = place.CreateOutput("result", kinds.Float2)
-    for name, file in zip(("colours", "normals"), pictures):
-        texture = shader(name, "UsdUVTexture")
-        texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(f"./{file}"))
-        texture.CreateInput("st", kinds.Float2).ConnectToSource(result)
-        texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB" if name == "colours" else "raw")
-        for axis in ("wrapS", "wrapT"):
-            texture.CreateInput(axis, kinds.Token).Set("clamp")
-        rgb = texture.CreateOutput("rgb", kinds.Float3)
-        if name == "colours":
-            colour.ConnectToSource(rgb)
-            continue
-        texture.CreateInput("scale", kinds.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
-        texture.CreateInput("bias", kinds.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
-        surface.CreateInput("normal", kinds.Normal3f).ConnectToSource(rgb)
+    texture = shader("colours", "UsdUVTexture")
+    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(f"./{picture}"))
+    texture.CreateInput("st", kinds.Float2).ConnectToSource(result)
+    texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+    for axis in ("wrapS", "wrapT"):
+        texture.CreateInput(axis, kinds.Token).Set("clamp")
+    colour.ConnectToSource(texture.CreateOutput("rgb", kinds.Float3))

@@ -71,12 +71,11 @@ def _check_texture(mesh: Mesh, path: Path) -> None:
     _check_finite({"texture coordinates": corners}, path)
     if corners.min() < 0 or corners.max() > 1:
         raise BadInput(f"{path}: texture coordinates from {corners.min():g} to {corners.max():g}, expected 0 to 1. Make the texture again.")
-    for picture in (texture.colours, *(() if texture.normals is None else (texture.normals,))):
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not 1 <= min(picture.shape[:2]) <= max(picture.shape[:2]) <= MOST_TEXELS:
-            raise BadInput(
-                f"{path}: a texture of {picture.dtype} in shape {picture.shape}, expected (H, W, 3) uint8 of at most {MOST_TEXELS} a side. "
-                "Make the texture again."
-            )
+    picture = texture.colours
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not 1 <= min(picture.shape[:2]) <= max(picture.shape[:2]) <= MOST_TEXELS:
+        raise BadInput(
+            f"{path}: a texture of {picture.dtype} in shape {picture.shape}, expected (H, W, 3) uint8 of at most {MOST_TEXELS} a side. Make the texture again."
+        )
 
 
 def check_points(points: PointCloud, path: Path) -> None:

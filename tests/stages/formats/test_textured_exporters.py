@@ -21,19 +21,18 @@ from tests.stages.io.meshes import NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb
 SIDE = 48
 
 
-def textured(*, normals: bool = False) -> Mesh:
+def textured() -> Mesh:
     """The block with each of its six sides in a cell of an atlas, which is 3 wide and 2 high."""
     quad = 0.05 + 0.9 * np.array([(0.0, 0), (0, 1), (1, 1), (1, 0)])
     cells = [(np.array([k % 3, k // 3]) + quad) / [3, 2] for k in range(6)]
     coordinates = np.array([part for cell in cells for part in (cell[[0, 1, 2]], cell[[0, 2, 3]])])
     y, x = np.mgrid[0:SIDE, 0:SIDE] / SIDE
     colours = np.stack([255 * x, 255 * y, 128 + 100 * np.sin(20 * x) * np.cos(14 * y)], -1).astype(np.uint8)
-    flat = np.full((SIDE, SIDE, 3), (128, 128, 255), np.uint8)
-    return replace(block(), texture=Texture(coordinates, colours, flat if normals else None))
+    return replace(block(), texture=Texture(coordinates, colours))
 
 
-# corners (F, 3, 3) in the capture's frame, texture coordinates (F, 3, 2) with v up, the picture, the normal map
-Read = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]
+# corners (F, 3, 3) in the capture's frame, texture coordinates (F, 3, 2) with v up, the picture
+Read = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def picture_of(data: bytes) -> np.ndarray:
@@ -44,19 +43,17 @@ def read_glb(path: Path) -> Read:
     document, blob = glb_document(path)
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
     primitive = document["meshes"][0]["primitives"][0]
-    tangent = ["TANGENT"] if "normalTexture" in document["materials"][0] else []
-    assert sorted(primitive["attributes"]) == ["NORMAL", "POSITION", *tangent, "TEXCOORD_0"], "colours of vertices would darken the texture"
+    assert sorted(primitive["attributes"]) == ["NORMAL", "POSITION", "TEXCOORD_0"], "colours of vertices would darken the texture"
     vertices, places = (accessor(document, blob, primitive["attributes"][name]) for name in ("POSITION", "TEXCOORD_0"))
     faces = accessor(document, blob, primitive["indices"]).reshape(-1, 3)
     back = np.array(document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"])[:3, :3]
-    pictures = []
-    for image in document["images"]:
-        view = document["bufferViews"][image["bufferView"]]
-        pictures.append(picture_of(blob[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]))
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    picture = picture_of(blob[view["byteOffset"] : view["byteOffset"] + view["byteLength"]])
     material = document["materials"][0]
     assert document["textures"][material["pbrMetallicRoughness"]["baseColorTexture"]["index"]]["source"] == 0
-    assert ("KHR_materials_unlit" in material.get("extensions", {})) == ("normalTexture" not in material) == ("extensionsUsed" in document)
-    return (vertices @ back)[faces], (places * [1, -1] + [0, 1])[faces], pictures[0], pictures[1] if len(pictures) > 1 else None
+    assert "KHR_materials_unlit" in material["extensions"]
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    return (vertices @ back)[faces], (places * [1, -1] + [0, 1])[faces], picture
 
 
 def read_obj(path: Path) -> Read:
@@ -69,9 +66,7 @@ def read_obj(path: Path) -> Read:
     (used,) = [line[1:] for line in lines if line[0] == "usemtl"]
     assert material["newmtl"] == used
     (colours,) = material["map_Kd"]
-    normals = path.with_name(material["norm"][0]).read_bytes() if "norm" in material else None
-    picture = picture_of(path.with_name(colours).read_bytes())
-    return vertices[corners[..., 0]], places[corners[..., 1]], picture, None if normals is None else picture_of(normals)
+    return vertices[corners[..., 0]], places[corners[..., 1]], picture_of(path.with_name(colours).read_bytes())
 
 
 def read_usd(path: Path) -> Read:
@@ -87,41 +82,30 @@ def read_usd(path: Path) -> Read:
     st = UsdGeom.PrimvarsAPI(shape).GetPrimvar("st")
     places = np.array(st.ComputeFlattened()).reshape(-1, 3, 2)
     surface = UsdShade.Shader(stage.GetPrimAtPath("/surface/material/surface"))
-    pictures = {}
-    for name in ("emissiveColor", "diffuseColor", "normal"):
-        found = surface.GetInput(name)
-        if found and found.HasConnectedSource():
-            source = UsdShade.Shader(found.GetConnectedSources()[0][0].source.GetPrim())
-            asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(source.GetInput("file").Get().resolvedPath))
-            pictures[name] = picture_of(bytes(asset.GetBuffer()))
-    assert sorted(pictures) in (["emissiveColor"], ["diffuseColor", "normal"])
-    colours = pictures.get("emissiveColor", pictures.get("diffuseColor"))
-    assert colours is not None
-    return (np.array(shape.GetPointsAttr().Get()) @ back)[faces], places, colours, pictures.get("normal")
+    source = UsdShade.Shader(surface.GetInput("emissiveColor").GetConnectedSources()[0][0].source.GetPrim())
+    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(source.GetInput("file").Get().resolvedPath))
+    return (np.array(shape.GetPointsAttr().Get()) @ back)[faces], places, picture_of(bytes(asset.GetBuffer()))
 
 
 READERS: dict[str, Callable[[Path], Read]] = {".glb": read_glb, ".obj": read_obj, ".usdz": read_usd, ".usdc": read_usd}
 TEXTURED = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in READERS]
 
 
-@pytest.mark.parametrize(("normals", "picture"), [(False, "png"), (True, "jpeg")], ids=["unlit", "normal map"])
+@pytest.mark.parametrize("picture", ["png", "jpeg"])
 @pytest.mark.parametrize("extension", TEXTURED)
-def test_the_same_surface_in_the_same_colours(extension: str, normals: bool, picture: str, tmp_path: Path) -> None:
-    mesh, path = textured(normals=normals), tmp_path / f"thing{extension}"
+def test_the_same_surface_in_the_same_colours(extension: str, picture: str, tmp_path: Path) -> None:
+    mesh, path = textured(), tmp_path / f"thing{extension}"
     exporter = MESH_EXPORTERS[extension]
     exporter(mesh, path, Y_DOWN, picture=picture)
-    corners, places, colours, bent = READERS[extension](path)
+    corners, places, colours = READERS[extension](path)
     np.testing.assert_allclose(corners, mesh.vertices[mesh.faces], atol=1e-5)
     np.testing.assert_allclose(places, mesh.texture.coordinates, atol=1e-6)
     if picture == "png":
         np.testing.assert_array_equal(colours, mesh.texture.colours)
     else:
         assert 30 < -10 * np.log10(((colours / 255.0 - mesh.texture.colours / 255.0) ** 2).mean()) < 70
-    assert (bent is not None) == normals
-    if normals:
-        np.testing.assert_array_equal(bent, mesh.texture.normals)
     written = sorted(each.name for each in tmp_path.iterdir())
-    assert written == sorted([path.name, *(each.name for each in exporter.companions(path, picture, normals))])
+    assert written == sorted([path.name, *(each.name for each in exporter.companions(path, picture))])
 
 
 @pytest.mark.parametrize("extension", [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in MESH_EXPORTERS])
@@ -149,10 +133,10 @@ def test_open_meshes_are_seen_from_both_sides(tmp_path: Path) -> None:
 @NEEDS_USD
 def test_usdz_is_a_zip_of_aligned_stored_files_without_dates(tmp_path: Path) -> None:
     path = tmp_path / "a.usdz"
-    MESH_EXPORTERS[".usdz"](textured(normals=True), path, Z_UP)
+    MESH_EXPORTERS[".usdz"](textured(), path, Z_UP)
     data = path.read_bytes()
     with zipfile.ZipFile(path) as archive:
-        assert [entry.filename for entry in archive.infolist()] == ["surface.usdc", "surface.png", "surface_normal.png"]
+        assert [entry.filename for entry in archive.infolist()] == ["surface.usdc", "surface.png"]
         for entry in archive.infolist():
             name, extra = struct.unpack_from("<HH", data, entry.header_offset + 26)
             assert (entry.header_offset + 30 + name + extra) % 64 == 0
@@ -162,7 +146,7 @@ def test_usdz_is_a_zip_of_aligned_stored_files_without_dates(tmp_path: Path) -> 
 
 
 @NEEDS_USD
-@pytest.mark.parametrize("mesh", [block(), textured(), textured(normals=True)], ids=["vertex colours", "texture", "normal map"])
+@pytest.mark.parametrize("mesh", [block(), textured()], ids=["vertex colours", "texture"])
 def test_usds_own_validators_find_nothing(mesh: Mesh, tmp_path: Path) -> None:
     from pxr import Usd, UsdValidation
 
@@ -204,13 +188,13 @@ BROKEN = {
     "grey": spoilt(colours=np.zeros((4, 4), np.uint8)),
     "empty": spoilt(colours=np.zeros((0, 4, 3), np.uint8)),
     "too large": spoilt(colours=np.broadcast_to(np.uint8(0), (20000, 20000, 3))),
-    "normals": spoilt(normals=np.zeros((4, 4, 4), np.uint8)),
+    "with opacity": spoilt(colours=np.zeros((4, 4, 4), np.uint8)),
 }
 
 
 @pytest.mark.parametrize("extension", [".glb", ".obj", ".usdz"])
 def test_broken_textures_are_refused(extension: str, tmp_path: Path) -> None:
     for mesh in BROKEN.values():
-        with pytest.raises(BadInput, match=r"texture|coordinates|normal"):
+        with pytest.raises(BadInput, match=r"texture|coordinates"):
             MESH_EXPORTERS[extension](mesh, tmp_path / f"a{extension}", Z_UP)
     assert list(tmp_path.iterdir()) == []

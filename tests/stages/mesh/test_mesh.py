@@ -13,14 +13,13 @@ from efficientnerf.asset import format
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.orbit import Orbit
 from efficientnerf.surface.mesh import Mesh
-from pipeline.errors import CorruptArtifact, UsageError
+from pipeline.errors import UsageError
 from pipeline.stage import Job
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
 from stages.evaluate.mesh import load_mesh
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, load, save
 from stages.mesh import run as stage
-from stages.mesh.files import read_mesh
 from stages.mesh.settings import STAGE, MeshSettings
 from stages.mesh.texture import textured
 from tests.stages.mesh.balls import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
@@ -175,20 +174,6 @@ def test_held_back_photographs_are_not_looked_at(ball: Path, tmp_path: Path) -> 
     stage.run(Job(settings=settings, inputs=inputs(ball, poses), out=tmp_path / "b", work=tmp_path / "work"))
     assert (tmp_path / "a" / "report.json").read_bytes() == (tmp_path / "b" / "report.json").read_bytes()
     assert json.loads((tmp_path / "a" / "report.json").read_text())["texture_observed"] > 0.5
-
-
-def test_a_normal_map_is_written_and_read_again(ball: Path, photographed: Path, tmp_path: Path) -> None:
-    settings = MeshSettings(max_faces=300, texture_size=256, normal_map=True)
-    stage.run(Job(settings=settings, inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["normal_map_met"] > 0.98
-    outputs = MeshOutputs(tmp_path / "out")
-    found = read_mesh(outputs)
-    assert found.texture.normals.shape == found.texture.colours.shape
-    assert "normal map" in json.loads(outputs.timings.read_text())
-    outputs.normal_map.unlink()
-    with pytest.raises(CorruptArtifact, match=r"mesh_normal\.png"):
-        read_mesh(outputs)
 
 
 def test_the_preview_shows_all_of_a_subject_that_is_clipped() -> None:

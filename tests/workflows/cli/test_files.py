@@ -241,7 +241,7 @@ def test_describing_gaussians(enerf: Enerf, tmp_path: Path) -> None:
         assert (found["what"], found["gaussians"], found["sh_degree"]) == ("splats", 20, 2)
     MESH_EXPORTERS[".glb"](block(), tmp_path / "mesh.glb", Z_UP)
     assert enerf("inspect", tmp_path / "mesh.glb", "--json").object["what"] == "mesh"
-    (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-30])
+    (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:9])
     result = enerf("inspect", tmp_path / "a.spz")
     assert (result.code, "a.spz" in result.err) == (2, True)
 

@@ -75,18 +75,6 @@ def _quantised(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
     ]
 
 
-def places(raw: bytes, bits: int) -> np.ndarray:
-    """(N, 3) float64 of the places as versions 2 and 3 write them."""
-    padded = np.zeros((len(raw) // 3, 4), np.uint8)
-    padded[:, 1:] = np.frombuffer(raw, np.uint8).reshape(-1, 3)
-    return np.asarray((padded.view("<i4")[:, 0] >> 8).reshape(-1, 3) / 2.0**bits)
-
-
-def scales(raw: bytes) -> np.ndarray:
-    """(N, 3) float64 of the scales."""
-    return np.asarray(np.exp(np.frombuffer(raw, np.uint8).reshape(-1, 3) / SCALE_STEPS + SMALLEST_SCALE))
-
-
 def rotation_codes(rotations: np.ndarray) -> np.ndarray:
     """(N,) uint32 of unit quaternions w x y z: the number of the largest of x y z w, then the others in that order, a sign and 9 bits each."""
     q = rotations[:, [1, 2, 3, 0]].astype(np.float64)
