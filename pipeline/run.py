@@ -25,7 +25,7 @@ import msgspec
 
 from pipeline import files
 from pipeline.errors import BadInput, CorruptArtifact, RunLocked
-from pipeline.executors.memory import MOST
+from pipeline.executors.memory import NO_LIMIT
 from pipeline.failures import cannot_write, failed
 from pipeline.links import CACHE, HOLDER, LEASE, LOCK, RUN, refuse_links
 from pipeline.locks.lease import Lease
@@ -47,7 +47,7 @@ _FIELDS: dict[str, Any] = {
     "preset": Annotated[str, msgspec.Meta(max_length=200)] | None,
     "seed": Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None,
     "device": Annotated[str, msgspec.Meta(max_length=200)] | None,
-    "memory": Annotated[int, msgspec.Meta(ge=1, le=MOST)] | None,
+    "memory": Annotated[int, msgspec.Meta(ge=1, le=NO_LIMIT)] | None,
     "viewer": Annotated[str, msgspec.Meta(max_length=200)] | None,
     "created": Annotated[float, msgspec.Meta(gt=-1e15, lt=1e15)],
 }

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from efficientnerf.capture.adjustment import shape_spread
-from efficientnerf.capture.markers import SURE, common_ratio
+from efficientnerf.capture.markers import CONFIDENCE, common_ratio
 from efficientnerf.capture.supports import level_plane
 from efficientnerf.capture.triangulation import Place, length_between, triangulated
 from efficientnerf.geometry.cameras import Camera, Similarity
@@ -130,7 +130,7 @@ class Measured:
     def length(self, a: Place, b: Place) -> tuple[float, float]:
         """The length between two places in the frame of exports, and its error (99 %)."""
         length, spread = length_between(a, b)
-        return self.frame.scale * length, self.frame.scale * float(np.hypot(SURE * np.hypot(spread, self.shape * length), (self.error or 0.0) * length))
+        return self.frame.scale * length, self.frame.scale * float(np.hypot(CONFIDENCE * np.hypot(spread, self.shape * length), (self.error or 0.0) * length))
 
 
 def measured(run: Path, *, captured: bool = False) -> Measured:
@@ -174,7 +174,7 @@ def sides_of(run: Path, inside: Measured) -> dict[str, Any] | None:
     scale = inside.frame.scale
     sides = scale * np.array([longer, shorter, np.ptp(turned[:, 1])])
     surface = scale * _surface_noise(inside, vertices, normals, _points_of(run))
-    errors = np.hypot(SURE * np.hypot(np.sqrt(2) * surface, inside.shape * sides), (inside.error or 0.0) * sides)
+    errors = np.hypot(CONFIDENCE * np.hypot(np.sqrt(2) * surface, inside.shape * sides), (inside.error or 0.0) * sides)
     facts = {"surface_noise": surface, "shape_spread": inside.shape, "ground_sample_distance": scale * _pixel(inside, vertices)}
     return {"unit": inside.unit, "scale_error": inside.error, "sides": sides.tolist(), "errors": errors.tolist(), **facts}
 
@@ -219,7 +219,7 @@ def measure(inside: Measured, places: Sequence[str]) -> dict[str, Any]:
         legs.append({"from": places[n], "to": places[n + 1], "length": length, "error": error})
     shown = [
         {
-            "place": text, "position": inside.frame.points(place.position).tolist(), "error": inside.frame.scale * SURE * place.spread,
+            "place": text, "position": inside.frame.points(place.position).tolist(), "error": inside.frame.scale * CONFIDENCE * place.spread,
             "photographs": place.views, "miss": place.miss,
         }
         for text, place in zip(places, found, strict=True)
@@ -259,7 +259,7 @@ def ground_through(inside: Measured, places: Sequence[str]) -> tuple[Ground, flo
         raise BadInput(f"{listed}: three places in one line, or nearly, which up may turn about. Pick them far apart in both directions.")
     up = normal / area
     spreads = np.array([up @ each.covariance @ up for each in found]) ** 0.5
-    error = float(np.degrees(np.arctan(SURE * np.linalg.norm(spreads * sides / area))))
+    error = float(np.degrees(np.arctan(CONFIDENCE * np.linalg.norm(spreads * sides / area))))
     if error > LARGEST_TILT:
         raise BadInput(f"{listed}: up would be known within {error:.0f} degrees only. Pick places farther apart, or in more photographs.")
     above = np.median(inside.centres @ up) - at.mean(axis=0) @ up

@@ -15,7 +15,7 @@ GAUGE = 7  # degrees of freedom of a similarity, which no photograph determines
 MOST_POINTS = 4000  # an even choice of more stands for all
 MOST_CAMERAS = 500  # the covariance of more takes a minute and a gigabyte
 FEWEST = 8  # points
-LEAST = 1e-12  # of the largest eigenvalue: less is not known
+MIN_EIGENVALUE = 1e-12  # of the largest eigenvalue: less is not known
 SEEING = 4  # points, from which a camera's centre is known by them
 
 
@@ -49,7 +49,7 @@ def shape_spread(
     mixed = _rows(across, at[point], at.size).T @ by_camera  # (3 P, N)
     follow = solved @ mixed  # (3 P, N): points go as far the other way
     values, vectors = np.linalg.eigh((by_camera.T @ by_camera - mixed.T @ follow).toarray())
-    deviations = vectors[:, GAUGE:] / np.sqrt(every * np.maximum(values[GAUGE:], LEAST * values[-1]))  # (N, N - 7), independent
+    deviations = vectors[:, GAUGE:] / np.sqrt(every * np.maximum(values[GAUGE:], MIN_EIGENVALUE * values[-1]))  # (N, N - 7), independent
 
     moved = -(follow.tocsr()[at[some].ravel()] @ deviations).reshape(some.sum(), 3, -1)  # (S, 3, N - 7)
     places = places[some]

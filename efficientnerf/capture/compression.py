@@ -5,7 +5,7 @@ docs/experiments/sfm.md
 import numpy as np
 
 BLOCK = 8  # px, side of JPEG's blocks
-LEAST = 8 * BLOCK  # px of a side, below which nothing is reported
+MIN_SIDE = 8 * BLOCK  # px of a side, below which nothing is reported
 STRONG = 20  # quality of a JPEG by libjpeg's count, below which it is compressed strongly
 STEP, SHARE = 2.0, 0.8  # levels, and of the mean difference of neighbouring pixels, from which steps between blocks show
 
@@ -25,7 +25,7 @@ def block_steps(grey: np.ndarray) -> tuple[float, float]:
 
     grey  (H, W) uint8, at the size at which it was compressed; the blocks are found at half of that size, too
     """
-    if min(grey.shape) < LEAST:
+    if min(grey.shape) < MIN_SIDE:
         return 0.0, 0.0
     return min(_steps_across(grey), _steps_across(grey.T))
 

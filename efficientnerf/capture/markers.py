@@ -17,7 +17,7 @@ MIN_VIEWS = 3
 STILL = 0.0015  # of a picture's longest side: up to this root mean square a view agrees with where a marker is
 MIN_AGREEING = 0.7  # share of the views of a marker that stood still
 CORNER_BIAS = 0.1  # px of an edge's length that is no noise: what blur does to small markers, alike in all views
-SURE = 2.58  # standard deviations of the stated error: 99 %
+CONFIDENCE = 2.58  # standard deviations of the stated error: 99 %
 ROUNDS = 30
 
 
@@ -84,7 +84,7 @@ def common_ratio(ratios: np.ndarray, spread: np.ndarray) -> tuple[float, float, 
     weight = spread**-2 / (spread**-2).sum()
     mean = float(weight @ logs)
     excess = float(np.sqrt((((logs - mean) / spread) ** 2).sum() / max(len(logs) - 1, 1)))
-    return float(np.exp(mean)), SURE * float((spread**-2).sum() ** -0.5) * max(1.0, excess), excess
+    return float(np.exp(mean)), CONFIDENCE * float((spread**-2).sum() ** -0.5) * max(1.0, excess), excess
 
 
 def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> tuple[np.ndarray, float] | None:
@@ -99,7 +99,7 @@ def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> tuple[np.nda
         return None
     uneven = extent[2] / np.sqrt(len(fits) - 2)  # corners of one marker miss the plane alike
     shift = 2 * float(np.median([fit.shift for fit in fits]))  # `extent` counts each of the places four times
-    error = np.degrees(np.arctan(SURE * np.hypot(uneven, shift) / extent[1]))
+    error = np.degrees(np.arctan(CONFIDENCE * np.hypot(uneven, shift) / extent[1]))
     return axes[2] * np.sign((faces @ axes[2]).sum()), float(error)
 
 

@@ -13,7 +13,7 @@ from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.splats.gaussians import Gaussians
 
 NEAR = 0.05  # depth in front of which nothing is rendered, units of the training frame
-BESIDE = 0.15  # of the picture's width and height, outside of it, up to where derivatives of the projection follow the means; as 3DGS
+OVERSCAN = 0.15  # of the picture's width and height, outside of it, up to where derivatives of the projection follow the means; as 3DGS
 LOG_SCALES = (-30.0, 20.0)  # values beyond are rendered as these: float32 holds their squares
 LANES = 16
 
@@ -66,7 +66,7 @@ def _limits(camera: Camera) -> np.ndarray:
     local = rays(camera, border)[1] @ camera.world_from_camera[:3, :3]
     plane = local[:, :2] / np.maximum(local[:, 2:], 1e-3)
     low, high = plane.min(axis=0), plane.max(axis=0)
-    margin = BESIDE * (high - low)
+    margin = OVERSCAN * (high - low)
     return np.stack([low - margin, high + margin], axis=-1).reshape(4)
 
 

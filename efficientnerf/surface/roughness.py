@@ -14,7 +14,7 @@ SIDE = 256  # pixels of the longest side in which plain regions are sought
 CONTRAST = 3 / 255  # change of colour from pixel to pixel, below which it is plain
 REACH = 4  # of those pixels, from the middle of a line to its ends
 BENT = 20.0  # degrees between both halves of a line, from which it is bent
-LEAST = 0.03  # of the pixels: fewer lines say nothing
+MIN_LINES = 0.03  # of the pixels: fewer lines say nothing
 
 
 def roughness(photograph: np.ndarray, depth: np.ndarray, camera: Camera) -> float | None:
@@ -31,7 +31,7 @@ def roughness(photograph: np.ndarray, depth: np.ndarray, camera: Camera) -> floa
     known = np.isfinite(depth) & (regions > 0)
     points = directions * (np.where(known, depth, 1) / (directions @ camera.forward))[..., None]
     bent = np.concatenate([_bends(points.swapaxes(0, axis), regions.swapaxes(0, axis), known.swapaxes(0, axis)) for axis in (0, 1)])
-    return float((bent > BENT).mean()) if len(bent) >= 2 * LEAST * regions.size else None
+    return float((bent > BENT).mean()) if len(bent) >= 2 * MIN_LINES * regions.size else None
 
 
 def _plain_regions(photograph: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from pipeline.executors.cores import affinity
 from pipeline.text import printable
 
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
-MOST = 2**60  # bytes; larger than any real limit; version 1 of control groups states "none" by a number above it
+NO_LIMIT = 2**60  # bytes; larger than any real limit; version 1 of control groups states "none" by a number above it
 KEPT_BACK = 0.1  # of the machine, or of the control group: for the system, page tables and buffers of files
 # Addresses that a process with torch and OpenCV reserves beyond what it uses, and for each thread its stack and the C library's arena.
 RESERVED, RESERVED_BY_THREAD = 1200 * 2**20, 72 * 2**20  # under RLIMIT_AS
@@ -42,7 +42,7 @@ def parse_size(text: str) -> int:
     """Bytes in `512m`, `8g`, `1.5GiB`, `2 TB` or `8000000000`; units are powers of 1024. Raises UsageError."""
     found = re.fullmatch(r"(\d{1,20}(?:\.\d{1,9})?)\s*(?:([kmgt])(?:i?b)?|b)?", text.strip().lower(), re.ASCII)
     size = int(float(found[1]) * UNITS[found[2] or ""]) if found else 0
-    if not 0 < size <= MOST:
+    if not 0 < size <= NO_LIMIT:
         raise UsageError(f"--memory {printable(text[:40])}: expected a size, as in 512m, 8g or 1.5GiB.")
     return size
 
@@ -83,7 +83,7 @@ def available_now(root: Path = Path("/")) -> int | None:
     found = own + free
     for folder, _ in cgroup_folders(root, "memory"):
         limit, used = first_number(folder, _LIMITS), first_number(folder, ("memory.current", "memory.usage_in_bytes"))
-        if limit is not None and used is not None and limit < MOST:
+        if limit is not None and used is not None and limit < NO_LIMIT:
             cached = sum(number_of(folder / "memory.stat", name) or 0 for name in ("inactive_file", "active_file"))
             found = min(found, own + max(0, limit - used + cached))
     return found
@@ -118,7 +118,7 @@ def _cgroups(root: Path) -> Iterator[Limit]:
     """The limits of the control groups that the process is in, and of those around them, which hold for it too."""
     for folder, name in cgroup_folders(root, "memory"):
         limit = first_number(folder, _LIMITS)
-        if limit is not None and limit < MOST:
+        if limit is not None and limit < NO_LIMIT:
             yield Limit(limit, f"the control group {printable(name)}")
 
 
@@ -127,7 +127,7 @@ def _rlimits(cores: int) -> list[Limit]:
     found = []
     for name, reserved, by_thread in (("RLIMIT_AS", RESERVED, RESERVED_BY_THREAD), ("RLIMIT_DATA", PRIVATE, PRIVATE_BY_THREAD)):
         soft, _ = resource.getrlimit(getattr(resource, name))
-        if soft != resource.RLIM_INFINITY and 0 <= soft < MOST:
+        if soft != resource.RLIM_INFINITY and 0 <= soft < NO_LIMIT:
             found.append(Limit(max(soft - reserved - cores * by_thread, soft // 16, 1), name))
     return found
 

@@ -13,7 +13,7 @@ from pipeline import files
 from pipeline.fleet.state import MOST_SCENES
 
 FOLDER = ".requests"
-MOST = 100  # that are taken at a time
+MAX_AT_ONCE = 100  # that are taken at a time
 ANSWER_SECONDS = 30.0  # that the caller waits for the process that runs the fleet, which checks every second
 _LIMIT = 4 * 2**20  # bytes of one
 
@@ -61,7 +61,7 @@ def take(fleet: Path) -> list[Request]:
     folder, found = fleet / FOLDER, []
     if not files.is_folder(folder):
         return []
-    for path in sorted(folder.glob("[0-9]*.json"))[:MOST]:
+    for path in sorted(folder.glob("[0-9]*.json"))[:MAX_AT_ONCE]:
         with contextlib.suppress(OSError, ValueError):  # of msgspec, too
             found.append(msgspec.convert(files.read_json(path, limit=_LIMIT, follow=False), Request))
         with contextlib.suppress(OSError):

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from efficientnerf.capture.adjustment import shape_spread
-from efficientnerf.capture.markers import MIN_VIEWS, SURE, SquareFit, common_length, common_normal, fit_square
+from efficientnerf.capture.markers import CONFIDENCE, MIN_VIEWS, SquareFit, common_length, common_normal, fit_square
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.rendering.colour import linear_from_srgb
 from pipeline.errors import BadInput
@@ -64,7 +64,7 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     if excess > 3 and max(abs(fit.square.scale / length - 1) for fit in still.values()) > LARGEST_ERROR:
         lengths = ", ".join(f"{number}: {fit.square.scale / length * size:.4g} m" for number, fit in sorted(still.items()))
         raise BadInput(f"{job.source}: markers differ in size ({lengths}): they are not all of one size, they moved, or {_ANYWAY}")
-    error = float(np.hypot(error, SURE * _shape_spread(capture, [*still.values()], job.settings.feature_image_size)))
+    error = float(np.hypot(error, CONFIDENCE * _shape_spread(capture, [*still.values()], job.settings.feature_image_size)))
     if error > LARGEST_ERROR:
         remedy = "Photograph them larger, from more sides, and with more of what is round them."
         warn(f"markers give lengths within {min(error, 1):.0%} only, and are not used. {remedy}")

@@ -7,11 +7,11 @@ from pipeline import files
 from pipeline.errors import BadInput
 from pipeline.text import printable
 
-LARGEST = 256 << 20  # bytes; scene.json of a hundred thousand views fits
+MAX_BYTES = 256 << 20  # bytes; scene.json of a hundred thousand views fits
 LARGEST_NUMBER = 1e12  # of lengths and parameters: UTM coordinates in millimetres fit, and no product of a few overflows
 
 
-def read_json(path: Path, remedy: str, *, limit: int = LARGEST) -> Any:
+def read_json(path: Path, remedy: str, *, limit: int = MAX_BYTES) -> Any:
     """The value in a JSON file of at most `limit` bytes, without NaN and Infinity; BadInput says what is wrong with the file, then the remedy."""
     try:
         return files.read_json(path, limit)
@@ -21,7 +21,7 @@ def read_json(path: Path, remedy: str, *, limit: int = LARGEST) -> Any:
         raise BadInput(f"{printable(path)}: {error}. {remedy}".strip()) from error
 
 
-def read_object(path: Path, where: str, remedy: str, *, limit: int = LARGEST) -> dict[str, Any]:
+def read_object(path: Path, where: str, remedy: str, *, limit: int = MAX_BYTES) -> dict[str, Any]:
     """The object in a JSON file, which messages call `where`; BadInput where it holds another value."""
     found = read_json(path, remedy, limit=limit)
     if not isinstance(found, dict):

@@ -20,7 +20,7 @@ from stages.io.scene_schema import CameraDocument, read_document
 from stages.train import choices
 
 FORMAT = 1
-AGAIN = "Train again."
+REMEDY = "Train again."
 LEFT_OUT = "left out"  # the split of a training view that was not trained on in the end
 
 
@@ -42,19 +42,19 @@ def load_scene(poses: Path, train: Path) -> Scene:
     found, path = choices.load(train).scene(scene.load(poses)), TrainOutputs(train).cameras
     if not path.is_file():
         return found
-    document = read_document(path, RefinedDocument, AGAIN)
+    document = read_document(path, RefinedDocument, REMEDY)
     known = {view.image: view for view in found.views}
     if not known.keys() >= set(document.left_out):
-        raise CorruptArtifact(f"{printable(path)}: views are left out that this scene has not. {AGAIN}")
+        raise CorruptArtifact(f"{printable(path)}: views are left out that this scene has not. {REMEDY}")
     for image, camera in document.cameras.items():
         view = known.get(image)
         size = None if view is None else (view.camera.width, view.camera.height, view.camera.model)
         if document.format != FORMAT or size != (camera.width, camera.height, camera.model):
-            raise CorruptArtifact(f"{printable(path)}: '{printable(image, 100)}' is no such view of this scene, or the format is another one. {AGAIN}")
+            raise CorruptArtifact(f"{printable(path)}: '{printable(image, 100)}' is no such view of this scene, or the format is another one. {REMEDY}")
     try:
         cameras = {image: camera_from(camera, image) for image, camera in document.cameras.items()}
     except ValueError as error:
-        raise CorruptArtifact(f"{printable(path)}: {printable(error, 300)}. {AGAIN}") from error
+        raise CorruptArtifact(f"{printable(path)}: {printable(error, 300)}. {REMEDY}") from error
     return as_trained(found, cameras, document.left_out)
 
 

@@ -36,7 +36,7 @@ from stages.reports import poses_report
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
-AGAIN = "Run the poses stage again."
+REMEDY = "Run the poses stage again."
 WORKING_FORMATS = ("PNG", "JPEG")  # of images/; masks/ hold PNG
 
 
@@ -129,15 +129,15 @@ def load(folder: Path) -> Scene:
     path = PosesOutputs(folder).scene
     if not path.is_file():
         raise BadInput(f"{printable(path)}: no such file. Run the poses stage first.")
-    found = json_of_run(path, AGAIN)
+    found = json_of_run(path, REMEDY)
     version = found.get("format") if isinstance(found, dict) else None
     if type(version) is int and version > FORMAT:
         newer = str(version) if version < 10**6 else "of many digits"
-        raise CorruptArtifact(f"{printable(path)}: format version {newer}; this build reads 1 to {FORMAT}. Upgrade efficientnerf. {AGAIN}")
+        raise CorruptArtifact(f"{printable(path)}: format version {newer}; this build reads 1 to {FORMAT}. Upgrade efficientnerf. {REMEDY}")
     try:
-        return _scene_from(decoded(found, SceneDocument, path, AGAIN))
+        return _scene_from(decoded(found, SceneDocument, path, REMEDY))
     except ValueError as error:
-        raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {AGAIN}") from error
+        raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {REMEDY}") from error
 
 
 def _scene_from(document: SceneDocument) -> Scene:
@@ -171,10 +171,10 @@ def read_image(folder: Path, view: View) -> np.ndarray:
         with opened(path, WORKING_FORMATS) as image:
             rgb, alpha = rgb_and_alpha(image)
     except UnreadableImage as error:
-        raise CorruptArtifact(f"{printable(path)}: missing or {error}. {AGAIN}") from error
+        raise CorruptArtifact(f"{printable(path)}: missing or {error}. {REMEDY}") from error
     if rgb.shape[:2] != (view.camera.height, view.camera.width):
         found = f"{rgb.dtype} {rgb.shape[1]}x{rgb.shape[0]}"
-        raise CorruptArtifact(f"{printable(path)}: {found}; expected an 8-bit image of {view.camera.width}x{view.camera.height}. {AGAIN}")
+        raise CorruptArtifact(f"{printable(path)}: {found}; expected an 8-bit image of {view.camera.width}x{view.camera.height}. {REMEDY}")
     return np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha]))
 
 
@@ -194,7 +194,7 @@ def read_mask(folder: Path, view: View) -> np.ndarray | None:
     with contextlib.suppress(UnreadableImage), opened(path, WORKING_FORMATS) as image:
         pixels = grey_of(image)
     if pixels is None or pixels.shape != (view.camera.height, view.camera.width):
-        raise CorruptArtifact(f"{printable(path)}: missing, unreadable or not {view.camera.width}x{view.camera.height}. {AGAIN}")
+        raise CorruptArtifact(f"{printable(path)}: missing, unreadable or not {view.camera.width}x{view.camera.height}. {REMEDY}")
     return pixels >= 128
 
 
@@ -230,14 +230,14 @@ def _point_arrays(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
         tensors = load_file(path)
         xyz, rgb, error, counts, observers = (tensors[name] for name in ("xyz", "rgb", "error", "observer_counts", "observers"))
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError) as reason:
-        raise CorruptArtifact(f"{printable(path)}: not readable as sparse points ({printable(reason, 80)}). {AGAIN}") from reason
+        raise CorruptArtifact(f"{printable(path)}: not readable as sparse points ({printable(reason, 80)}). {REMEDY}") from reason
     count = len(counts) if counts.ndim == 1 else 0
     shapes = [array.shape for array in (xyz, rgb, error, counts)] == [(count, 3), (count, 3), (count,), (count,)]
     types = [array.dtype for array in (xyz, rgb, error, counts, observers)] == [np.float64, np.uint8, np.float64, np.int64, np.int64]
     if not shapes or not types or (counts < 0).any() or (counts > observers.size).any() or observers.shape != (counts.sum(),) or (observers < 0).any():
-        raise CorruptArtifact(f"{printable(path)}: sparse points whose shapes, types or counts do not agree. {AGAIN}")
+        raise CorruptArtifact(f"{printable(path)}: sparse points whose shapes, types or counts do not agree. {REMEDY}")
     if not np.isfinite(xyz).all():
-        raise CorruptArtifact(f"{printable(path)}: sparse points that are not finite. {AGAIN}")
+        raise CorruptArtifact(f"{printable(path)}: sparse points that are not finite. {REMEDY}")
     return xyz, rgb, error, counts, observers
 
 

@@ -20,7 +20,7 @@ from stages.memory.need import MIB, Need
 
 T = TypeVar("T")
 
-LEAST = MIB // 4  # bytes: logs, plots, manifests, previews of small pictures
+MIN_SPACE = MIB // 4  # bytes: logs, plots, manifests, previews of small pictures
 PREVIEWS = 6  # pictures of a stage, as large as a working image
 
 
@@ -52,7 +52,7 @@ def memory_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mapp
 def space_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mapping[str, Any], memory: int | None = None) -> int:
     """Bytes that a stage of this name writes in so much memory. The artifacts that it needs are there."""
     written: int = _of(stage).space_needed(Known(run, sources, settings, memory=memory))
-    return LEAST + written
+    return MIN_SPACE + written
 
 
 def _of(stage: str) -> Any:

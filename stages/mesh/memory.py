@@ -3,7 +3,7 @@
 import math
 
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.surface.fitting.photometric import LARGEST
+from efficientnerf.surface.fitting.photometric import MAX_PIXELS
 from efficientnerf.surface.fusion import MARGIN
 from efficientnerf.surface.isosurface import BLOCK, pool_of
 from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
@@ -13,7 +13,7 @@ from stages.memory.forecast import Known
 from stages.memory.need import MIB, SURFACES, Need, libraries
 from stages.memory.tree import asset_of, tree_bytes
 from stages.mesh.check import CAPTURED, FUSED, LONGER_SIDE, ORBIT
-from stages.mesh.refinement import MOST
+from stages.mesh.refinement import MAX_PHOTOGRAPHS
 from stages.mesh.settings import MeshSettings
 from stages.mesh.texture import largest_photograph
 from stages.train.data import count_pixels
@@ -44,7 +44,7 @@ def surface_needed(tree: NerfTree, texture: int = 0, pixels: int = 0, fitted: in
         "libraries": libraries() + SURFACES,
     }
     optional = {"the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
-                "the fit to photographs": (FITTED_VERTEX * fitted + MOST * min(pixels, LARGEST)) if fitted else 0}  # fmt: skip
+                "the fit to photographs": (FITTED_VERTEX * fitted + MAX_PHOTOGRAPHS * min(pixels, MAX_PIXELS)) if fitted else 0}  # fmt: skip
     return Need(terms | {what: count for what, count in optional.items() if count})
 
 

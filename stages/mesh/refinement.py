@@ -17,7 +17,7 @@ from stages.mesh.texture import photographs
 from stages.mesh.timing import Stopwatch
 from stages.reports import CameraVerdict, read_report
 
-MOST = 64  # photographs, evenly spread over the capture
+MAX_PHOTOGRAPHS = 64  # photographs, evenly spread over the capture
 
 
 def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, choice: str, job: Job, watch: Stopwatch) -> Mesh:
@@ -26,7 +26,7 @@ def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, choic
     cameras = read_report(inputs.poses.verdict, CameraVerdict) if inputs.poses.verdict.is_file() else CameraVerdict()
     if choice == "off" or cameras.grade == "poor":
         return mesh
-    chosen = tuple(views[n] for n in np.unique(np.linspace(0, len(views) - 1, min(MOST, len(views))).round().astype(int)))
+    chosen = tuple(views[n] for n in np.unique(np.linspace(0, len(views) - 1, min(MAX_PHOTOGRAPHS, len(views))).round().astype(int)))
     found = refined(mesh.vertices, mesh.faces, photographs(inputs, chosen), job.safe_point)
     vertices = found.vertices
     if found.improved:

@@ -21,7 +21,7 @@ from stages.sfm.colmap import import_pycolmap
 from stages.sfm.database import FEATURES, Row, insert_features, rows_of
 
 LAYOUT = 1  # of the files; raise it when what is written there, or how features are detected, changes meaning
-MOST = 1024  # MiB of all files
+MAX_MIB = 1024  # MiB of all files
 MAX_FILE = 2**28  # bytes
 SUFFIX = ".features"
 
@@ -29,7 +29,7 @@ SUFFIX = ".features"
 def max_bytes() -> int:
     """Of all files."""
     chosen = os.environ.get("ENERF_FEATURE_CACHE_MIB", "")
-    return (int(chosen) if chosen.isdecimal() else MOST) * 2**20
+    return (int(chosen) if chosen.isdecimal() else MAX_MIB) * 2**20
 
 
 @functools.cache

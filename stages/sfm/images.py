@@ -32,7 +32,7 @@ class Callables(TypedDict):
 
 
 Masks = Mapping[str, Path | None]  # file of the mask of each photograph that has one; None: what is transparent is used, too
-WHOLE = "whole"  # in the place of the digest of a mask
+NO_MASK = "whole"  # in the place of the digest of a mask
 
 
 def _sha256(path: Path) -> str:
@@ -104,7 +104,7 @@ def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> 
     for name in sorted(paths):
         safe_point()
         mask = masks.get(name)
-        rows.append([name, _sha256(paths[name]), _sha256(mask) if mask is not None else WHOLE if name in masks else None])
+        rows.append([name, _sha256(paths[name]), _sha256(mask) if mask is not None else NO_MASK if name in masks else None])
     return rows
 
 

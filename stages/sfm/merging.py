@@ -20,7 +20,7 @@ from stages.sfm.added.markers import tie_markers
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts, mapper_database
 
-LEAST, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
+MIN_SHARED, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
 TOLERANCE = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart
 MATCHES = 15  # of a pair, from which they are used, as in the mapper
 HYPOTHESES, MOST = 500, 5000  # similarities that are tried; shared points that they are tried on
@@ -84,7 +84,7 @@ def similarity_of(ours: Sights, theirs: Sights, seed: int) -> Similarity | None:
     """The similarity that takes most of (N,) shared points of one model to where the photographs of the other see them, and back; None where too few agree on
     one."""
     count = len(ours.xyz)
-    if count < LEAST:
+    if count < MIN_SHARED:
         return None
     some = np.arange(0, count, -(-count // MOST))
     few_ours, few_theirs = ours.only(some), theirs.only(some)
@@ -100,12 +100,12 @@ def similarity_of(ours: Sights, theirs: Sights, seed: int) -> Similarity | None:
         return None
     fitting = _fitting(best, ours, theirs)
     for _ in range(REFINED):
-        if fitting.sum() < LEAST:
+        if fitting.sum() < MIN_SHARED:
             return None
         near = np.linalg.norm(ours.xyz - ours.centre, axis=1)[fitting]  # what is far away is known less well
         best = closest_similarity(theirs.xyz[fitting], ours.xyz[fitting], near**-2.0)
         fitting = _fitting(best, ours, theirs)
-    return best if fitting.sum() >= max(LEAST, SHARE * count) else None
+    return best if fitting.sum() >= max(MIN_SHARED, SHARE * count) else None
 
 
 def _fitting(similarity: Similarity, ours: Sights, theirs: Sights) -> np.ndarray:

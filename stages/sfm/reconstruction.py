@@ -37,12 +37,12 @@ from stages.sfm.pairs import features_for, matching_for
 #     they are matched by networks, where the user has given them
 #     each photograph gets a focal length or a principal point of its own, where single photographs would have another, as zoomed or cropped ones have
 ATTEMPTS = (
-    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.KEPT),
+    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.MAX_LOSS),
     Attempt("fewer matches", lambda s: s.models and s.missing, lambda s: s.go_on()),
     anew(BEGIN_ANEW, lambda s: s.most_missing, RELAXED),
     anew(SMALL_ANGLES, lambda s: s.was_last(BEGIN_ANEW) and not s.enough, FORWARD),  # as of a way straight ahead
     Attempt("wider matching", lambda s: s.missing, attempts.match_more),
-    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.KEPT),
+    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.MAX_LOSS),
     Attempt("more features", lambda s: s.missing and not s.enough, attempts.detect_more),
     anew(BEGIN_ANEW, lambda s: not s.enough and not s.begun_anew(), RELAXED),
     anew(SMALL_ANGLES, lambda s: s.was_last(BEGIN_ANEW) and not s.enough, FORWARD),

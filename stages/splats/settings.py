@@ -9,7 +9,7 @@ from efficientnerf.settings import Auto, Count, Off, Seconds, Seed, setting
 from pipeline.stage import ByName, Stage
 from stages.artifacts import SplatsInputs, needs_of
 
-MOST = 5_000_000  # Gaussians: beyond that no program opens them
+MAX_COUNT = 5_000_000  # Gaussians: beyond that no program opens them
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class SplatsSettings:
     region: Literal["foreground", "all"] = setting(
         "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject and what it stands on (foreground).", advanced=True
     )
-    count: Annotated[int, Meta(ge=1, le=MOST)] = setting(300_000, "Maximum number of Gaussians; no more are made than an image has pixels.", advanced=True)
+    count: Annotated[int, Meta(ge=1, le=MAX_COUNT)] = setting(300_000, "Maximum number of Gaussians; no more are made than an image has pixels.", advanced=True)
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
     iterations: Count | Auto = setting(
         "auto",

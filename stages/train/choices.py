@@ -17,7 +17,7 @@ from stages.io.scene import Scene
 from stages.io.scene_schema import read_document
 
 FORMAT = 1
-AGAIN = "Train again."
+REMEDY = "Train again."
 NEAR_SHARE = 0.1  # of the cameras' distance from the subject: a near plane that leaves out nothing that could be part of it
 
 
@@ -70,4 +70,4 @@ def load(train: Path) -> TrainingChoices:
     path = TrainOutputs(train).choices
     if not path.is_file():
         return TrainingChoices()
-    return read_document(path, _Document, AGAIN).choices
+    return read_document(path, _Document, REMEDY).choices

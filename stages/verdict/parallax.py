@@ -15,7 +15,7 @@ from stages.io.capture import Photo, SparsePoints
 SMALL_ANGLE = 4.0  # degrees of parallax
 AROUND = 0.5  # of the distance of the cameras from where their axes meet: points nearer to it are the subject, with its support
 OBSERVERS, FEWEST = 3, 10  # photographs that see a point of the subject, and such points, that wrong matches hardly make: then something is there
-MOST = 2000  # points that are looked at
+MAX_POINTS = 2000  # points that are looked at
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def parallax(points: SparsePoints, photos: Sequence[Photo]) -> Parallax:
             there = np.flatnonzero(near & np.array([len(set(track)) >= OBSERVERS for track in points.tracks], bool))
             subject = len(there) >= FEWEST
             chosen = there if subject else chosen
-    chosen = chosen[:: max(1, len(chosen) // MOST)]
+    chosen = chosen[:: max(1, len(chosen) // MAX_POINTS)]
     widest = [_widest(centres[list(points.tracks[n])] - points.xyz[n]) for n in chosen.tolist() if len(points.tracks[n]) > 1]
     return Parallax(float(np.median(widest)) if widest else 0.0, subject)
 

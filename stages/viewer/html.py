@@ -5,7 +5,7 @@ import hashlib
 import json
 from typing import Any
 
-LARGEST = 192_000_000  # bytes of an asset that a page is made of by itself: its textures fill what a graphics card of 1 GB has for them
+MAX_ASSET = 192_000_000  # bytes of an asset that a page is made of by itself: its textures fill what a graphics card of 1 GB has for them
 
 
 def policy_hash(text: str) -> str:

@@ -21,7 +21,7 @@ from pipeline.hashes import CHUNK
 from pipeline.manifest import DISTRIBUTION, read_manifest
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs, SplatsInputs, SplatsOutputs, needs_of
-from stages.viewer.html import LARGEST
+from stages.viewer.html import MAX_ASSET
 
 VIEWER, ASSET_VIEWER = "viewer.html", "viewer_asset.html"
 PAGES = ("report.html", VIEWER, ASSET_VIEWER)  # of a run
@@ -115,7 +115,7 @@ def viewers(run: Run) -> dict[str, Path]:
     asset, else the asset."""
     asset, splats = BakeOutputs.of_run(run.path).asset, SplatsOutputs.of_run(run.path).spz
     sizes = {path: size_of(path) for path in (splats, asset)}
-    known = [path for path, size in sizes.items() if size is not None and size <= LARGEST and sizes[asset] is not None]
+    known = [path for path, size in sizes.items() if size is not None and size <= MAX_ASSET and sizes[asset] is not None]
     if splats in known and not _splats_are_current(run):
         known.remove(splats)
     shown = {"asset": [path for path in known if path == asset], "both": known, "off": []}.get(run.viewer or "splats", known[:1])

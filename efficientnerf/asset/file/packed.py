@@ -23,7 +23,7 @@ from efficientnerf.backends.pieces import pieces
 MINOR = 5  # the version that brought it
 STREAMS: tuple[str, ...] = ("packed.occupancy", "packed.mask", "packed.density", "packed.base", "packed.sh")
 TABLES = ("density.table", "base.table", "sh.palette")
-MOST = 2**31 - 1  # bricks or voxels, which are counted in 32 bits
+MAX_COUNT = 2**31 - 1  # bricks or voxels, which are counted in 32 bits
 SLICE_VOXELS = 2**17  # about; docs/experiments/packed.md
 Tensors = dict[str, np.ndarray]
 Walk = Callable[[Any], None]
@@ -35,9 +35,9 @@ def counts_of(name: str, meta: dict[str, Any]) -> tuple[int, int, int, int]:
     found = meta.get("packed")
     if not isinstance(found, dict):
         raise FormatError(f"{name}: metadata 'packed' is {str(found)[:60]}; expected an object")
-    bricks, voxels = (int(number(name, found, key, 0, MOST, whole=True)) for key in ("bricks", "voxels"))
+    bricks, voxels = (int(number(name, found, key, 0, MAX_COUNT, whole=True)) for key in ("bricks", "voxels"))
     width = int(number(name, found, "code_bytes", 1, 2, whole=True))
-    each = int(number(name, found, "slice_bricks", max(1, math.ceil(bricks / streams.MOST_SLICES)), MOST, whole=True))
+    each = int(number(name, found, "slice_bricks", max(1, math.ceil(bricks / streams.MOST_SLICES)), MAX_COUNT, whole=True))
     return bricks, voxels, width, each
 
 

@@ -13,7 +13,7 @@ MAX_CELLS = 2**22
 PART = 2**20  # tiles that are counted at a time
 INTERVAL = 32  # steps after which the chances are set again
 MEMORY = 0.5  # of the running mean, kept by each new error
-MOST = 4.0  # times the mean that the root of a cell's error counts, at most: errors that cannot be fitted should not take all rays
+MAX_ROOT = 4.0  # times the mean that the root of a cell's error counts, at most: errors that cannot be fitted should not take all rays
 
 
 class Drawn(NamedTuple):
@@ -94,7 +94,7 @@ class ErrorMap:
         known = (self.errors[1] >= 0) & (self.met > 0)
         root = np.sqrt(np.maximum(self.errors[1], 0), dtype=np.float32)
         mean = np.average(root[known], weights=self.met[known]) if known.any() else 0.0
-        chance = np.where(known, np.minimum(root, MOST * mean), mean) if mean > 0 else np.ones(len(root))
+        chance = np.where(known, np.minimum(root, MAX_ROOT * mean), mean) if mean > 0 else np.ones(len(root))
         chance = self.share * chance + (1 - self.share) * np.average(chance, weights=self.met)
         cumulative = np.cumsum(chance * self.met, dtype=np.float64)
         self.cumulative = cumulative / cumulative[-1]

@@ -26,7 +26,7 @@ from efficientnerf.surface.texturing.photographs import Photograph, halved, show
 PLACES = 6  # photographs that a vertex is compared in
 OFFSETS = 13
 ROUNDS = (0.5, 0.25)  # pixels that the patch moves from an offset to the next in the photograph with the second widest angle
-LARGEST = 2**21  # pixels of a photograph: larger ones are halved
+MAX_PIXELS = 2**21  # pixels of a photograph: larger ones are halved
 APART, WIDEST = np.radians(8), np.radians(60)  # between views of a vertex: from the first they count in full, up to the second at all
 LEAST_PARALLAX = 0.1  # pixels that a patch moves with a pixel along the normal
 NOISE = 2.0  # of 255: deviation of a patch that shows nothing
@@ -58,7 +58,7 @@ def refined(vertices: np.ndarray, faces: np.ndarray, photographs: Iterable[Photo
     cameras: list[Camera] = []
     grades, greys = [], []
     for photo in photographs:
-        while photo.usable.size > LARGEST:
+        while photo.usable.size > MAX_PIXELS:
             photo = halved(photo)
         cameras.append(photo.camera)
         grades.append(shown_vertices(vertices, faces, normals, photo, tick))

@@ -15,7 +15,7 @@ from efficientnerf.surface.mesh import face_neighbours, face_vectors
 
 SMOOTHING = 4  # rounds over neighbouring faces, of the normals that charts are grown by
 LIMIT = float(np.cos(np.radians(50)))  # of a smoothed normal to a chart's axis
-LEAST = float(np.cos(np.radians(80)))  # of a face's own normal: there a texel is stretched nearly sixfold
+MIN_COSINE = float(np.cos(np.radians(80)))  # of a face's own normal: there a texel is stretched nearly sixfold
 ROUNDS = 6  # of taking out faces that lie over their own chart
 TURNS = 12  # rotations tried
 SMALL = 40  # faces under which a chart joins one next to it, where it fits
@@ -43,7 +43,7 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
     normals = np.divide(vectors, areas[:, None], out=np.zeros_like(vectors), where=areas[:, None] > 0)
     smooth, order = _smoothed(normals, areas, beside)
     chart = np.full(len(faces), -1, np.int64)
-    count = grow(order, beside, normals, smooth, areas, LEAST, LIMIT, 0, chart)
+    count = grow(order, beside, normals, smooth, areas, MIN_COSINE, LIMIT, 0, chart)
     chart = _joined(chart, beside, normals, areas)
     changed = np.arange(len(faces))  # faces of charts that are not those of the round before
     for round_ in range(ROUNDS):
@@ -57,7 +57,7 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
             chart[out] = chart.max(initial=-1) + 1 + np.arange(int(out.sum()))
         else:
             count = int(chart.max(initial=-1)) + 1
-            count = grow(order[out[order]], beside, normals, smooth, areas, LEAST, LIMIT, count, chart)
+            count = grow(order[out[order]], beside, normals, smooth, areas, MIN_COSINE, LIMIT, count, chart)
         chart = _connected(chart, beside)
     return flattened(vertices, faces, chart)
 
@@ -114,7 +114,7 @@ def _misplaced(charts: Charts, looked_at: np.ndarray, normals: np.ndarray, vecto
     edge = np.diff(charts.corners, axis=1)
     area = edge[:, 0, 0] * edge[:, 1, 1] - edge[:, 0, 1] * edge[:, 1, 0]
     alone = np.bincount(charts.chart)[charts.chart] == 1
-    out = (area <= 0.25 * LEAST * np.linalg.norm(vectors, axis=1)) & ~alone & (normals != 0).any(1)
+    out = (area <= 0.25 * MIN_COSINE * np.linalg.norm(vectors, axis=1)) & ~alone & (normals != 0).any(1)
     far = np.zeros((charts.count, 2))
     np.maximum.at(far, charts.chart[order], charts.corners[order].max(1))
     marked = np.zeros(len(order), bool)
@@ -145,7 +145,7 @@ def _joined(chart: np.ndarray, beside: np.ndarray, normals: np.ndarray, areas: n
         which = np.repeat(np.arange(len(own)), sizes[own])
         fit = np.full(len(own), np.inf)
         np.minimum.at(fit, which, (normals[members[rows]] * axes[other[which]]).sum(1))
-        good = fit >= LEAST
+        good = fit >= MIN_COSINE
         own, other, edges = own[good], other[good], edges[good]
         if not len(own):
             break

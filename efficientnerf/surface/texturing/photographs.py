@@ -22,7 +22,7 @@ from efficientnerf.surface.texturing.asset import interpolated
 from efficientnerf.surface.texturing.atlas import Atlas, Texels
 from efficientnerf.surface.texturing.filling import carried_on
 
-KEPT = 12  # photographs that a texel remembers
+MAX_PHOTOGRAPHS = 12  # photographs that a texel remembers
 SCALE = 60.0  # of 255, by which colours differ of which one is an outlier. docs/experiments/textures.md
 VOTE = 1.5  # of the colour that the asset has, on which of the photographs is right, against the best of them
 TRUST = 0.01  # grade of the colour that is expected. docs/experiments/textures.md
@@ -30,7 +30,7 @@ REACH = 6.0  # pixels from an edge at which a photograph counts in full
 BORDER = 0.03  # of the longer side of a photograph, over which it fades out
 JUMP = 0.01  # of the inverse depth, at a depth edge
 SLACK = 0.001  # of its depth that a texel may lie behind what the mesh shows there
-BESIDE = 1.0  # pixels that it may be from where that depth was taken: it lies deeper by as much as the surface slopes
+PIXEL_SHIFT = 1.0  # pixels that it may be from where that depth was taken: it lies deeper by as much as the surface slopes
 FACING, CLEAR = 0.3, 3.0  # cosine to the normal, and pixels from edges, from which a photograph shows a vertex
 FAINT = 250  # alpha under which a pixel shows something else, too
 FINER = 1.25  # texels on the side of a pixel
@@ -118,7 +118,7 @@ def _shown(seen: _Seen, photo: Photograph) -> tuple[np.ndarray, np.ndarray, np.n
 def _beside(photo: Photograph) -> float:
     """BESIDE pixels of a photograph, as a share of the depth."""
     intrinsics = photo.camera.intrinsics
-    return BESIDE / min(float(intrinsics["fx"]), float(intrinsics["fy"]))
+    return PIXEL_SHIFT / min(float(intrinsics["fx"]), float(intrinsics["fy"]))
 
 
 def texels_wanted(vertices: np.ndarray, faces: np.ndarray, density: np.ndarray) -> float:
@@ -243,8 +243,8 @@ class PhotographTexture:
 
     def __post_init__(self) -> None:
         count = len(self.texels.place)
-        self.seen = np.zeros((count, KEPT, 3), np.uint8)
-        self.weights = np.zeros((count, KEPT), np.uint16)
+        self.seen = np.zeros((count, MAX_PHOTOGRAPHS, 3), np.uint8)
+        self.weights = np.zeros((count, MAX_PHOTOGRAPHS), np.uint16)
         self.density = np.ascontiguousarray(self.density, np.float32)
         ratio = self.texels_per_pixel()
         self.halvings = max(0, int(np.floor(np.log(1 / ratio) / np.log(FINEST) + 1e-9))) if ratio > 0 else 0

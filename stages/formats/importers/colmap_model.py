@@ -41,7 +41,7 @@ MAX_FILE = 8 << 30  # bytes
 MAX_IMAGES = 100_000
 MAX_NAME = 200  # characters of a name that a message shows
 MAX_COORDINATE = 1e60  # of points: those of nearly parallel rays lie far away, and squares of squares are numbers yet
-_AGAIN = "Copy the model again, or export it anew."
+_REMEDY = "Copy the model again, or export it anew."
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def read_model(folder: Path, found: Sequence[Path]) -> Model:
     for image in images.values():
         if image.camera not in cameras:
             raise BadInput(
-                f"{found[1]}: image {printable(image.name, MAX_NAME)} refers to camera {image.camera}, which {found[0].name} does not hold. {_AGAIN}"
+                f"{found[1]}: image {printable(image.name, MAX_NAME)} refers to camera {image.camera}, which {found[0].name} does not hold. {_REMEDY}"
             )
     return Model(folder, cameras, images)
 
@@ -121,7 +121,7 @@ class _Bytes:
 
     def need(self, size: int) -> None:
         if size > len(self.data) - self.at:
-            raise BadInput(f"{self.path}: truncated: {len(self.data)} bytes, at least {self.at + size} expected. {_AGAIN}")
+            raise BadInput(f"{self.path}: truncated: {len(self.data)} bytes, at least {self.at + size} expected. {_REMEDY}")
 
     def skip(self, size: int) -> None:
         self.need(size)
@@ -137,13 +137,13 @@ class _Bytes:
     def text(self) -> str:
         end = self.data.find(b"\0", self.at, self.at + 4096)
         if end < 0:
-            raise BadInput(f"{self.path}: truncated: a name without an end at byte {self.at}. {_AGAIN}")
+            raise BadInput(f"{self.path}: truncated: a name without an end at byte {self.at}. {_REMEDY}")
         raw, self.at = self.data[self.at : end], end + 1
         return raw.decode("utf-8", "surrogateescape")
 
     def finish(self) -> None:
         if self.at != len(self.data):
-            raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes after its end. Is it a COLMAP model? {_AGAIN}")
+            raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes after its end. Is it a COLMAP model? {_REMEDY}")
 
 
 def count_parameters(model: str) -> int | None:
@@ -164,8 +164,8 @@ def _lens(path: Path, number: int, model: str, width: int, height: int, params: 
         supported = ", ".join([*MODELS, *FISHEYE])
         raise BadInput(f"{path}: camera {number} is a {printable(model, 40)}; supported are {supported}. Undistort with `colmap image_undistorter` first.")
     if len(params) != expected:
-        raise BadInput(f"{path}: camera {number}: {model} has {expected} parameters, found {len(params)}. {_AGAIN}")
-    width, height = image_size(width, height, f"{path}: camera {number}", _AGAIN)
+        raise BadInput(f"{path}: camera {number}: {model} has {expected} parameters, found {len(params)}. {_REMEDY}")
+    width, height = image_size(width, height, f"{path}: camera {number}", _REMEDY)
     return Camera("", width, height, *as_traced(model, params), np.eye(4))
 
 
@@ -173,9 +173,9 @@ def _posed(path: Path, name: str, camera: int, numbers: tuple[float, ...]) -> Po
     quaternion, translation, shown = numbers[:4], numbers[4:], printable(name, MAX_NAME)
     if not all(map(math.isfinite, numbers)) or abs(math.hypot(*quaternion) - 1) > 1e-2:
         found = f"quaternion {list(quaternion)}, translation {list(translation)}"
-        raise BadInput(f"{path}: image {shown}: {found}; expected a unit quaternion and finite numbers. {_AGAIN}")
+        raise BadInput(f"{path}: image {shown}: {found}; expected a unit quaternion and finite numbers. {_REMEDY}")
     if not name:
-        raise BadInput(f"{path}: an image without a name. {_AGAIN}")
+        raise BadInput(f"{path}: an image without a name. {_REMEDY}")
     return PosedImage(name, camera, quaternion, translation)  # type: ignore[arg-type]
 
 
@@ -220,7 +220,7 @@ def _points_bin(path: Path) -> SparsePoints:
 def _finite(path: Path, points: SparsePoints) -> SparsePoints:
     unusable = ~(np.abs(points.xyz) <= MAX_COORDINATE).all(1)  # nan, too
     if unusable.any():
-        raise BadInput(f"{path}: {int(unusable.sum())} points are not finite. {_AGAIN}")
+        raise BadInput(f"{path}: {int(unusable.sum())} points are not finite. {_REMEDY}")
     return points
 
 
@@ -237,19 +237,19 @@ def _check_count(path: Path, what: str, found: int) -> None:
             return
         stated = re.match(rf"# Number of {what}:\s*([0-9]{{1,19}})\s*(,|:|$)", line)
         if stated and int(stated[1]) > found:
-            raise BadInput(f"{path}: truncated: its first lines say {stated[1]} {what}, it holds {found}. {_AGAIN} (Or correct that comment.)")
+            raise BadInput(f"{path}: truncated: its first lines say {stated[1]} {what}, it holds {found}. {_REMEDY} (Or correct that comment.)")
 
 
 def _numbers(path: Path, line: int, words: list[str]) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as error:
-        raise BadInput(f"{path}: line {line}: {printable(error, 100)}. {_AGAIN}") from error
+        raise BadInput(f"{path}: line {line}: {printable(error, 100)}. {_REMEDY}") from error
 
 
 def _integer(path: Path, line: int, word: str) -> int:
     if not re.fullmatch("-?[0-9]{1,19}", word):
-        raise BadInput(f"{path}: line {line}: {word[:40]!r} is not a whole number. {_AGAIN}")
+        raise BadInput(f"{path}: line {line}: {word[:40]!r} is not a whole number. {_REMEDY}")
     return int(word)
 
 
@@ -260,7 +260,7 @@ def _cameras_txt(path: Path) -> dict[int, Camera]:
         if not words or words[0].startswith("#"):
             continue
         if len(words) < 5:
-            raise BadInput(f"{path}: line {line}: {len(words)} words, expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS. {_AGAIN}")
+            raise BadInput(f"{path}: line {line}: {len(words)} words, expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS. {_REMEDY}")
         number = _integer(path, line, words[0])
         params = tuple(_numbers(path, line, words[4:]))
         cameras[number] = _lens(path, number, words[1], _integer(path, line, words[2]), _integer(path, line, words[3]), params)
@@ -282,9 +282,9 @@ def _images_txt(path: Path) -> dict[int, PosedImage]:
         words = text.split(maxsplit=9)
         if len(words) < 10:
             expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME (then a line of points, or an empty one)"
-            raise BadInput(f"{path}: line {line}: {len(words)} words, expected {expected}. {_AGAIN}")
+            raise BadInput(f"{path}: line {line}: {len(words)} words, expected {expected}. {_REMEDY}")
         if points is not None and len(points.split()) % 3:
-            raise BadInput(f"{path}: line {line + 1}: truncated: points come as X Y POINT3D_ID, found {len(points.split())} words. {_AGAIN}")
+            raise BadInput(f"{path}: line {line + 1}: truncated: points come as X Y POINT3D_ID, found {len(points.split())} words. {_REMEDY}")
         if len(images) >= MAX_IMAGES:
             raise BadInput(f"{path}: more than {MAX_IMAGES} images; not read.")
         numbers = tuple(_numbers(path, line, words[1:8]))
@@ -301,11 +301,11 @@ def _points_txt(path: Path) -> SparsePoints:
             continue
         if len(words) < 8 or len(words) % 2:
             expected = "POINT3D_ID X Y Z R G B ERROR and pairs IMAGE_ID POINT2D_IDX"
-            raise BadInput(f"{path}: line {line}: truncated: {len(words)} words, expected {expected}. {_AGAIN}")
+            raise BadInput(f"{path}: line {line}: truncated: {len(words)} words, expected {expected}. {_REMEDY}")
         numbers = _numbers(path, line, words[1:8])
         colour = numbers[3:6]
         if not all(0 <= channel <= 255 for channel in colour):
-            raise BadInput(f"{path}: line {line}: colour {colour}, expected 0 to 255. {_AGAIN}")
+            raise BadInput(f"{path}: line {line}: colour {colour}, expected 0 to 255. {_REMEDY}")
         xyz.append(numbers[:3])
         rgb.append(colour)
         error.append(numbers[6])

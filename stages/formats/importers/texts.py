@@ -11,11 +11,11 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.json_file import LARGEST_NUMBER
 
-LARGEST = 256 << 20  # bytes of a text file
-_AGAIN = "Export it again."
+MAX_BYTES = 256 << 20  # bytes of a text file
+_REMEDY = "Export it again."
 
 
-def read_bytes(path: Path, limit: int = LARGEST) -> bytes:
+def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
     """What a plain file of at most `limit` bytes holds. Raises BadInput, and OSError where the system does not read it."""
     with open(files.open_plain(path), "rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -25,14 +25,14 @@ def read_bytes(path: Path, limit: int = LARGEST) -> bytes:
     return data
 
 
-def read_text(path: Path, limit: int = LARGEST) -> str:
+def read_text(path: Path, limit: int = MAX_BYTES) -> str:
     """As `read_bytes`, decoded: UTF-8, with or without a byte order mark, or UTF-16 with one. Raises BadInput."""
     data = read_bytes(path, limit)
     encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
-        raise BadInput(f"{path}: no text ({error.reason} at byte {error.start}). {_AGAIN}") from None
+        raise BadInput(f"{path}: no text ({error.reason} at byte {error.start}). {_REMEDY}") from None
 
 
 def head(path: Path, size: int = 4096) -> str:
@@ -53,12 +53,12 @@ def number(text: str, where: str) -> float:
     except ValueError:
         value = float("nan")
     if not abs(value) <= LARGEST_NUMBER:
-        raise BadInput(f"{where}: {printable(text, 40) or 'nothing'}; expected a finite number. {_AGAIN}")
+        raise BadInput(f"{where}: {printable(text, 40) or 'nothing'}; expected a finite number. {_REMEDY}")
     return value
 
 
 def numbers(texts: Sequence[str], count: int, where: str) -> np.ndarray:
     """(count,) float64 of as many words. Raises BadInput."""
     if len(texts) != count:
-        raise BadInput(f"{where}: {len(texts)} numbers, expected {count}. {_AGAIN}")
+        raise BadInput(f"{where}: {len(texts)} numbers, expected {count}. {_REMEDY}")
     return np.array([number(text, where) for text in texts])

@@ -14,7 +14,7 @@ from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, forge
 from stages.sfm.images import Progress
 from stages.sfm.pairs import Pair, ordered
 
-MOST = 2048  # features of a photograph: what LightGlue takes grows with their square
+MAX_FEATURES = 2048  # features of a photograph: what LightGlue takes grows with their square
 NEIGHBOURS = 4  # photographs with a camera that each of them is compared with, too: its features get points by these
 AT_ONCE = 2  # pictures, or pairs, that are worked on: each takes up to 2.3 GiB (`stages.poses.memory`)
 
@@ -58,7 +58,7 @@ def add_matches(
     def detect(position: int) -> Features:
         folder, file = images_of(place).parent, images[position].file
         mask = folder / "masks" / f"{file}.png"
-        return detector.features(read_png(folder / "images" / file), read_png(mask) if mask.exists() else None, MOST)
+        return detector.features(read_png(folder / "images" / file), read_png(mask) if mask.exists() else None, MAX_FEATURES)
 
     found: dict[int, Features] = {}
     for position, each in zip(used, in_order(detect, used, at_once, safe_point), strict=True):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.refinement import error_map
-from efficientnerf.asset.refinement.error_map import MOST, ErrorMap, count_cells
+from efficientnerf.asset.refinement.error_map import MAX_ROOT, ErrorMap, count_cells
 from efficientnerf.training.patches import PatchGrid
 from tests.efficientnerf.small_views import views
 
@@ -22,7 +22,7 @@ def test_chances_are_the_roots_of_errors_limited_and_the_mean_is_unbiased(share:
     made = ErrorMap(grid, None, errors, share=share)
     root = np.sqrt(np.maximum(errors[1], 0))
     mean = root[errors[1] >= 0].mean()
-    wanted = np.minimum(np.where(errors[1] < 0, mean, root), MOST * mean)
+    wanted = np.minimum(np.where(errors[1] < 0, mean, root), MAX_ROOT * mean)
     np.testing.assert_allclose(chances(made), (1 - share) / len(grid) + share * wanted / wanted.sum(), rtol=1e-5, atol=1e-12)
     values = rng.random(len(grid))
     np.testing.assert_allclose((chances(made) * made.factor * values).sum(), values.sum() / len(grid), rtol=1e-5)

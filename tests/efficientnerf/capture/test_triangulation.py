@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from efficientnerf.capture.markers import SURE, common_ratio
+from efficientnerf.capture.markers import CONFIDENCE, common_ratio
 from efficientnerf.capture.triangulation import PICK, Place, length_between, triangulated
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from tests.efficientnerf.capture.rings import cameras_round
@@ -45,7 +45,7 @@ def test_true_lengths_lie_within_the_stated_error_of_100_random_cases() -> None:
         ratio, scale_error, _ = common_ratio(np.array(ratios), np.array(spreads))
         a, b = rng.uniform(-0.5, 0.5, (2, 3))
         length, spread = length_between(picked(cameras, a, rng), picked(cameras, b, rng))
-        error = float(np.hypot(SURE * spread, scale_error * length)) * ratio
+        error = float(np.hypot(CONFIDENCE * spread, scale_error * length)) * ratio
         outside += abs(ratio * length - true * np.linalg.norm(b - a)) > error
         errors.append(error / (ratio * length))
     print(f"outside: {outside} of 100; median error bar {np.median(errors):.2%} of the length")

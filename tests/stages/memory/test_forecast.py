@@ -17,7 +17,7 @@ from stages.bake.settings import BakeSettings
 from stages.evaluate import run as evaluate
 from stages.formats.exporters.exr import write_exr
 from stages.io.png import write_png
-from stages.memory.forecast import LEAST, Known, memory_needed, sizes_below, space_needed
+from stages.memory.forecast import MIN_SPACE, Known, memory_needed, sizes_below, space_needed
 from stages.mesh import run as mesh
 from stages.points import run as points
 from stages.splats import run as splats
@@ -86,7 +86,7 @@ def test_training_and_baking_take_no_more_than_was_predicted(run: tuple[Path, di
 def test_a_stage_writes_what_was_predicted_and_no_less_than_half(run: tuple[Path, Any, dict[str, int]], stage: str) -> None:
     """But for logs and pictures whose size does not follow from the scene's."""
     predicted, written = space_needed(stage, run[0], (), OWN), run[2][stage]
-    assert written <= predicted <= 2 * written + 3 * LEAST
+    assert written <= predicted <= 2 * written + 3 * MIN_SPACE
 
 
 def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
     nerfstudio(tmp_path / "source", cameras(8))
     needed = space_needed("poses", tmp_path / "run", (tmp_path / "source",), DEFAULTS)
     pixels = 8 * WIDTH * HEIGHT
-    assert pixels < needed - LEAST < 4 * pixels
+    assert pixels < needed - MIN_SPACE < 4 * pixels
     taken = {**DEFAULTS, "poses": replace(DEFAULTS["poses"], format="photographs", max_features=512)}
     assert space_needed("poses", tmp_path / "run", (tmp_path / "source",), taken) >= needed + 8 * 512 * 300, "asked to find the cameras it looks for features"
     assert disk.has_room(60 * 10**6, (tmp_path, needed), [(tmp_path, needed)])
@@ -103,7 +103,7 @@ def test_small_pictures_with_cameras_need_little_room(tmp_path: Path) -> None:
 def test_pixels_that_do_not_fit_into_memory_and_checkpoints_are_written(run: tuple[Path, Any, Any]) -> None:
     roomy, tight = (space_needed("train", run[0], (), OWN, memory) for memory in (None, 1000))
     assert tight - roomy == 4 * 7 * 16 * 16
-    one, three = (space_needed("train", run[0], (), {**OWN, "train": replace(OWN["train"], checkpoint_every=every)}) - LEAST for every in (1000, 1))
+    one, three = (space_needed("train", run[0], (), {**OWN, "train": replace(OWN["train"], checkpoint_every=every)}) - MIN_SPACE for every in (1000, 1))
     assert 1.5 * one < three < 3 * one, "a checkpoint that no step reaches is predicted for an interruption alone"
 
 

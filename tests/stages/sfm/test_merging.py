@@ -91,7 +91,7 @@ def test_a_similarity_is_found_among_wrong_matches_unless_most_are(wrong: float,
     assert (similarity is not None) == found
     if similarity is not None:
         np.testing.assert_allclose(similarity.matrix(), MOVED.matrix(), atol=0.02)
-    few = [each.only(np.arange(merging.LEAST - 1)) for each in sights(MOVED, 0.0)]
+    few = [each.only(np.arange(merging.MIN_SHARED - 1)) for each in sights(MOVED, 0.0)]
     assert merging.similarity_of(few[0], few[1], seed=0) is None
 
 
@@ -127,7 +127,7 @@ def test_a_merge_that_contradicts_the_matches_is_refused(scene: tuple[Path, list
     found = climbed(scene, parts, monkeypatch)
     assert asked
     rungs = {str(rung["rung"]): rung for rung in found.tried}
-    assert rungs[attempts.MERGED]["agreeing"] < rungs["exhaustive"]["agreeing"] - attempts.KEPT  # type: ignore[operator]
+    assert rungs[attempts.MERGED]["agreeing"] < rungs["exhaustive"]["agreeing"] - attempts.MAX_LOSS  # type: ignore[operator]
     assert found.best == "exhaustive"
     assert found.models[0].num_reg_images() == 5
     errors = aligned_errors(np.array([image.projection_center() for image in registered(found.models[0])]), np.array([c.centre for c in TRUTH[:5]]))

@@ -35,7 +35,7 @@ from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame
 VERSION = 2
 LEVELS = 256  # of a codebook
 PALETTE, BRANCHES, A_ROW = 2**16, 256, 64  # entries: at most; of the upper level; in a row of the image
-LARGEST = 252  # and 0 to 3: which of w x y z is the largest
+ROTATION_TAG = 252  # and 0 to 3: which of w x y z is the largest
 ITERATIONS, BINS = 16, 4096  # of Lloyd's algorithm; of the histogram that it begins with
 OLDEST = (1980, 1, 1, 0, 0, 0)  # no time: the same Gaussians give the same bytes
 
@@ -104,7 +104,7 @@ def rotation_codes(rotations: np.ndarray) -> np.ndarray:
     q = np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -q, q)
     others = np.array([[k for k in range(4) if k != which] for which in range(4)])[largest]
     rest = np.round((np.take_along_axis(q, others, 1) * 2**0.5 + 1) * 127.5)
-    return np.concatenate([np.clip(rest, 0, 255), largest[:, None] + LARGEST], axis=1)
+    return np.concatenate([np.clip(rest, 0, 255), largest[:, None] + ROTATION_TAG], axis=1)
 
 
 def palette_of(vectors: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ from stages.io.json_file import finite, number, numbers, read_json, shown
 
 PLACES = ("opensfm/reconstruction.json", "reconstruction.json")
 MAX_POINTS = 2_000_000
-_AGAIN = "Reconstruct again, or choose another format with --as."
+_REMEDY = "Reconstruct again, or choose another format with --as."
 _BROWN = {
     "perspective": ("k1", "k2"),
     "simple_radial": ("k1",),
@@ -44,11 +44,11 @@ def _signs(source: Source) -> Sequence[Path]:
 def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     """The reconstruction with most shots."""
     file, where, tracks = signs[0], source.name_of(signs[0]), signs[0].with_name("tracks.csv")
-    document = read_json(source.real(file), _AGAIN)
+    document = read_json(source.real(file), _REMEDY)
     found = [one for one in document if isinstance(one, dict)] if isinstance(document, list) else []
     found = [one for one in found if isinstance(one.get("shots"), dict) and isinstance(one.get("cameras"), dict)]
     if not found:
-        raise BadInput(f"{where}: no reconstruction: expected a list of objects with `cameras` and `shots`. {_AGAIN}")
+        raise BadInput(f"{where}: no reconstruction: expected a list of objects with `cameras` and `shots`. {_REMEDY}")
     best, *others = sorted(found, key=lambda one: len(one["shots"]), reverse=True)
     counts = ", ".join(str(len(one["shots"])) for one in others[:5])
     warning = f"{where}: the reconstruction with {len(best['shots'])} images is used; there are others with {counts}, which share no frame with it."
@@ -73,12 +73,12 @@ def _frames(source: Source, file: Path, reconstruction: dict[str, Any]) -> list[
     for name, shot in sorted(reconstruction["shots"].items()):
         place = f"{where}: shot {printable(name, frames.MAX_NAME)}"
         if not isinstance(shot, dict):
-            raise BadInput(f"{place}: {shown(shot)}; expected an object. {_AGAIN}")
-        turn, shift = (np.array(numbers(shot.get(key), 3, f"{place}: {key}", _AGAIN)) for key in ("rotation", "translation"))
+            raise BadInput(f"{place}: {shown(shot)}; expected an object. {_REMEDY}")
+        turn, shift = (np.array(numbers(shot.get(key), 3, f"{place}: {key}", _REMEDY)) for key in ("rotation", "translation"))
         pose = lenses.inverse(rotation_of(turn), shift)
         lens = reconstruction["cameras"].get(shot.get("camera")) if isinstance(shot.get("camera"), str) else None
         if not isinstance(lens, dict):
-            raise BadInput(f"{place}: camera {shown(shot.get('camera'))} is not among the cameras. {_AGAIN}")
+            raise BadInput(f"{place}: camera {shown(shot.get('camera'))} is not among the cameras. {_REMEDY}")
         listed.append(frames.Frame(name, beside, place, _camera(lens, pose, place), bare=True))
     return listed
 
@@ -94,7 +94,7 @@ def rotation_of(vector: np.ndarray) -> np.ndarray:
 
 
 def _camera(lens: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
-    value = partial(number, lens, where=f"{where}: its camera", remedy=_AGAIN)
+    value = partial(number, lens, where=f"{where}: its camera", remedy=_REMEDY)
     kind = lens.get("projection_type")
     if not isinstance(kind, str) or kind not in _BROWN | _FISHEYE:
         raise BadInput(f"{where}: a {shown(kind)} camera; {', '.join(_BROWN | _FISHEYE)} are read. Undistort the images first (opensfm undistort).")
@@ -102,7 +102,7 @@ def _camera(lens: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str
     k = {key: value(key, default=0.0) if key in used else 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
     focal = value("focal_x", default=lens.get("focal")), value("focal_y", default=lens.get("focal", lens.get("focal_x")))
     shift = value("c_x", default=0.0), value("c_y", default=0.0)
-    stated = lenses.image_size(value("width"), value("height"), where, _AGAIN) if "width" in lens and "height" in lens else None
+    stated = lenses.image_size(value("width"), value("height"), where, _REMEDY) if "width" in lens and "height" in lens else None
 
     def camera(name: str, size: tuple[int, int]) -> Camera:
         width, height = stated or size
@@ -123,13 +123,13 @@ def _points(source: Source, file: Path, reconstruction: dict[str, Any], places: 
         return None
     where = source.name_of(file)
     if len(points) > MAX_POINTS:
-        raise BadInput(f"{where}: {len(points)} points; at most {MAX_POINTS} are read. {_AGAIN}")
+        raise BadInput(f"{where}: {len(points)} points; at most {MAX_POINTS} are read. {_REMEDY}")
     xyz, rgb = [], []
     for name, point in points.items():
         if not isinstance(point, dict):
-            raise BadInput(f"{where}: point {printable(name, 40)}: {shown(point)}; expected an object. {_AGAIN}")
-        xyz.append(numbers(point.get("coordinates"), 3, f"{where}: point {printable(name, 40)}", _AGAIN))
-        rgb.append(numbers(point.get("color", [128, 128, 128]), 3, f"{where}: colour of point {printable(name, 40)}", _AGAIN))
+            raise BadInput(f"{where}: point {printable(name, 40)}: {shown(point)}; expected an object. {_REMEDY}")
+        xyz.append(numbers(point.get("coordinates"), 3, f"{where}: point {printable(name, 40)}", _REMEDY))
+        rgb.append(numbers(point.get("color", [128, 128, 128]), 3, f"{where}: colour of point {printable(name, 40)}", _REMEDY))
     tracks = _tracks(source, file.with_name("tracks.csv"), {name: index for index, name in enumerate(points)}, places)
     return sparse_points(np.array(xyz), np.array(rgb), tracks)
 

@@ -34,7 +34,7 @@ XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 LARGEST_SIDECAR = 1 << 20  # bytes
 _PLACES = (".", "images", "input", "photos")
-_AGAIN = "Export the registration again."
+_REMEDY = "Export the registration again."
 _BROWN = {"perspective": 0, "none": 0, "brown3": 3, "brown3t2": 5, "brown4": 4, "brown4t2": 6}
 
 
@@ -79,7 +79,7 @@ def _from_table(source: Source, file: Path, warnings: list[str]) -> Listed:
     text = read_text(source.real(file))
     title = _title(text)
     if title is None:
-        raise BadInput(f"{where}: no line names the columns {', '.join(REQUIRED)}. {_AGAIN}")
+        raise BadInput(f"{where}: no line names the columns {', '.join(REQUIRED)}. {_REMEDY}")
     separator, columns = _columns(title[1])
     rows = csv.reader(io.StringIO("\n".join(text.splitlines()[title[0] + 1 :])), delimiter=separator)
     listed: list[frames.Frame] = []
@@ -88,11 +88,11 @@ def _from_table(source: Source, file: Path, warnings: list[str]) -> Listed:
             if not any(cell.strip() for cell in cells):
                 continue
             if len(cells) < len(columns):
-                raise BadInput(f"{where}: line {index} has {len(cells)} of {len(columns)} columns. {_AGAIN}")
+                raise BadInput(f"{where}: line {index} has {len(cells)} of {len(columns)} columns. {_REMEDY}")
             listed.append(_row(source, f"{where}: line {index}", dict(zip(columns, (cell.strip() for cell in cells), strict=False))))
             frames.check_count(len(listed), where)
     except csv.Error as error:
-        raise BadInput(f"{where}: {printable(error, 100)}. {_AGAIN}") from None
+        raise BadInput(f"{where}: {printable(error, 100)}. {_REMEDY}") from None
     return Listed(where, listed, [file], warnings=warnings, up=Z_UP, facts={"registration": where})
 
 
@@ -127,7 +127,7 @@ def _lens(
 
     def camera(name: str, size: tuple[int, int]) -> Camera:
         if not focal > 0:
-            raise BadInput(f"{where}: focal length {focal:g}; expected more than zero. {_AGAIN}")
+            raise BadInput(f"{where}: focal length {focal:g}; expected more than zero. {_REMEDY}")
         longer = max(size)
         pixels = focal / FILM * longer
         centre = size[0] / 2 + principal[0] * longer, size[1] / 2 + principal[1] * longer

@@ -12,13 +12,13 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers.texts import read_bytes
 
-LARGEST = 128 << 20  # bytes; Metashape writes about a kilobyte a photograph
+MAX_BYTES = 128 << 20  # bytes; Metashape writes about a kilobyte a photograph
 MAX_ELEMENTS = 4_000_000
 MAX_DEPTH = 64
-_AGAIN = "Export it again."
+_REMEDY = "Export it again."
 
 
-def read_xml(path: Path, limit: int = LARGEST) -> Element:
+def read_xml(path: Path, limit: int = MAX_BYTES) -> Element:
     """The outermost element of a file; names with a namespace are "{namespace}name", as ElementTree has them. Raises BadInput."""
     data = read_bytes(path, limit)
     builder = TreeBuilder()
@@ -26,7 +26,7 @@ def read_xml(path: Path, limit: int = LARGEST) -> Element:
     count = depth = 0
 
     def refuse(what: str) -> BadInput:
-        return BadInput(f"{path}: {what}. {_AGAIN}")
+        return BadInput(f"{path}: {what}. {_REMEDY}")
 
     def start(name: str, attributes: dict[str, str]) -> None:
         nonlocal count, depth
