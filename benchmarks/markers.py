@@ -159,15 +159,21 @@ def found(number: int, work: Path, width: int) -> dict[str, Any]:
     return facts
 
 
+def _in_metres(capture: Capture, job: Job) -> Capture | str:
+    """The capture in metres by its markers; or why not."""
+    warnings: list[str] = []
+    try:
+        found = with_markers(job, capture, EDGE, warnings.append)
+    except BadInput as error:
+        return str(error).removeprefix(f"{job.source}: ")[:100]
+    return found if found.metric else warnings[-1][:100]
+
+
 def _between_cameras(capture: Capture, job: Job, true: np.ndarray) -> dict[str, Any]:
     """Of the lengths between cameras at true places (C, 3) that are far from each other."""
-    said: list[str] = []
-    try:
-        found = with_markers(job, capture, EDGE, said.append)
-    except BadInput as error:
-        return {"refused": str(error).removeprefix(f"{job.source}: ")[:100]}
-    if not found.metric:
-        return {"refused": said[-1][:100]}
+    found = _in_metres(capture, job)
+    if isinstance(found, str):
+        return {"refused": found}
     facts: Any = found.facts["markers"]
     lengths, expected = (np.linalg.norm(each[:, None] - each, axis=2) for each in (np.array([photo.camera.centre for photo in found.photos]), true))
     far = expected > FAR * np.linalg.norm(true, axis=1).mean()
@@ -201,14 +207,9 @@ def measured(number: int, work: Path, width: int) -> dict[str, Any]:
 
 def outcome(capture: Capture, work: Path) -> dict[str, Any]:
     """How far off the lengths and up are, and by how much at most they are said to be; or why not."""
-    said: list[str] = []
-    job = Job(settings=PosesSettings(marker_size=EDGE), out=work / "out", work=work / "scratch", source=work)
-    try:
-        found = with_markers(job, capture, EDGE, said.append)
-    except BadInput as error:
-        return {"refused": str(error).removeprefix(f"{work}: ")[:100]}
-    if not found.metric:
-        return {"refused": said[-1][:100]}
+    found = _in_metres(capture, Job(settings=PosesSettings(marker_size=EDGE), out=work / "out", work=work / "scratch", source=work))
+    if isinstance(found, str):
+        return {"refused": found}
     facts: Any = found.facts["markers"]
     before, after = (np.array([photo.camera.centre for photo in each.photos]) for each in (capture, found))
     length = np.linalg.norm(after[-1] - after[0]) / np.linalg.norm(before[-1] - before[0]) - 1

@@ -65,7 +65,7 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, reader: PhotoRea
     renders  whether the capture's format may hold renders of an object, as transforms.json may
     """
     photos = capture.photos
-    there = {"alpha": sum(map(_has_alpha, photos)), "masks": sum(photo.mask is not None for photo in photos)}
+    there = {"alpha": sum(map(has_alpha, photos)), "masks": sum(photo.mask is not None for photo in photos)}
     if choice != "auto":
         reasons = {kind: "poses.masks says so" for kind, count in there.items() if count}
         wanted = choice == "silhouette"
@@ -89,7 +89,7 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, reader: PhotoRea
 
 def without_silhouette(photos: Sequence[Photo], silhouettes: Silhouettes) -> list[str]:
     """Names of the photos of which nothing says what is background, in a capture whose others do. Raises BadInput where too few are left."""
-    have = [(silhouettes.masks and photo.mask is not None) or (silhouettes.alpha and _has_alpha(photo)) for photo in photos]
+    have = [(silhouettes.masks and photo.mask is not None) or (silhouettes.alpha and has_alpha(photo)) for photo in photos]
     if not silhouettes or all(have) or not any(have):
         return []  # without any these are renders on a constant background
     if sum(have) < MIN_IMAGES:
@@ -147,7 +147,8 @@ def _pixels(xyz: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np
     return shown, column, row
 
 
-def _has_alpha(photo: Photo) -> bool:
+def has_alpha(photo: Photo) -> bool:
+    """Whether its file has an alpha channel; False where it cannot be read."""
     try:
         return read_header(photo.image).alpha
     except UnreadableImage:

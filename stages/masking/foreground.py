@@ -23,10 +23,10 @@ from stages.compiling import compiling_kernels
 from stages.cores import count_cores, in_order
 from stages.figures.plots import grid_sheet
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
-from stages.framing.mask_use import LEAST_OVERLAP, MIN_AGREEING, alike, hull_overlaps
+from stages.framing.mask_use import LEAST_OVERLAP, MIN_AGREEING, alike, has_alpha, hull_overlaps
 from stages.io.capture import FOREGROUND, Capture, Photo, without
 from stages.io.photo import read_photo
-from stages.io.pictures import UnreadableImage, grey_of, opened, read_header
+from stages.io.pictures import UnreadableImage, grey_of, opened
 from stages.masking.first_training import RAYS, SIDE, FirstField, first_field, first_training_needed
 from stages.masking.made import write_mask
 from stages.masking.subject import Subject, coverage, subject_of
@@ -87,17 +87,10 @@ def _made_anew(job: Job, capture: Capture, images: list[np.ndarray], folder: Pat
 
 
 def _refuse_other_masks(photos: Sequence[Photo]) -> None:
-    own = [photo.camera.name for photo in photos if photo.mask is not None or _has_alpha(photo)]
+    own = [photo.camera.name for photo in photos if photo.mask is not None or has_alpha(photo)]
     if own:
         text = f"--mask {FOREGROUND}: {len(own)} of {len(photos)} photographs have a mask or an alpha channel already: {abbreviated(own)}."
         raise UsageError(f"{text} Omit --mask to use these, or remove them.")
-
-
-def _has_alpha(photo: Photo) -> bool:
-    try:
-        return read_header(photo.image).alpha
-    except UnreadableImage:
-        return False  # reported where it is read
 
 
 def _pictures(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[np.ndarray]]:
