@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.errors import BadInput, DiskFull, Interrupted, PipelineError, StageFailed
-from pipeline.files import NOTHING_FREE
+from pipeline.files import FULL_DISK_BYTES
 from pipeline.text import printable
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -69,7 +69,7 @@ def _full_folder(error: BaseException, run: Path) -> Path | None:
             return Path(name).absolute().parent if isinstance(name, str) else run
         if any(text in str(cause).lower() for text in _FULL_TEXTS):
             return run
-    if not isinstance(error, PipelineError) and shutil.disk_usage(run).free < NOTHING_FREE:
+    if not isinstance(error, PipelineError) and shutil.disk_usage(run).free < FULL_DISK_BYTES:
         return run  # a library that gave no reason
     return None
 

@@ -24,7 +24,7 @@ SafePoint = Callable[[], None]
 MAX_JSON = 32 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
 MAX_DEPTH = 100  # of nested JSON; recursion over a value stays far from Python's limit
 
-NOTHING_FREE = 2**16  # bytes of a disk that is full
+FULL_DISK_BYTES = 2**16  # bytes of a disk that is full
 
 _CONTAINERS = 2**20  # lists and objects that a small file may hold; each takes about a hundred bytes of memory, and two in the file
 _RANDOM = 8  # bytes; the names of temporary files cannot be guessed
@@ -33,7 +33,7 @@ _TEMPORARY = re.compile(r"\.(.+)\.(?:[0-9a-f]{16}|[0-9]{1,10})\.part", re.DOTALL
 _TRASH = re.compile(r"trash-(?:[0-9a-f]{16}|[0-9]{1,10}-[0-9]{1,20})")
 _LONGEST = 200  # bytes of a file's name that its temporary's repeats: file systems allow 255
 # Errors that speak of the file itself. All others are of the system, and say nothing about what was written.
-_ITS_FAULT = (errno.ELOOP, errno.EISDIR, errno.ENOTDIR, errno.EINVAL, errno.ENXIO, errno.ENAMETOOLONG, errno.ENOENT)
+_ERRORS_OF_THE_FILE = (errno.ELOOP, errno.EISDIR, errno.ENOTDIR, errno.EINVAL, errno.ENXIO, errno.ENAMETOOLONG, errno.ENOENT)
 _KINDS = {
     stat.S_IFLNK: "a link",
     stat.S_IFIFO: "a pipe",
@@ -64,7 +64,7 @@ def pretty_json(value: Any, *, sort_keys: bool = True, default: Callable[[Any], 
 
 def is_denied(error: OSError) -> bool:
     """Whether the system would not read the file, whatever is in it: no permission, too many open files, no memory, a failing disk."""
-    return error.errno not in _ITS_FAULT
+    return error.errno not in _ERRORS_OF_THE_FILE
 
 
 def kind_of(mode: int) -> str:
@@ -200,7 +200,7 @@ def _disk_full_behind(error: BaseException, path: Path) -> OSError | None:
     if not isinstance(error, Exception) or (isinstance(error, OSError) and error.errno is not None):
         return None
     with contextlib.suppress(OSError):
-        if shutil.disk_usage(path.parent).free < NOTHING_FREE:
+        if shutil.disk_usage(path.parent).free < FULL_DISK_BYTES:
             return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
     return None
 

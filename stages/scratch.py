@@ -80,12 +80,12 @@ def unusable(path: Path, reason: object) -> str:
 
 def once(warn: Warn) -> Warn:
     """Pass on the first warning alone: a power cut damages many pieces at a time."""
-    said = False
+    warned = False
 
     def first(text: str) -> None:
-        nonlocal said
-        if not said:
-            said = True
+        nonlocal warned
+        if not warned:
+            warned = True
             warn(text)
 
     return first

@@ -17,7 +17,7 @@ from efficientnerf.geometry.cameras import Camera
 MAX_KEYS = 24  # poses that the spline passes through; of more cameras, those evenly spaced along the way
 MAX_ORDERED = 400  # cameras that a tour is sought through; of more, every n-th
 LEAPS = 2.2  # files are in order if their tour is at most so many times as long as that of nearest neighbours
-CLOSES = 1.5  # a tour is closed if its ends are at most so many mean steps apart
+MAX_CLOSING_GAP = 1.5  # a tour is closed if its ends are at most so many mean steps apart
 STEEPEST = 0.9  # |z| of view axes up to which cameras can be levelled
 DENSE = 40  # points of the spline to a piece, for its length
 
@@ -49,7 +49,7 @@ def captured_path(poses: Sequence[np.ndarray], frames: int) -> list[np.ndarray]:
     if steps.sum() <= 0:  # one camera, or all in one place
         return [_poses(rows[:1], given)[0]] * frames
     ends = rows[-1] * _sign(rows[0], rows[-1])
-    closed = len(rows) > 3 and bool(np.linalg.norm(ends - rows[0]) <= CLOSES * steps.mean())
+    closed = len(rows) > 3 and bool(np.linalg.norm(ends - rows[0]) <= MAX_CLOSING_GAP * steps.mean())
     keys = _thinned(_smoothed(rows, closed))
     curve = _spline(keys, closed)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])

@@ -16,7 +16,7 @@ WINDOW = 15  # px, of a patch that is tracked
 ROUND_TRIP = 1.0  # px at most between a corner and where it is tracked back to
 ANCHOR = 0.04  # of the diagonal: from here on, motion is measured from a later frame
 FEWEST = 12  # corners that are found again, or the picture is another
-PATIENCE = 6  # frames for which a picture that is not found again may be blurred only
+MAX_BLURRED_FRAMES = 6  # frames for which a picture that is not found again may be blurred only
 MOVED = 75  # percentile of the corners' motions: the subject may fill a part of the picture, and stay while the rest moves
 
 
@@ -71,7 +71,7 @@ class Motion:
         moved = self._moved(grey)
         if moved is None:
             self._lost += 1
-            if self._lost > PATIENCE:  # a cut, or a pan that was quicker than can be tracked
+            if self._lost > MAX_BLURRED_FRAMES:  # a cut, or a pan that was quicker than can be tracked
                 self._base = self._total = self._total + ANCHOR
                 self._set_anchor(grey)
             return self._total

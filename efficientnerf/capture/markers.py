@@ -14,7 +14,7 @@ from efficientnerf.geometry.cameras import Camera, Similarity, closest_similarit
 
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])  # seen from +z: clockwise from the top left, as OpenCV has them
 MIN_VIEWS = 3
-STILL = 0.0015  # of a picture's longest side: up to this root mean square a view agrees with where a marker is
+MAX_MISS = 0.0015  # of a picture's longest side: up to this root mean square a view agrees with where a marker is
 MIN_AGREEING = 0.7  # share of the views of a marker that stood still
 CORNER_BIAS = 0.1  # px of an edge's length that is no noise: what blur does to small markers, alike in all views
 CONFIDENCE = 2.58  # standard deviations of the stated error: 99 %
@@ -48,7 +48,7 @@ def fit_square(cameras: Sequence[Camera], corners: np.ndarray) -> SquareFit:
     origin, along = np.stack([each[0] for each in seen]), np.stack([each[1] for each in seen])  # (V, 4, 3)
     across = across_rays(along)  # (V, 4, 2, 3)
     focal = np.array([camera.intrinsics["fx"] for camera in cameras])
-    limit = STILL * np.array([max(camera.width, camera.height) for camera in cameras])
+    limit = MAX_MISS * np.array([max(camera.width, camera.height) for camera in cameras])
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(1)  # (V,) px
     weight = np.ones(views)
     agrees = np.ones(views, bool)

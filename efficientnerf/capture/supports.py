@@ -22,7 +22,7 @@ MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane hol
 MIN_CONNECTED = 0.25  # of the cells of a plane's largest connected part, that others have which count
 MAX_THROUGH = 0.12  # of the rays that meet a plane within its outline, that go on
 MAX_PAST, MAX_PAST_LEVEL = 0.15, 0.7  # the rays that go on past the edge of a plane, of those that end on it; of a floor or table, which may end in view
-ROUND_IT = 1.3  # times the outline: what is round a wall
+OUTLINE_MARGIN = 1.3  # times the outline: what is round a wall
 MIN_UNDER = 0.5  # of what the middles of the photographs show before a plane, that stands on it
 LEVEL = 0.995  # least height of the normal of a floor or table
 FARTHEST = 1.6  # distance at which rays meet a plane over the usual distance
@@ -104,7 +104,7 @@ def _supports(plane: Plane, cells: Cells, on: np.ndarray, before: np.ndarray, ra
     at = np.flatnonzero(meets)
     beside = _beside(outline, (rays.origins[at] + distance[at, None] * rays.directions[at]) @ across.T)
     goes_on = (rays.ends[at] - distance[at]) * toward[at] > tolerance + 0.02 * distance[at]
-    within, past = beside <= 1, (beside > 1) & (beside <= ROUND_IT)
+    within, past = beside <= 1, (beside > 1) & (beside <= OUTLINE_MARGIN)
     on_it = int((within & ~goes_on).sum())
     if under < MIN_UNDER * float(cells.central[before].sum()) or (within & goes_on).sum() > MAX_THROUGH * within.sum():
         return False

@@ -10,7 +10,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, rays
 
-PICK = 1.0  # px, the standard deviation of a pixel that someone points at; more where the rays pass each other farther apart
+PICK_DEVIATION = 1.0  # px, the standard deviation of a pixel that someone points at; more where the rays pass each other farther apart
 ROUNDS = 20
 
 
@@ -44,7 +44,7 @@ def triangulated(cameras: Sequence[Camera], pixels: np.ndarray) -> Place:
             raise ValueError("they see it along one line")
         point = point - np.linalg.solve(normal, np.einsum("vnki,vnk->i", slope, off))
     squared = float((off**2).sum())
-    noise = max(PICK**2, squared / (2 * len(seen) - 3))
+    noise = max(PICK_DEVIATION**2, squared / (2 * len(seen) - 3))
     return Place(point[0], noise * np.linalg.inv(normal), len(seen), float(np.sqrt(squared / len(seen))))
 
 

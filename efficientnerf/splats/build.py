@@ -46,22 +46,22 @@ def gaussians_of_asset(
     if not views:
         raise ValueError("Gaussians of an asset need pictures to be fitted to; there are none")
 
-    def said(done: int, text: str) -> None:
+    def report(done: int, text: str) -> None:
         if progress is not None:
             progress(done, budget.steps + 1, text)
 
     def passed() -> float:
         return 0.0 if time_used is None else min(time_used(), 1.0)
 
-    said(0, "merging voxels")
+    report(0, "merging voxels")
     begun = max(1, int(START * budget.count)) if budget.steps else budget.count
     gaussians = merged(tree, [view.camera for view in views], begun, budget.degree)
     if not len(gaussians):
         raise NothingToShow("no voxel of the asset shows in any picture: there is nothing that Gaussians could show")
-    said(1, "fitting Gaussians")
+    report(1, "fitting Gaussians")
     fitted = refitted(
         gaussians, views, budget.steps, most=budget.count, background=tree.background, seed=budget.seed,
-        reached=lambda step, error: said(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used,
+        reached=lambda step, error: report(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used,
     )  # fmt: skip
     if not len(fitted):
         raise NothingToShow("no Gaussian is left that shows in any picture")

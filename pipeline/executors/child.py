@@ -34,8 +34,8 @@ Kind = tuple[int, tuple[int, ...]]
 
 LAST_LINES = 20  # of standard error that are kept
 LONGEST_LINE = 500
-IDLE = 5.0  # seconds that a child without work is kept
-LITTLE = 2**30  # bytes that the child of a finished run may hold and be used again: for small scenes starting another takes a large part of the time
+IDLE_SECONDS = 5.0  # seconds that a child without work is kept
+MAX_KEPT_BYTES = 2**30  # bytes that the child of a finished run may hold and be used again: for small scenes starting another takes a large part of the time
 GRACE = 20.0  # seconds that a child has to reach a safe point once it is asked to stop
 PREPARES = "prepares runs "
 _PR_SET_PDEATHSIG = 1  # prctl(2), Linux alone
@@ -198,7 +198,7 @@ class Children:
             held = answer.pop("resident", None)
             if child.stopping or child.process.returncode is not None or answer.get("kind") == "memory":  # a new one has all of its memory
                 self._drop(run)
-            elif held is not None and held <= LITTLE and not gpus:
+            elif held is not None and held <= MAX_KEPT_BYTES and not gpus:
                 self._release(run)
             return answer
         except OSError as error:  # no process could be started
@@ -209,8 +209,8 @@ class Children:
                 self._stopped.discard(run)
                 finished = request["kind"] == "finish" and run in self._children  # with much memory, which it needs no more
                 if run in self._children:
-                    self._children[run].idle_since = time.monotonic() - (IDLE if finished else 0.0)
-            timer = threading.Timer(0.0 if finished else IDLE, self.tidy)
+                    self._children[run].idle_since = time.monotonic() - (IDLE_SECONDS if finished else 0.0)
+            timer = threading.Timer(0.0 if finished else IDLE_SECONDS, self.tidy)
             timer.daemon = True
             timer.start()
 
@@ -233,7 +233,7 @@ class Children:
             if child is not None and run in self._working:
                 child.stop()
 
-    def tidy(self, kept: float = IDLE) -> None:
+    def tidy(self, kept: float = IDLE_SECONDS) -> None:
         """End the children that have had no work for so many seconds."""
         now = time.monotonic()
         with self._lock:

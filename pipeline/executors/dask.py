@@ -39,7 +39,7 @@ LOOK_SECONDS = 1.0  # between a worker's checks whether its task is still wanted
 PROGRESS_SECONDS = 2.0  # between two reports of a task's progress: they pass through Dask's scheduler
 # Defaults for clusters that are started here; the user's configuration overrides them. Workers wait for children, of which Dask's profiler sees nothing:
 # it took 3.5 % of a core in each worker and as much in the scheduler's process (docs/experiments/fleet.md).
-CALM = {
+DASK_DEFAULTS = {
     "distributed": {
         "worker": {"profile": {"enabled": False}, "memory": {"monitor-interval": "1s"}},
         "admin": {"system-monitor": {"interval": "5s"}, "tick": {"interval": "200ms"}},
@@ -161,8 +161,8 @@ def _started(kind: str, options: dict[str, Any], jobs: int) -> Any:
     module, name = CLUSTERS[kind]
     cluster_type = getattr(_imported(module), name)
     config = _imported("dask").config
-    if CALM not in config.defaults:
-        config.update_defaults(CALM)
+    if DASK_DEFAULTS not in config.defaults:
+        config.update_defaults(DASK_DEFAULTS)
     if kind == "ssh":
         _imported("asyncssh")  # Dask says so late
     if kind == "local":

@@ -10,7 +10,7 @@ from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, SceneState, StageStat
 from pipeline.fleet.workers import Task
 from pipeline.text import printable
 
-BESIDE_STAGES = 512 * 2**20  # bytes that preparing a run takes at most, and writing its pages
+PREPARATION = 512 * 2**20  # bytes that preparing a run takes at most, and writing its pages
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Progress:
         if self.attempts.memory is not None:
             return self.attempts.memory
         if not self.todo:
-            return BESIDE_STAGES
+            return PREPARATION
         estimate = self.memory.get(self.what)
         return None if estimate is None else int(HEADROOM * estimate)
 

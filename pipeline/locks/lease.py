@@ -1,6 +1,6 @@
 """A lease: who writes a folder, across machines that share it, without a lock service.
 
-    FOLDER/.lease/<number>   one file for each holder, its number one above that of the holder before; modified by its holder every BEAT seconds
+    FOLDER/.lease/<number>   one file for each holder, its number one above that of the holder before; modified by its holder every RENEWAL_SECONDS seconds
 
 The highest number holds. It is free where it was not modified for EXPIRY seconds, by the clock of the file server alone: the clocks of machines differ.
 Who finds it free creates the next number, which exactly one can: a file is written aside and linked to its name, as is safe on NFS, or created with
@@ -27,7 +27,7 @@ from pipeline.errors import CorruptArtifact
 from pipeline.links import LEASE
 
 EXPIRY = 60.0  # seconds
-BEAT = 10.0
+RENEWAL_SECONDS = 10.0
 _MOST = 10**15  # a number that no count of holders reaches
 _TRIES = 100
 _PART = ".part"
@@ -81,7 +81,7 @@ class Lease:
                 os.utime(self.path, (0, 0))
 
     def _renew(self) -> None:
-        while not self._done.wait(BEAT) and self._why_lost is None:
+        while not self._done.wait(RENEWAL_SECONDS) and self._why_lost is None:
             self.beat()
 
 

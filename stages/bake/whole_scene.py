@@ -42,7 +42,7 @@ from stages.train.priors import filled_points
 # Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned
 # in those that are partly as close, such as a wall behind the cameras, is baked. docs/experiments/near-cameras.md
 BAKED_CLEARANCE = 0.5
-MUCH_SMALLER = 0.6  # scene bounds, of the foreground region's longest side. docs/experiments/whole-scene.md
+MAX_RATIO = 0.6  # scene bounds, of the foreground region's longest side. docs/experiments/whole-scene.md
 # Where no training image looks, but the next view, which lies between no two of them, may: what the field shows there is baked too. Rays past the borders of
 # training images, of those within; and weight of a voxel in which one of them ends. docs/experiments/whole-scene.md
 PAST_SHARE, END_WEIGHT = 0.3, 0.02
@@ -156,7 +156,7 @@ def innermost_box(region: Region, scene_bounds: np.ndarray) -> np.ndarray:
     bounds, wide = np.asarray(scene_bounds, np.float64), np.asarray(region.bounds, np.float64)
     inside = np.stack([np.maximum(bounds[0], wide[0]), np.minimum(bounds[1], wide[1])])
     sides, most = inside[1] - inside[0], float((wide[1] - wide[0]).max())
-    return inside if sides.min() > 0 and sides.max() < MUCH_SMALLER * most else wide
+    return inside if sides.min() > 0 and sides.max() < MAX_RATIO * most else wide
 
 
 def cascades_needed(samples: FieldSamples, bounds: np.ndarray, least: int, most: int) -> int:

@@ -14,7 +14,7 @@ RADII = np.arange(0.5, 6.01, 0.1)  # of circles round the disc, in its own radii
 ANGLES = 120
 PLAIN = 0.04  # share of a circle that may be of the other colour where it is plain
 GAP, ARCS, MARGIN = (2, 16), (4, 30), 3  # steps of RADII, how wide
-EVEN = 0.1  # of the contrast, how far it is from the paper's light in the mean
+MAX_UNEVENNESS = 0.1  # of the contrast, how far it is from the paper's light in the mean
 FEWEST, SHORTEST = 4, 3  # arcs and spaces between them; steps of ANGLES that one has
 SHARP = 0.8  # share of a code's samples that are dark or bright, and not between
 STEADY = 0.94  # share of them that are as those of the next circle
@@ -73,7 +73,7 @@ def is_coded(circles: np.ndarray) -> bool:
     wide = GAP[0] <= begin - gap <= GAP[1] and ARCS[0] <= end - begin <= ARCS[1] and end + MARGIN < len(RADII)
     if not (wide and inked[: gap - 4].mean(1).min() >= 1 - PLAIN and plain[end : end + MARGIN].all()):
         return False
-    if max(np.abs(light[gap : begin - 1]).mean(), np.abs(light[end + 1 : end + 1 + MARGIN]).mean()) > EVEN:
+    if max(np.abs(light[gap : begin - 1]).mean(), np.abs(light[end + 1 : end + 1 + MARGIN]).mean()) > MAX_UNEVENNESS:
         return False
     ring, code = light[begin + 1 : end - 1], inked[begin + 1 : end - 1]
     sharp = (np.minimum(np.abs(ring), np.abs(ring - 1)) < 0.35).mean()

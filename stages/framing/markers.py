@@ -59,11 +59,11 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     still = {number: fit for number, fit in fits.items() if fit.still}
     moved = sorted(fits.keys() - still.keys())
     if len(still) <= len(moved):
-        raise BadInput(f"{job.source}: markers {_listed(moved)} are not where other photographs see them: they moved, a number was printed twice, or {_ANYWAY}")
+        raise BadInput(f"{job.source}: markers {_listed(moved)} are not where other photographs see them: they moved, a number was printed twice, or {_REMEDY}")
     length, error, excess = common_length([*still.values()])
     if excess > 3 and max(abs(fit.square.scale / length - 1) for fit in still.values()) > LARGEST_ERROR:
         lengths = ", ".join(f"{number}: {fit.square.scale / length * size:.4g} m" for number, fit in sorted(still.items()))
-        raise BadInput(f"{job.source}: markers differ in size ({lengths}): they are not all of one size, they moved, or {_ANYWAY}")
+        raise BadInput(f"{job.source}: markers differ in size ({lengths}): they are not all of one size, they moved, or {_REMEDY}")
     error = float(np.hypot(error, CONFIDENCE * _shape_spread(capture, [*still.values()], job.settings.feature_image_size)))
     if error > LARGEST_ERROR:
         remedy = "Photograph them larger, from more sides, and with more of what is round them."
@@ -100,7 +100,7 @@ def _why_none(job: Job, capture: Capture) -> str:
 
 
 _LINEAR = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
-_ANYWAY = "the cameras are wrong. Without --marker-size (poses.marker_size=off) they are not looked for."
+_REMEDY = "the cameras are wrong. Without --marker-size (poses.marker_size=off) they are not looked for."
 
 
 def _listed(numbers: list[int]) -> str:

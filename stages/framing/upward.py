@@ -13,7 +13,7 @@ from stages.io.photo import read_gravity
 from stages.io.pictures import UnreadableImage
 
 FEWEST = 6  # photographs with a gravity vector, and half of all
-SHAKEN = 5.0  # degrees, of the median photograph's gravity from that of all, up to which they give up
+MAX_SPREAD = 5.0  # degrees, of the median photograph's gravity from that of all, up to which they give up
 AGREED = 5.0  # degrees between two that say which way is up, beyond which a warning names them
 THE_CAMERAS, PLANE = "level cameras", "the floor or table"
 
@@ -70,4 +70,4 @@ def up_by_gravity(capture: Capture) -> np.ndarray | None:
         mean /= max(float(np.linalg.norm(mean)), 1e-9)
         angle = np.degrees(np.arccos(np.clip(all_of @ mean, -1, 1)))
         weight = 1 / (1 + (angle / max(2 * float(np.median(angle)), 1e-3)) ** 2)
-    return mean if np.median(angle) <= SHAKEN else None
+    return mean if np.median(angle) <= MAX_SPREAD else None

@@ -35,7 +35,7 @@ BLOCK = 8  # density voxels along a side of the blocks that no view shows
 COARSE = 32  # px, longest side of the masks that find such blocks: a pixel and its neighbours are wider than the points of a block are apart
 CLEARANCE = 0.8  # of the near plane's distance: how far from the cameras' path nothing is. docs/experiments/near-cameras.md
 REACH = 0.5  # of the way to where the cameras' axes meet, that a camera's near plane is taken to lie at most
-STRAY = 0.5  # of the cameras' median distance from there: one that is nearer stands in the subject, or shows a detail of it
+MIN_DISTANCE = 0.5  # of the cameras' median distance from there: one that is nearer stands in the subject, or shows a detail of it
 NEIGHBOURS = 8  # of a camera that its path leads to, where they are within twice the near plane's distance
 BEFORE_VIEWS = 2  # that must have a voxel before their near planes, or a quarter of the cameras (rounded up) if that is less
 MAX_CONTRADICTED = 0.03  # of the reliable sparse points, that a rule may declare empty: more refute it. docs/priors.md
@@ -191,14 +191,14 @@ def close_to_path(
 
     filled  (F, 3) reliable sparse points: a camera that has more than MAX_CONTRADICTED of them so close stands where it cannot, and keeps nothing clear
 
-    Where the cameras' axes meet in a point, none keeps the middle of the others' pictures clear (REACH), and one that strays there nothing (STRAY).
+    Where the cameras' axes meet in a point, none keeps the middle of the others' pictures clear (REACH), and one that strays there nothing (MIN_DISTANCE).
     """
     centres, plane = np.array([camera.centre for camera in cameras]), np.asarray(near, np.float64)
     middle, meeting = meeting_point(cameras)
     if meeting:
         distance = np.linalg.norm(centres - middle, axis=1)
         plane = np.minimum(plane, REACH * distance)
-        stands = distance >= STRAY * np.median(distance)
+        stands = distance >= MIN_DISTANCE * np.median(distance)
         centres, plane = centres[stands], plane[stands]
     if filled is not None and len(filled):
         within = cKDTree(filled).query_ball_point(centres, clearance * plane, return_length=True)

@@ -7,7 +7,7 @@ a fringe of B, another one in each photograph.
 import cv2
 import numpy as np
 
-CLEAR = 0.25  # share of a pixel from which its own colour is solved for; below, noise would be multiplied by more than four
+MIN_ALPHA = 0.25  # share of a pixel from which its own colour is solved for; below, noise would be multiplied by more than four
 WITHIN = 0.9  # share from which a pixel shows the object alone
 NEAR, FAR = 1.0, 4.0  # px, standard deviations of the neighbourhoods that colours are taken from
 AROUND = 5  # px, side of the neighbourhood within whose colours of the object a solution stays
@@ -28,15 +28,15 @@ def without_background(colour: np.ndarray, cover: np.ndarray) -> np.ndarray:
         return colour
     seen = colour.astype(np.float32)
     behind, known = _mean_nearby(seen, (cover == 0).astype(np.float32))
-    solved = (seen - (1 - share[..., None]) * behind) / np.maximum(share, CLEAR)[..., None]
+    solved = (seen - (1 - share[..., None]) * behind) / np.maximum(share, MIN_ALPHA)[..., None]
     within = (share >= WITHIN)[..., None]
     window = np.ones((AROUND, AROUND), np.uint8)
     low, high = cv2.erode(np.where(within, seen, 255.0).astype(np.float32), window), cv2.dilate(np.where(within, seen, 0.0).astype(np.float32), window)
     bounded = low <= high
     solved = np.clip(np.where(bounded, np.clip(solved, low, high), solved), 0, 255)
     solved = np.where((soft & known)[..., None], solved, seen)
-    nearby, some = _mean_nearby(solved, np.where(share >= CLEAR, share, np.float32(0)))
-    solved = np.where((soft & (share < CLEAR) & some)[..., None], nearby, solved)
+    nearby, some = _mean_nearby(solved, np.where(share >= MIN_ALPHA, share, np.float32(0)))
+    solved = np.where((soft & (share < MIN_ALPHA) & some)[..., None], nearby, solved)
     return np.asarray(np.rint(solved).astype(np.uint8))
 
 

@@ -47,7 +47,7 @@ _LOWEST = 3  # rows and columns of a quantisation table that its coarseness is j
 _LOWEST_MEAN = 118 / 9
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 # The fault of the process or the machine, not of one file: to leave pictures out for these would change results in silence.
-NOT_THE_FILES_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+ERRORS_OF_THE_MACHINE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 # Nor may these leave a picture out: the engine has read all of the file just before, for its digest, so that they may be over by the next run, which would
 # take the artifact without the picture for a fresh one.
 _PASSING = (errno.EIO, errno.EACCES, errno.EPERM)
@@ -93,7 +93,7 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     except (UnreadableImage, MemoryError, PipelineError):
         raise
     except OSError as error:
-        if error.errno in (*NOT_THE_FILES_FAULT, *_PASSING):
+        if error.errno in (*ERRORS_OF_THE_MACHINE, *_PASSING):
             raise
         raise UnreadableImage(f"unreadable: {_reason(error)}") from error
     except Exception as error:  # decoders raise whatever they stumble over: struct.error, TypeError, KeyError, RecursionError ...

@@ -23,7 +23,7 @@ MAX_PART = 200  # bytes of a part of the path of a working image
 OPAQUE = 128  # alpha from which a pixel counts where alpha is used as a mask
 TRANSPARENT = 8  # alpha and levels of masks up to which a pixel of a silhouette is background: what networks and filters leave of nothing
 LOSSY_NOISE = 16  # the same, in formats that keep pixels only about as they were
-NEITHER = Silhouettes()
+NO_SILHOUETTES = Silhouettes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def decode(path: Path, as_stored: bool = False) -> Decoded:
     return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, lossy, profile.fault)
 
 
-def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouettes: Silhouettes = NEITHER, may_be_empty: bool = True) -> Written:
+def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouettes: Silhouettes = NO_SILHOUETTES, may_be_empty: bool = True) -> Written:
     """Write the working image of a photo, and its mask if it has one.
 
     relative      path of the image below folder/images, with its source's extension

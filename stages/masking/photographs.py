@@ -27,7 +27,7 @@ from stages.masking.polarity import kept_white
 from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
 from stages.sfm.added.networks import given_networks
-from stages.sfm.attempts import ENOUGH
+from stages.sfm.attempts import MIN_REGISTERED
 from stages.sfm.cameras import find_cameras
 from stages.sfm.pairs import features_for
 from stages.sfm.reconstruction import Request
@@ -59,20 +59,20 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
 
 def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tuple[Capture, list[str]]:
     """The capture in the frame of cameras that the source states, where it is read as photographs in spite of them; else by GPS; and sentences to report."""
-    said, source = [], job.source
+    sentences, source = [], job.source
     assert source is not None
     name = posed_format(source, job.settings) if len(job.sources) == 1 else None
     if name is not None:
         try:
             capture, sentence = with_stated_cameras(capture, IMPORTERS[name].read(source, job.settings))
-            said.append(sentence)
+            sentences.append(sentence)
         except BadInput as error:
-            said.append(f"the source's cameras cannot be read and are not used: {error}")
+            sentences.append(f"the source's cameras cannot be read and are not used: {error}")
         stated = capture.provenance.stated_cameras
         if stated is not None and stated.used != "nothing":
-            return capture, said
+            return capture, sentences
     capture, sentence = with_gps(capture, paths)
-    return capture, [*said, sentence] if sentence else said
+    return capture, [*sentences, sentence] if sentence else sentences
 
 
 def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], reader: PhotoReader) -> Capture:
@@ -160,7 +160,7 @@ def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path], reader:
     if turn([photo for photo in alone.photos if photo.mask is not None]) < LEAST_TURN:
         job.say("all cameras look the same way, so the background may be far away; the full images are used")
         return None, False
-    if len(alone.photos) < ENOUGH * len(paths):
+    if len(alone.photos) < MIN_REGISTERED * len(paths):
         job.say("the subject alone has too few features in some photographs; cameras are also estimated from the full images")
         with contextlib.suppress(BadInput):
             whole = find("cameras", {})

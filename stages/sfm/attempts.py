@@ -18,9 +18,9 @@ from stages.sfm.images import Progress
 from stages.sfm.intrinsics import zoom
 from stages.verdict.verdict import DOUBTFUL
 
-ENOUGH = 0.9  # of the photographs with a camera, from which the costlier attempts are not made; and
+MIN_REGISTERED = 0.9  # of the photographs with a camera, from which the costlier attempts are not made; and
 AGREEING = 0.8  # of the verified matches, that agree with the cameras
-BETTER = 1.005  # times the score, from which a later attempt is better than an earlier one
+MIN_GAIN = 1.005  # times the score, from which a later attempt is better than an earlier one
 MORE_FEATURES, LESS_CONTRAST = 2, 0.35
 EACH, CROPPED, MERGED = "a focal length each", "a principal point each", "merged sub-models"
 BEGIN_ANEW, SMALL_ANGLES = "another beginning", "small angles"
@@ -71,7 +71,7 @@ class Search:
         self.place = self.work = self.base
         self.quiet: dict[str, Any] = {"progress": self.progress, "safe_point": self.safe_point}
 
-    def keep(self, name: str, models: Models, *, least: float = 0.0, better: float = BETTER) -> None:
+    def keep(self, name: str, models: Models, *, least: float = 0.0, better: float = MIN_GAIN) -> None:
         """Keep an attempt's result where its score, the number of photographs with a camera times the share of the matches that agree, is `better` times
         the best, and at least the share `least` agrees."""
         agreement, count = mapping.match_agreement(self.place, models[0]) if models else 0.0, mapping.num_registered(models)
@@ -103,7 +103,7 @@ class Search:
 
     @property
     def enough(self) -> bool:
-        return mapping.num_registered(self.models) >= ENOUGH * len(self.images) and self.agreement >= AGREEING
+        return mapping.num_registered(self.models) >= MIN_REGISTERED * len(self.images) and self.agreement >= AGREEING
 
     def was_last(self, name: str) -> bool:
         return self.tried[-1]["rung"] == name
@@ -121,7 +121,7 @@ class Attempt:
     when: Callable[[Search], object]  # whether it is made
     run: Callable[[Search], Models | None]  # its sub-models; None where nothing was tried
     least: Callable[[Search], float] = lambda search: 0.0  # share of the matches that has to agree with the result, for it to be kept
-    better: Callable[[Search, Models], float] = lambda search, models: BETTER  # times the best score, that it has to have
+    better: Callable[[Search, Models], float] = lambda search, models: MIN_GAIN  # times the best score, that it has to have
 
 
 def anew(name: str, when: Callable[[Search], bool], options: mapping.Options) -> Attempt:
@@ -228,4 +228,4 @@ def with_own_principal_points(search: Search) -> Models | None:
 
 def better_where_closer(search: Search, models: Models) -> float:
     closer = models[0].compute_mean_reprojection_error() < CLOSER * search.models[0].compute_mean_reprojection_error()
-    return SAME if closer else BETTER
+    return SAME if closer else MIN_GAIN

@@ -80,10 +80,10 @@ def every_image_read(pycolmap: Any, folder: Path) -> Iterator[None]:
         for name, value in before.items():
             setattr(log, name, value)
         log.set_log_destination(log.WARNING, "")
-        said = [line for path in sorted(folder.glob(f"{_LOG}*")) for line in _lines(path)]
+        lines = [line for path in sorted(folder.glob(f"{_LOG}*")) for line in _lines(path)]
         for path in folder.glob(f"{_LOG}*"):
             remove(path)
-    unread = next((line for line in said if "Could not read image" in line), None)
+    unread = next((line for line in lines if "Could not read image" in line), None)
     if unread is not None:
         raise StageFailed(f"poses: {printable(unread.partition('] ')[2], 300)} Run again: what is done is kept.")
 

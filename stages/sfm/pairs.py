@@ -25,7 +25,7 @@ MOST_LIKE = 16  # of retrieval: images that each is matched with for its likenes
 LESS_LIKE = (20, 26, 34, 44)  # and ranks of some more, for long baselines
 FOLLOWING = (1, 2, 3, 5, 8)  # and those that follow it in sorted order
 
-WORDS = 64
+VOCABULARY = 64
 WORD_SAMPLES = 20_000  # descriptors that the words are found in
 WORD_ROUNDS = 8
 AGGREGATED = 1500  # descriptors of an image, at most
@@ -137,12 +137,12 @@ def aggregated(descriptors: np.ndarray) -> np.ndarray:
 
 
 def visual_words(descriptors: Sequence[np.ndarray], seed: int) -> np.ndarray:
-    """(K, 128) uint8, by k-means in an even sample of all images; at most WORDS."""
+    """(K, 128) uint8, by k-means in an even sample of all images; at most VOCABULARY."""
     each = max(1, WORD_SAMPLES // max(1, len(descriptors)))
     sample = np.concatenate([image[:: max(1, -(-len(image) // each))] for image in descriptors] or [np.zeros((0, 128), np.uint8)])
-    if len(sample) <= WORDS:
+    if len(sample) <= VOCABULARY:
         return sample
-    words = sample[np.sort(np.random.Generator(np.random.PCG64(seed)).choice(len(sample), WORDS, replace=False))]
+    words = sample[np.sort(np.random.Generator(np.random.PCG64(seed)).choice(len(sample), VOCABULARY, replace=False))]
     for _ in range(WORD_ROUNDS):
         nearest = _nearest(sample, words)
         sums, counts = _sums(sample.astype(np.int64), nearest, len(words))

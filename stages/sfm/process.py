@@ -185,15 +185,15 @@ def _raise(message: Mapping[str, Any]) -> NoReturn:
 
 
 def _end_in_words(code: int, last_words: list[str]) -> str:
-    said = f" Its last words: {' / '.join(last_words)}." if last_words else ""
+    output = f" Its last words: {' / '.join(last_words)}." if last_words else ""
     if code == -signal.SIGKILL:
         return (
-            f"poses: structure from motion was ended by SIGKILL, as a system that runs out of memory does.{said} Close other programs, or lower"
+            f"poses: structure from motion was ended by SIGKILL, as a system that runs out of memory does.{output} Close other programs, or lower"
             " poses.feature_image_size or poses.max_features; what is done is kept."
         )
     how = f"by {_name_of(-code)}" if code < 0 else f"with code {code} and no result"
     return (
-        f"poses: structure from motion ended {how}.{said} Run again. Should it end so again, lower poses.max_features, take out photographs, or install"
+        f"poses: structure from motion ended {how}.{output} Run again. Should it end so again, lower poses.max_features, take out photographs, or install"
         " another version of pycolmap."
     )
 

@@ -22,7 +22,7 @@ LESS_SHARP = 0.77  # share of the capture's median, below which it is blurred am
 STEP = 0.75  # stops from the capture's median that are a step of exposure
 DARK = -6.0  # stops below white, of the mean of linear light: little but noise is left
 MOST_CLIPPED = 0.4  # share of pixels without detail
-SAME = 1.5  # of 255, root mean square between two small pictures that are the same
+MAX_DUPLICATE_ERROR = 1.5  # of 255, root mean square between two small pictures that are the same
 NOISY = 12.0  # of 255, standard deviation of noise that hides weak features; docs/experiments/sfm.md
 LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # their difference: of edges hardly anything is left
 BLOCK, LEAST_BLOCKS = 16, 9  # px; a picture of fewer is not judged
@@ -184,7 +184,7 @@ def duplicates(looks: Mapping[str, Look]) -> dict[str, str]:
         if small[i].std() < FLAT:
             continue
         apart = np.sqrt(((small[:i] - small[i]) ** 2).mean(1))
-        first = int(np.argmax(apart < SAME))
-        if apart[first] < SAME:
+        first = int(np.argmax(apart < MAX_DUPLICATE_ERROR))
+        if apart[first] < MAX_DUPLICATE_ERROR:
             found[names[i]] = found.get(names[first], names[first])
     return found

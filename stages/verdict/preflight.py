@@ -40,7 +40,7 @@ CHOSEN = 150  # pictures of a larger folder, evenly spaced
 MOST_LIKE, NEXT = 3, 2  # pictures that each is compared with
 OVERLAP = 14  # matches that fit one geometry, from which two pictures overlap
 RATIO, EPIPOLAR_ERROR = 0.8, 1.5  # of the distances of the two best; px
-STILL = 1.0  # px that a feature of a background that stands still moves by, at most
+MAX_STILL_MOTION = 1.0  # px that a feature of a background that stands still moves by, at most
 SMALL = 640  # px; photographs whose longest side is shorter are small
 _EXIF = 34665
 TURNING = Problem(
@@ -189,7 +189,7 @@ def overlap_of(one: Small, other: Small) -> Overlap | None:
         return None
     a, b = a[inside], b[inside]
     flat = cv2.findHomography(a, b, cv2.RANSAC, 2 * EPIPOLAR_ERROR)[1]
-    return Overlap(int(inside.sum()), float((np.linalg.norm(a - b, axis=1) < STILL).mean()), 0.0 if flat is None else float(flat.mean()))
+    return Overlap(int(inside.sum()), float((np.linalg.norm(a - b, axis=1) < MAX_STILL_MOTION).mean()), 0.0 if flat is None else float(flat.mean()))
 
 
 def _groups(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> list[list[int]]:

@@ -21,7 +21,7 @@ from stages.verdict import looks, pictures
 from stages.verdict.verdict import Verdict, verdict_on
 
 GREY = np.array([0.299, 0.587, 0.114])
-NOT_SAID = ("not registered", "folded", "parallax", "few")  # problems that the search for cameras has warned of, or that the user knows of
+ALREADY_REPORTED = ("not registered", "folded", "parallax", "few")  # problems that the search for cameras has warned of, or that the user knows of
 
 
 def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) -> Verdict:
@@ -51,7 +51,7 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
     pictures.sharpness_sheet(files, sharpness, looks.blurred(seen), outputs.sharpness)
     job.say(found.summary(), grade=found.grade)
     for problem in found.problems:
-        if problem.grade != "good" and problem.what not in NOT_SAID:
+        if problem.grade != "good" and problem.what not in ALREADY_REPORTED:
             warn(f"{problem.sentence} {problem.remedy}")
     return found
 

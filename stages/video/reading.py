@@ -21,7 +21,7 @@ from av.video.reformatter import Colorspace, Interpolation
 
 from pipeline.text import printable
 from stages.io.photo import working_size
-from stages.io.pictures import MAX_PIXELS, MAX_SIDE, NOT_THE_FILES_FAULT
+from stages.io.pictures import ERRORS_OF_THE_MACHINE, MAX_PIXELS, MAX_SIDE
 from stages.video import KNOWN
 
 MAX_FRAMES = 1_000_000  # that are looked at
@@ -165,7 +165,7 @@ def opened(path: Path, threads: int = 1) -> Iterator[Video]:
                 stream.codec_context.thread_count, stream.codec_context.thread_type = threads, "AUTO"
                 yield Video(container, stream)
     except av.error.FFmpegError as error:
-        if getattr(error, "errno", None) in NOT_THE_FILES_FAULT:
+        if getattr(error, "errno", None) in ERRORS_OF_THE_MACHINE:
             raise
         raise UnreadableVideo(f"unreadable: {_reason(error)}") from error
 

@@ -29,7 +29,7 @@ from workflows.report.pages import has_pages, write_pages
 from workflows.report.summary import graded, in_words, summary
 
 MOST_JOBS = 4  # stages that need nothing of each other: mesh, splats, turntable and points
-WORTH_IT = 20.0  # seconds of poses, training and baking; a child takes two to five to import what a stage needs
+MIN_SECONDS = 20.0  # seconds of poses, training and baking; a child takes two to five to import what a stage needs
 GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 
 
@@ -141,7 +141,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
 
 def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextManager[SideBySide | None]:
     """What runs stages at the same time; on CUDA, or with one core, nothing does."""
-    least = 0.0 if jobs is not None else WORTH_IT
+    least = 0.0 if jobs is not None else MIN_SECONDS
     jobs = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     if jobs < 2 or device != "cpu":
         return nullcontext()

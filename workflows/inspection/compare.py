@@ -53,7 +53,7 @@ def in_words(found: dict[str, Any]) -> list[str]:
     if found["equal"]:
         return ["equal"]
     lines = [f"{key:<24} {_short(a)} -> {_short(b)}" for key, (a, b) in found["metadata"].items()]
-    lines += [f"{name:<24} {said}" for name, said in found["tensors"].items() if said != "same"]
+    lines += [f"{name:<24} {difference}" for name, difference in found["tensors"].items() if difference != "same"]
     if found["views"]:
         lines.append(f"{'renders':<24} {found['psnr']:.2f} dB apart (PSNR), mean of {len(found['views'])} views; least {min(found['views']):.2f}")
     return lines

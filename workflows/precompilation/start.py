@@ -22,7 +22,7 @@ from workflows.cli.resolve import Settings, Table, read_preset, table_of
 REQUEST = "ENERF_PRECOMPILATION"  # how the process is told what to compile
 USUAL = "preview"  # preset
 SWITCH = "ENERF_PRECOMPILE"  # off: kernels are compiled when they are needed
-PATIENCE = 5.0  # seconds that the process has to end
+END_SECONDS = 5.0  # seconds that the process has to end
 MEMORY = 4 << 30  # bytes that a run has to have: the other process takes up to a third of it
 
 
@@ -72,7 +72,7 @@ def precompiling(execute: Executor, settings: Table, device: str, memory: Limit 
             if process is not None and process.stdin is not None:
                 process.stdin.close()  # it ends itself
                 try:
-                    process.wait(PATIENCE)
+                    process.wait(END_SECONDS)
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()

@@ -27,7 +27,7 @@ NEAR = 1.0  # pixels of a view from the surface's silhouette, up to which a vert
 REACH = 3.0  # pixels from the asset's, up to which the two are the same edge
 GRAZING = 0.35  # cosine between a normal and a ray, below which a vertex may be on a silhouette
 SPREAD = 12  # rounds of averaging over neighbours
-STAY = 1.0  # weight of staying, in views
+STAY_WEIGHT = 1.0  # weight of staying, in views
 CURVED = (0.97, 0.85)  # length of the mean normal around a vertex: down to the first it is flat and stays, from the second on it is sharply curved
 
 
@@ -55,7 +55,7 @@ def fitted_to_silhouettes(
             sums[at] += np.stack([move, np.ones(len(at))], 1)
         curved = np.clip((CURVED[0] - np.linalg.norm(spread(normals), axis=1)) / (CURVED[0] - CURVED[1]), 0, 1)
         move, weight = spread(sums).T
-        vertices = vertices + (curved * move / (weight + STAY))[:, None] * normals
+        vertices = vertices + (curved * move / (weight + STAY_WEIGHT))[:, None] * normals
     return vertices
 
 

@@ -15,7 +15,7 @@ from efficientnerf.surface.texturing.charts import Charts, charts_of
 SMALLEST = 16  # texels along a side
 FILLED = 0.7  # share of a square that packed charts fill, about
 STEP = 0.97  # of the scale, until charts fit
-ENOUGH = 0.8  # of the scale that is wanted, or that the charts' area alone allows
+MIN_SCALE = 0.8  # of the scale that is wanted, or that the charts' area alone allows
 GAP = 4  # texels between charts, at least; 1/512 of the side in larger textures
 
 
@@ -77,7 +77,7 @@ def atlas_of(vertices: np.ndarray, faces: np.ndarray, scale: float, largest: int
         while placed is None:
             at *= STEP
             placed = _packed(charts, at, size)
-        if at >= ENOUGH * min(scale, fitting) or 2 * size > largest:
+        if at >= MIN_SCALE * min(scale, fitting) or 2 * size > largest:
             return Atlas(placed, charts.chart, size, at)
         size *= 2  # gaps take more space than charts
 

@@ -25,7 +25,7 @@ from efficientnerf.surface.texturing.filling import carried_on
 MAX_PHOTOGRAPHS = 12  # photographs that a texel remembers
 SCALE = 60.0  # of 255, by which colours differ of which one is an outlier. docs/experiments/textures.md
 VOTE = 1.5  # of the colour that the asset has, on which of the photographs is right, against the best of them
-TRUST = 0.01  # grade of the colour that is expected. docs/experiments/textures.md
+MIN_GRADE = 0.01  # grade of the colour that is expected. docs/experiments/textures.md
 REACH = 6.0  # pixels from an edge at which a photograph counts in full
 BORDER = 0.03  # of the longer side of a photograph, over which it fades out
 JUMP = 0.01  # of the inverse depth, at a depth edge
@@ -287,5 +287,5 @@ class PhotographTexture:
         out, known = np.empty((len(self.seen), 3), np.uint8), np.empty(len(self.seen), np.float32)
         for part in pieces(len(self.seen), first=4096):
             tick()
-            blend(part.start, part.stop, self.seen, self.weights, SCALE, expected, VOTE, TRUST, out, known)
+            blend(part.start, part.stop, self.seen, self.weights, SCALE, expected, VOTE, MIN_GRADE, out, known)
         return out, known

@@ -15,7 +15,7 @@ from pipeline.text import printable
 from stages.formats.importers.photographs import photographs
 from stages.formats.importers.source import ImportSettings, Source
 from stages.io.capture import Capture
-from stages.io.pictures import NOT_THE_FILES_FAULT
+from stages.io.pictures import ERRORS_OF_THE_MACHINE
 from stages.video import KNOWN, SUFFIXES
 
 
@@ -61,7 +61,7 @@ def one_line_errors(folder: Path) -> Iterator[None]:
     except BadInput as error:
         raise BadInput(printable(error, LONGEST)) from error
     except OSError as error:
-        if error.errno in NOT_THE_FILES_FAULT:
+        if error.errno in ERRORS_OF_THE_MACHINE:
             raise
         raise BadInput(printable(f"{error.filename or folder}: cannot be read ({error.strerror or error}). Check the source folder.")) from error
 

@@ -107,9 +107,9 @@ def _exr(path: Path) -> np.ndarray:
     """(H, W) float32, the one channel of an OpenEXR file, or its R, Y or Z. Raises UnreadableImage."""
     import OpenEXR  # only where depth is read: folders are recognised without it
 
-    data, said = read_bytes(path, LARGEST_EXR), io.StringIO()
+    data, messages = read_bytes(path, LARGEST_EXR), io.StringIO()
     try:
-        with contextlib.redirect_stdout(said):  # it prints what is wrong with a file
+        with contextlib.redirect_stdout(messages):  # it prints what is wrong with a file
             file = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0)
             low, high = file.header()["dataWindow"]
             width, height = (int(end) - int(begin) + 1 for begin, end in zip(low, high, strict=True))
@@ -124,8 +124,8 @@ def _exr(path: Path) -> np.ndarray:
     except (RuntimeError, ValueError, TypeError, KeyError, StopIteration) as error:
         raise UnreadableImage(f"unreadable: no OpenEXR file, or damaged ({printable(error, 80)})") from error
     finally:
-        if said.getvalue():
-            logging.getLogger("OpenEXR").warning(printable(said.getvalue(), 300))
+        if messages.getvalue():
+            logging.getLogger("OpenEXR").warning(printable(messages.getvalue(), 300))
     if pixels.shape != (height, width) or pixels.dtype.kind not in "fiu":
         raise UnreadableImage("unreadable: no channel of as many pixels as the file has")
     return pixels

@@ -19,7 +19,7 @@ FACES, FACE = 2**16, 4  # triangles that there may be anyhow; bytes of the file 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_ELSEWHERE = "accessors that do not lie in the file's own binary part, row by row (write it without compression)"
+_UNSUPPORTED_LAYOUT = "accessors that do not lie in the file's own binary part, row by row (write it without compression)"
 _LARGEST = 1e15  # of a number in a node
 
 
@@ -48,12 +48,12 @@ class Glb:
         binary part, and where all that was read comes to many times the file."""
         entry = self.document["accessors"][_place(number)]
         if "bufferView" not in entry or "sparse" in entry:
-            raise Damaged(_ELSEWHERE)
+            raise Damaged(_UNSUPPORTED_LAYOUT)
         view = self.document["bufferViews"][_place(entry["bufferView"])]
         kind = _TYPES.get(entry["componentType"])
         numbers = [entry["count"], view.get("byteOffset", 0), entry.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 0)]
         if not all(type(each) is int and 0 <= each < 2**53 for each in numbers) or view.get("buffer", 0) != 0 or "uri" in self.document["buffers"][0]:
-            raise Damaged(_ELSEWHERE)
+            raise Damaged(_UNSUPPORTED_LAYOUT)
         count, width = numbers[0], _WIDTHS[widths]
         if kind is None or entry["type"] != widths or count < 1:
             raise Damaged(f"an accessor of {count} {printable(entry['type'], 20)}; expected {widths}")

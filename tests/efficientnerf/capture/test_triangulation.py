@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.capture.markers import CONFIDENCE, common_ratio
-from efficientnerf.capture.triangulation import PICK, Place, length_between, triangulated
+from efficientnerf.capture.triangulation import PICK_DEVIATION, Place, length_between, triangulated
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from tests.efficientnerf.capture.rings import cameras_round
 
@@ -13,7 +13,7 @@ def pixels(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
     return np.stack([project(camera, point[None])[0][0] for camera in cameras])
 
 
-def picked(cameras: list[Camera], point: np.ndarray, rng: np.random.Generator, noise: float = PICK) -> Place:
+def picked(cameras: list[Camera], point: np.ndarray, rng: np.random.Generator, noise: float = PICK_DEVIATION) -> Place:
     """By a random choice of two to four of the cameras."""
     chosen = [cameras[n] for n in rng.choice(len(cameras), rng.integers(2, 5), replace=False)]
     return triangulated(chosen, pixels(chosen, point) + noise * rng.normal(size=(len(chosen), 2)))

@@ -145,9 +145,9 @@ def _world(transform: Element | None, where: str) -> tuple[Similarity, bool, np.
     distance = float(np.linalg.norm(shift))
     if distance <= FARTHEST:
         return Similarity(scale, turn, shift), metric, None, None
-    said = f"{where}: the project lies {distance:.3g} m from the origin of its coordinates; positions are from the chunk's own origin."
+    warning = f"{where}: the project lies {distance:.3g} m from the origin of its coordinates; positions are from the chunk's own origin."
     up = shift / distance if 6.2e6 < distance < 6.5e6 else None  # geocentric: away from the middle of the earth
-    return Similarity(scale, turn, np.zeros(3)), metric, up, said
+    return Similarity(scale, turn, np.zeros(3)), metric, up, warning
 
 
 FORMAT = ListFormat("metashape", "an XML file with the cameras of Metashape next to the photographs", _camera_files, _listed)
