@@ -125,7 +125,6 @@ class MeshOutputs(Outputs):
     preview = Name("preview.png")
     check = Name("check.png")  # where it differs most from the asset: opacity, mesh, what is missed and added
     report = Name("report.json")  # counts, topology, bounds, area, volume, agreement with the asset
-    timings = Name("timings.json")  # seconds of each part of the work
 
 
 class PointsOutputs(Outputs):

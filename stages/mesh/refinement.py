@@ -14,13 +14,12 @@ from stages.artifacts import MeshInputs
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import views_of
 from stages.mesh.texture import photographs
-from stages.mesh.timing import Stopwatch
 from stages.reports import CameraVerdict, read_report
 
 MAX_PHOTOGRAPHS = 64  # photographs, evenly spread over the capture
 
 
-def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, choice: str, job: Job, watch: Stopwatch) -> Mesh:
+def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, choice: str, job: Job) -> Mesh:
     """A mesh of the training frame moved to where photographs agree on it, with the asset's silhouettes again, and facts of that. `choice`: auto or off."""
     views = views_of(load_scene(inputs.poses.folder, inputs.train.folder), "train")
     cameras = read_report(inputs.poses.verdict, CameraVerdict) if inputs.poses.verdict.is_file() else CameraVerdict()
@@ -31,6 +30,5 @@ def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, choic
     vertices = found.vertices
     if found.improved:
         vertices = fitted_to_silhouettes(vertices, mesh.faces, seen[::SKIPPED], job.safe_point)
-    watch.lap("photometric refinement")
     facts = {"photo_consistency": [round(found.before, 4), round(found.after, 4)], "photo_consistent": round(found.seen, 4), "refined": found.improved}
     return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces), facts=mesh.facts | facts)

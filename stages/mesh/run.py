@@ -30,7 +30,6 @@ from stages.mesh.memory import needed
 from stages.mesh.refinement import refined_surface
 from stages.mesh.settings import MeshSettings
 from stages.mesh.texture import facts_of, textured
-from stages.mesh.timing import Stopwatch
 
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
 STEPS = 500  # of the progress of each
@@ -159,7 +158,6 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
 @compiling_kernels
 def run(job: Job) -> None:
     outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
-    watch = Stopwatch()
     whole = load(inputs.bake.asset)
     tree = restricted(whole, settings.region)
     frame = source_frame(tree.metadata)
@@ -167,26 +165,23 @@ def run(job: Job) -> None:
     seen: list[AssetView] = []
     share = 1.0 if settings.texture == "off" else SURFACE_SHARE
     border = whole.region if settings.region == "foreground" else None
-    surface = mesh_of(tree, settings, watch.listening(lambda done, total, text: job.reached(share * done, total, text)), seen, border)
+    surface = mesh_of(tree, settings, lambda done, total, text: job.reached(share * done, total, text), seen, border)
     if "no_surface" in surface.facts:
         write_empty(outputs, surface, seen, frame, job)
-        write_json(outputs.timings, watch.seconds)
         return
-    surface = refined_surface(surface, seen, inputs, settings.photometric_refinement, job, watch)
-    texture_progress = watch.listening(lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text))
-    found = textured(surface, tree, inputs, settings.texture, settings.texture_size, texture_progress)
+    surface = refined_surface(surface, seen, inputs, settings.photometric_refinement, job)
+    rest = 1 - share
+    found = textured(
+        surface, tree, inputs, settings.texture, settings.texture_size, lambda done, total, text: job.reached(share * total + rest * done, total, text)
+    )
     job.safe_point()
     write_png(preview_of(found, tree.metadata, clipped=border is not None), outputs.preview)
-    watch.lap("preview")
     job.safe_point()
     mesh = in_capture(found, frame)
     for path in (outputs.ply, outputs.glb, outputs.obj):
         MESH_EXPORTERS[path.suffix](mesh, path, frame)
-    watch.lap("files")
     agreed, picture = checked(found, seen, job.safe_point)
     write_png(picture, outputs.check)
-    watch.lap("check")
-    write_json(outputs.timings, watch.seconds)
     report = describe(mesh, frame) | {"region": job.settings.region} | agreed
     write_json(outputs.report, report)
     if (doubt := warning_of(report)) is not None:

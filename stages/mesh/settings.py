@@ -7,7 +7,7 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, Density, Fraction, setting
 from pipeline.stage import ByName, Stage
-from stages.artifacts import MeshInputs, MeshOutputs, needs_of
+from stages.artifacts import MeshInputs, needs_of
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,4 @@ class MeshSettings:
         return int(str(self.max_faces).replace("k", "000"))
 
 
-STAGE = Stage(
-    name="mesh",
-    version=20,
-    settings=MeshSettings,
-    needs=needs_of(MeshInputs),
-    run=ByName("stages.mesh.run:run"),
-    volatile=(MeshOutputs.timings,),
-)
+STAGE = Stage(name="mesh", version=20, settings=MeshSettings, needs=needs_of(MeshInputs), run=ByName("stages.mesh.run:run"))

@@ -135,7 +135,6 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         splats_report=_facts(folder, SPLATS.report, damaged),
         sides=_sides(folder, inside),
         upright=None if inside is None else how_to_turn_upright(folder, inside),
-        mesh_seconds=_facts(folder, MESH.timings, damaged),
         previews=_previews(folder, TRAIN.previews),
         asset_previews=_previews(folder, BAKE.previews),
         cameras=_cameras(folder, damaged),
