@@ -34,7 +34,7 @@ else:
     from backports import zstd
 
 MAGIC, VERSIONS = b"NGSP", (3, 4)
-MAX_PLACE = 2**23 - 1  # of a place, in its steps
+LARGEST = 2**23 - 1  # of a place, in its steps
 BITS = 12  # fractional bits of places that other writers have; here there are at least as many where they fit
 STEPS = 4  # of places, in the thickness of the thinnest Gaussians but a twentieth
 COLOUR = 0.15
@@ -56,10 +56,10 @@ def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_
 def _quantised(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
     """The fractional bits of places, and the parts after the header."""
     reach = float(np.abs(gaussians.means).max())
-    if reach > MAX_PLACE:
-        raise BadInput(f"{path}: Gaussians at up to {reach:g} units; SPZ has places up to {MAX_PLACE}. Write .ply or .glb.")
+    if reach > LARGEST:
+        raise BadInput(f"{path}: Gaussians at up to {reach:g} units; SPZ has places up to {LARGEST}. Write .ply or .glb.")
     thin = float(np.quantile(gaussians.scales.min(axis=1), 0.05))
-    bits = min(max(BITS, math.ceil(math.log2(STEPS / thin))), math.floor(math.log2(MAX_PLACE / max(reach, 2**-20))), 22)
+    bits = min(max(BITS, math.ceil(math.log2(STEPS / thin))), math.floor(math.log2(LARGEST / max(reach, 2**-20))), 22)
     count, harmonics = gaussians.harmonics.shape[:2]
     places = np.round(gaussians.means.astype(np.float64) * 2**bits).astype("<i4")
     above = gaussians.harmonics[:, 1:].astype(np.float64)
@@ -73,6 +73,18 @@ def _quantised(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
         rotation_codes(gaussians.rotations).tobytes(),
         np.clip(codes, 0, 255).astype(np.uint8).tobytes(),
     ]
+
+
+def places(raw: bytes, bits: int) -> np.ndarray:
+    """(N, 3) float64 of the places as versions 2 and 3 write them."""
+    padded = np.zeros((len(raw) // 3, 4), np.uint8)
+    padded[:, 1:] = np.frombuffer(raw, np.uint8).reshape(-1, 3)
+    return np.asarray((padded.view("<i4")[:, 0] >> 8).reshape(-1, 3) / 2.0**bits)
+
+
+def scales(raw: bytes) -> np.ndarray:
+    """(N, 3) float64 of the scales."""
+    return np.asarray(np.exp(np.frombuffer(raw, np.uint8).reshape(-1, 3) / SCALE_STEPS + SMALLEST_SCALE))
 
 
 def rotation_codes(rotations: np.ndarray) -> np.ndarray:
