@@ -23,7 +23,7 @@ from stages.io.reader import PhotoReader
 from stages.masking.backdrop import without_white_backdrop
 from stages.masking.background import silhouettes_with_surroundings
 from stages.masking.made import made_masks, masks_by_network
-from stages.masking.polarity import kept_white
+from stages.masking.polarity import INVERTED_NOTICE, kept_white
 from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
 from stages.sfm.added.networks import given_networks
@@ -42,11 +42,12 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     sizes = _sizes(job, paths)
     markers = None if settings.marker_size == "off" else find_markers(job, {name: (paths[name], size) for name, size in sizes.items()})
     find = _search(job, paths, reader, warn, [*sizes.values()], markers)
-    masks = {**kept_white(job, paths, found.masks), **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
+    given = kept_white(job, paths, found.masks, reader)
+    masks = {**given.masks, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     guessed = not masks and settings.mask_from == "auto" and settings.masks != "ignore"
     capture, seen = _of_turning_subject(job, find, paths, reader) if guessed else (None, False)
     if capture is None:
-        capture = _by_masks(job, find, paths, masks, reader)
+        capture = _by_masks(job, find, paths, masks, given.inverted, reader)
         if guessed and not seen:
             capture = without_white_backdrop(job, capture, paths, reader, warn)
     if seen:
@@ -75,11 +76,34 @@ def _in_known_frame(job: Job, capture: Capture, paths: Mapping[str, Path]) -> tu
     return capture, [*sentences, sentence] if sentence else sentences
 
 
-def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], reader: PhotoReader) -> Capture:
-    """The capture of photographs with these masks."""
-    kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, Provenance()), reader, job.safe_point)
-    # Alpha channels leave pixels out where these are no silhouettes.
-    return _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths), reader) if kind else find("cameras", masks)
+def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], inverted: Mapping[str, Path], reader: PhotoReader) -> Capture:
+    """The capture of photographs with these masks; with the inverted ones in their place where these are silhouettes of one thing."""
+
+    def search(masks: Mapping[str, Path]) -> Capture:
+        kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, Provenance()), reader, job.safe_point)
+        # Alpha channels leave pixels out where these are no silhouettes.
+        return _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths), reader) if kind else find("cameras", masks)
+
+    def fit(capture: Capture) -> bool:
+        """Whether the masks of nearly all photographs are silhouettes of one thing."""
+        return share_that_fits(capture, Silhouettes(masks=True), reader) >= MIN_AGREEING
+
+    if not inverted:
+        return search(masks)
+    try:
+        capture = search(masks)
+    except BadInput:  # what surrounds a subject that turned stands still
+        other = None
+        with contextlib.suppress(BadInput):
+            other = search(inverted)
+        if other is None or not fit(other):
+            raise
+    else:
+        other = replace(capture, photos=tuple(replace(photo, mask=inverted.get(photo.camera.name)) for photo in capture.photos))
+        if not fit(other):
+            return capture
+    job.say(INVERTED_NOTICE)
+    return other
 
 
 def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, Path]:

@@ -1,41 +1,77 @@
-"""Masks that keep what is black, turned round where `poses.mask_polarity` says so: all else keeps white, as nerfstudio, Brush and COLMAP have it."""
+"""Which level of given masks is kept. White is, as nerfstudio, Brush and COLMAP have it; but masks of an object that was painted black are met with, too.
+
+Masks that are white but for one compact thing in nearly all photographs either leave it out or show it the other way round. They show it where all of these
+black shapes are views of one thing: these fit its visual hull, and shapes of moving things do not. docs/experiments/silhouettes.md
+"""
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline.errors import BadInput
 from pipeline.stage import Job
-from stages.io.capture import Capture, Photo
+from stages.framing import scene_bounds
+from stages.framing.mask_use import MIN_AGREEING, alike, share_that_fits
+from stages.io.capture import Capture, Photo, Silhouettes
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.png import FAST, write_png
+from stages.io.reader import PhotoReader
 from stages.io.working_images import mask_levels
 from stages.masking.background import photo_without_camera
 
 INVERTED = "masks keep what is black; what is white is left out"
+INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white reverses this"
 
 
-def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path]) -> dict[str, Path]:
-    """The masks of photographs without cameras, by name, turned round where they keep black."""
-    if not masks or job.settings.mask_polarity == "white":
-        return dict(masks)
+@dataclass(frozen=True)
+class Kept:
+    """Masks by name of the photograph."""
+
+    masks: dict[str, Path]  # that keep what is white, as far as is known
+    # the same with black and white exchanged, where cameras have yet to show whether that is right; else none
+    inverted: dict[str, Path] = field(default_factory=dict)
+
+
+def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path], reader: PhotoReader) -> Kept:
+    """The masks of photographs without cameras, each turned round where `poses.mask_polarity` says so; and turned round where they look like it."""
+    polarity = job.settings.mask_polarity
+    if not masks or polarity == "white" or (polarity == "auto" and job.settings.masks == "ignore"):
+        return Kept(dict(masks))
     photos = [photo for name in sorted(masks) if (photo := photo_without_camera(name, paths[name], masks[name])) is not None]
-    return {**masks, **_turned_round(job, photos)}
+    if polarity == "black":
+        job.say(INVERTED)
+        return Kept({**masks, **_turned_round(job, photos)})
+    return Kept(dict(masks), _turned_round(job, photos) if _look_inverted(photos, reader) else {})
 
 
-def capture_kept_white(job: Job, capture: Capture) -> Capture:
+def capture_kept_white(job: Job, capture: Capture, reader: PhotoReader) -> Capture:
     """The same of a capture with cameras; masks whose format says which level is left out (`Photo.mask_ignore`) stay."""
+    polarity = job.settings.mask_polarity
     photos = [photo for photo in capture.photos if photo.mask is not None and photo.mask_ignore == "black"]
-    if not photos or job.settings.mask_polarity == "white":
+    if not photos or polarity == "white":
         return capture
+    if polarity == "auto":
+        if job.settings.masks == "ignore" or not _look_inverted(photos, reader):
+            return capture
+        flipped = replace(capture, photos=tuple(replace(photo, mask_ignore="white") for photo in photos))
+        if share_that_fits(flipped, Silhouettes(masks=True), reader) < MIN_AGREEING:
+            return capture
+    job.say(INVERTED_NOTICE if polarity == "auto" else INVERTED)
     masks = _turned_round(job, photos)
     return replace(capture, photos=tuple(replace(photo, mask=masks.get(photo.camera.name, photo.mask)) for photo in capture.photos))
 
 
+def _look_inverted(photos: Sequence[Photo], reader: PhotoReader) -> bool:
+    """Whether masks leave out one compact thing in nearly all photographs, and do not keep one."""
+    chosen = scene_bounds.chosen_photos(photos)
+    if not alike([(photo, reader.mask(photo)) for photo in chosen])[0]:
+        return False
+    return not alike([(photo, reader.mask(replace(photo, mask_ignore="white"))) for photo in chosen])[0]
+
+
 def _turned_round(job: Job, photos: Sequence[Photo]) -> dict[str, Path]:
     """Name -> mask with black and white exchanged, in the scratch folder; those that cannot be used are left out, and reported where they are read."""
-    job.say(INVERTED)
     folder = job.work / "masks_turned_round"
     folder.mkdir(parents=True, exist_ok=True)
     made = {}

@@ -123,7 +123,7 @@ def read(job: Job, settings: PosesSettings, reader: PhotoReader, warn: Any) -> C
         capture = importers.IMPORTERS[name].read(job.source, settings)
         for sentence in capture.warnings:
             warn(sentence)
-        capture = capture_kept_white(job, capture)
+        capture = capture_kept_white(job, capture, reader)
         made = masks_made_for(job, {photo.camera.name: photo.image for photo in capture.photos if photo.mask is None}, warn)
         capture = replace(capture, photos=tuple(replace(photo, mask=made.get(photo.camera.name, photo.mask)) for photo in capture.photos))
     else:

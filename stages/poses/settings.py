@@ -68,8 +68,11 @@ class PosesSettings:
     matcher_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
         "off", "ONNX file of a network that matches these features (LightGlue); off: none.", advanced=True
     )
-    mask_polarity: Literal["white", "black"] = setting(
-        "white", "Which pixels masks keep: those that are not black (white), or those that are (black).", advanced=True
+    mask_polarity: Literal["auto", "white", "black"] = setting(
+        "auto",
+        "Which pixels masks keep: those that are not black (white), or those that are (black); auto: white, unless black shows one compact object in nearly"
+        " all masks.",
+        advanced=True,
     )
     test_every: Annotated[int, Meta(ge=2, le=10**6)] = setting(
         8, "Every n-th image in sorted order is a test view, unless the source has a split.", advanced=True
