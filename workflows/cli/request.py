@@ -119,7 +119,8 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
     if options.budget is not None:
         values, names = settings.resolved(), [stage.name for stage in workflow.stages]
-        makes = values["splats"].make != "off" and (options.until not in names or names.index(options.until) >= names.index("splats"))
+        makes = "splats" in names and values["splats"].make != "off"
+        makes = makes and (options.until not in names or names.index(options.until) >= names.index("splats"))
         parts = share_budget(seconds_of(options.budget), train_share(sources, values["poses"]), splats=makes)
         for stage, seconds in parts.items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
