@@ -117,7 +117,8 @@ def verdict_on_result(metrics: Mapping[str, Any], cameras: CameraVerdict | None 
         *_of_splats(metrics, figures),
         *_of_cameras(cameras),
     ]
-    ordered = tuple(sorted(found, key=lambda each: -GRADES.index(each.grade)))
+    first = "holes" if _mostly_holes(metrics) else None
+    ordered = tuple(sorted(found, key=lambda each: (-GRADES.index(each.grade), each.what != first)))
     return ResultVerdict(ordered[0].grade if ordered else "good", ordered, figures)
 
 
@@ -277,6 +278,13 @@ def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or allow a larger asset (bake.max_mib)."
     usual = ("Voxels that few rays see were left out.", remedy)
     return [ResultProblem("holes", "poor" if holes > MANY_HOLES else "usable", sentence, *(_short(metrics) or usual), strip)]
+
+
+def _mostly_holes(metrics: Mapping[str, Any]) -> bool:
+    """Whether more than half of the asset's squared error is in its holes: then its pictures are not blurred."""
+    errors = [10 ** (-view["asset"]["psnr"] / 10) for view in metrics["views"] if view["asset"]["psnr"] is not None]
+    excess = metrics["holes_excess_error"]
+    return bool(errors) and excess is not None and excess > 0.5 * math.fsum(errors) / len(errors)
 
 
 def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:

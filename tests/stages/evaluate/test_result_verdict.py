@@ -131,6 +131,17 @@ def test_holes_that_nobody_sees_are_not_reported(off: float, reported: bool) -> 
     assert ("holes" in {problem.what for problem in verdict_on_result(found).problems}) == reported
 
 
+@pytest.mark.parametrize(("share", "first"), [(0.4, "pictures"), (0.6, "holes")])
+def test_pictures_whose_error_is_in_holes_are_not_called_blurred(share: float, first: str) -> None:
+    mean_colour, blurred, *_ = CAPTURES["still life"]
+    found = a_result(24.5, mean_colour=mean_colour, blurred=blurred)
+    error = np.mean([10 ** (-view["asset"]["psnr"] / 10) for view in found["views"]])
+    verdict = verdict_on_result({**found, "holes": 0.036, "holes_excess_error": share * error})
+    check(verdict)
+    assert {"pictures", "holes"} <= {problem.what for problem in verdict.problems}
+    assert verdict.problems[0].what == first
+
+
 def test_an_asset_that_is_right_is_good_and_agrees_with_its_points(tmp_path: Path) -> None:
     poses = make_scene(tmp_path / "poses", "tttr")
     with_points(poses, on_the_ball())
