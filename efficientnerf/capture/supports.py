@@ -7,10 +7,10 @@ M cells, R rays, C cameras.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from efficientnerf.capture.cells import CONNECTED, Cells, connected_parts
 from efficientnerf.geometry.cameras import Camera
@@ -28,6 +28,9 @@ LEVEL = 0.995  # least height of the normal of a floor or table
 FARTHEST = 1.6  # distance at which rays meet a plane over the usual distance
 FLAT, MIN_ON_LEVEL, MIN_BROAD = 0.01, 0.1, 0.15  # of what is near: how far points of a level plane are off it; their share; their extent across it
 MAX_POINTS = 4000  # that a level plane is looked for in
+# Of a support that rays do not pass: points on it at least; sine from which rays meet it; of the rays to sparse points that meet it, those that go on, and by
+# how much of the distance; of the extent of the points, round such a ray. docs/experiments/losses.md
+MIN_ON_SUPPORT, GRAZING, MAX_SEEN_THROUGH, SLACK, HOLE = 30, 0.1, 0.05, 0.03, 0.05
 MAX_FOOT_HEIGHT = 0.3  # of the subject's size, that a part of it stands above a support at most
 
 Plane = tuple[np.ndarray, float]
@@ -130,6 +133,60 @@ def level_plane(points: np.ndarray, cameras: np.ndarray, up: np.ndarray, tilt: f
     flat = on @ _axes_across(normal).T
     broad = len(on) >= MIN_ON_LEVEL * len(near) and np.sqrt(np.linalg.eigvalsh(np.cov(flat.T))[0]) >= MIN_BROAD * size
     return (normal, offset) if broad and (along(cameras, normal) > offset).mean() >= 0.8 and normal @ up > np.cos(np.radians(tilt)) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """The floor or table that a subject stands on, as far as sparse points show it: a plane within the hull of those on it, seen from above, but for where
+    others are seen through it."""
+
+    normal: np.ndarray  # (3,) upwards
+    offset: float
+    outline: Delaunay  # of the points on it, x and y
+    holes: np.ndarray  # (H, 2) x, y of points below that are seen through it, and of where
+    around: float = 0.0  # distance from these at which it is not known to be opaque
+
+    def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(R,) along rays (R, 3), to where they meet it from above; infinite where they do not."""
+        toward = -along(directions, self.normal)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            distance = (along(origins, self.normal) - self.offset) / toward
+        meets = np.flatnonzero((toward > GRAZING) & (distance > 0))
+        at = origins[meets, :2] + distance[meets, None] * directions[meets, :2]
+        inside = self.outline.find_simplex(at) >= 0
+        if len(self.holes) and inside.any():
+            inside[inside] = cKDTree(self.holes).query(at[inside])[0] > self.around
+        out = np.full(len(origins), np.inf)
+        out[meets[inside]] = distance[meets[inside]]
+        return out
+
+
+def opaque_support(points: np.ndarray, cameras: np.ndarray, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray) -> Support | None:
+    """The broadest level plane of points (N, 3), z up, below most cameras (C, 3); None where there is none, or where it is not opaque: rays (R, 3) to sparse
+    points at `lengths` (R,) go on through it."""
+    if len(points) < MIN_ON_SUPPORT:
+        return None
+    size = 2 * float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    broadest: tuple[float, Support] | None = None
+    for _ in range(MAX_SUPPORTS + 1):
+        if (plane := level_plane(points, cameras, np.array([0.0, 0.0, 1.0]))) is None:
+            break
+        height = np.abs(along(points, plane[0]) - plane[1])
+        on, points = points[height <= FLAT * size], points[height > 2 * FLAT * size]
+        if len(on) < MIN_ON_SUPPORT:
+            continue
+        area = float(ConvexHull(on[:, :2]).volume)
+        if broadest is None or area > broadest[0]:
+            broadest = area, Support(*plane, Delaunay(on[:, :2]), np.zeros((0, 2)))
+    if broadest is None:
+        return None
+    distance = broadest[1].distances(origins, directions)
+    meets = np.isfinite(distance)
+    goes_on = np.flatnonzero(meets)[lengths[meets] > distance[meets] * (1 + SLACK) + FLAT * size]
+    if len(goes_on) > MAX_SEEN_THROUGH * meets.sum():
+        return None
+    ways = [origins[goes_on, :2] + to[goes_on, None] * directions[goes_on, :2] for to in (distance, lengths)]
+    return replace(broadest[1], holes=np.concatenate(ways), around=HOLE * size)
 
 
 def _axes_across(normal: np.ndarray) -> np.ndarray:

@@ -173,7 +173,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         if m.space.scales_near_gradients:
             scale_gradients_by_distance(m, batch.origins, outputs)
         if aimed is not None:
-            loss = loss + weight * sparse_depth_loss(outputs, aimed.distance, samples_per_pivot, fitting)
+            loss = loss + weight * sparse_depth_loss(outputs, aimed.distance, aimed.on_support, samples_per_pivot, fitting)
         loss.backward()
         t.adam.step(number, t.schedule.learning_rate_at(number))
         update_occupancy(m, outputs, number, rng, padded=capacity is not None, may_wait=readback is None)

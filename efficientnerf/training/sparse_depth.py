@@ -16,6 +16,8 @@ from efficientnerf.training.losses import mean_over
 
 # docs/experiments/losses.md
 RAYS_PER_RAY = 8  # one ray to a sparse point for so many rays of pixels
+POINTS_PER_SUPPORT_RAY = 4
+LEAST_LIGHT = 0.05  # that reaches a support, below which what stands before it hides it
 WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as at the point
 
 
@@ -27,6 +29,7 @@ class SparseDepthRays:
     origins: np.ndarray
     directions: np.ndarray
     distance: np.ndarray  # (A,) float32, to the point
+    on_support: np.ndarray  # (A,) bool, those last: the point is on the plane that the subject stands on, and something may stand before it
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -38,42 +41,54 @@ def sparse_depth_weight(weight: float, fraction: float) -> float:
 
 
 class AimedRays(NamedTuple):
-    """Rays that are aimed at sparse points: `bundle`, the arguments of `render_rays` as of `RayBatch`, and the distances of the points (A,)."""
+    """Rays that are aimed at sparse points: `bundle`, the arguments of `render_rays` as of `RayBatch`, the distances of the points (A,), and which are on the
+    support (A,) bool."""
 
     bundle: tuple[Tensor, ...]
     distance: Tensor
+    on_support: Tensor
 
 
 def aimed_rays(m: Model, rays: SparseDepthRays, count: int, rng: np.random.Generator) -> AimedRays:
-    """`count` random rays to sparse points, from a tenth of their distance to four times it."""
-    pick = rng.integers(len(rays), size=count)
-    origins, directions, distance = (to_device(torch.from_numpy(a[pick]), m.device) for a in (rays.origins, rays.directions, rays.distance))
+    """`count` random rays to sparse points, from a tenth of their distance to four times it, and a quarter as many to the support, if there is one."""
+    points = int(np.count_nonzero(~rays.on_support))
+    pick = rng.integers(points, size=count)
+    if points < len(rays):
+        pick = np.concatenate([pick, rng.integers(points, len(rays), size=max(1, count // POINTS_PER_SUPPORT_RAY))])
+        count = len(pick)
+    arrays = rays.origins, rays.directions, rays.distance, rays.on_support
+    origins, directions, distance, on_support = (to_device(torch.from_numpy(a[pick]), m.device) for a in arrays)
     offset = to_device(torch.from_numpy(rng.random(count, np.float32)), m.device)
-    return AimedRays((origins, directions, 0.1 * distance, 4 * distance, offset, torch.full_like(directions, UNSEEN)), distance)
+    return AimedRays((origins, directions, 0.1 * distance, 4 * distance, offset, torch.full_like(directions, UNSEEN)), distance, on_support)
 
 
-def sparse_depth_loss(outputs: RayOutputs, distance: Tensor, samples_per_pivot: int, complete: Tensor | None) -> Tensor:
+def sparse_depth_loss(outputs: RayOutputs, distance: Tensor, on_support: Tensor, samples_per_pivot: int, complete: Tensor | None) -> Tensor:
     """The weight along the last rays of a rendered bundle that does not lie close to their sparse points, for both stages: 0 to 2.
 
         1 - sum_i w_i max(0, 1 - |t_i - d| / (WIDTH e_i))
 
     with t_i the middle of interval i, e_i its extent (of a coarse interval for both stages) and d the distance of the point. It removes floaters before
-    the point.
+    the point. Before a support there may be something: of a ray to it, what passes it counts of the light T that reaches it,
 
-    distance  (A,) of `AimedRays`, in the world
-    complete  (R + A,) bool, rays that count; None: all
+        T (1 - sum_i w_i / T)    over i with |t_i - d| < WIDTH e_i
+
+    where the first T has no gradient: what stands before it stays as it is, and it becomes opaque where it is seen.
+
+    distance, on_support  (A,) of `AimedRays`, in the world
+    complete              (R + A,) bool, rays that count; None: all
     """
     count, rays = len(distance), len(outputs.rays.near)
     distance = outputs.rays.last(count).frame_distance(distance)
     loss = distance.new_zeros(())
     for samples, weight, parts in ((outputs.coarse, outputs.coarse_weight, 1), (outputs.fine, outputs.fine_weight, samples_per_pivot)):
         start, extent, of_last, ray = _of_last(samples, weight, rays - count)
-        off = (start + extent / 2 - distance[ray]).abs() / (WIDTH * parts * extent).clamp(min=1e-12)
-        near = of_last * (1 - off).clamp(min=0)
-        if complete is None:
-            loss = loss + 1 - near.sum() / count
-        else:
-            loss = loss + mean_over(1 - near.new_zeros(count).index_add(0, ray, near), complete[-count:])
+        past = (start + extent / 2 - distance[ray]) / (WIDTH * parts * extent).clamp(min=1e-12)
+        zero = of_last.new_zeros(count)
+        near = zero.index_add(0, ray, of_last * (1 - past.abs()).clamp(min=0))
+        reaching, ending = (1 - zero.index_add(0, ray, of_last * (past <= -1))), zero.index_add(0, ray, of_last * (past.abs() < 1))
+        passing = reaching.detach().clamp(min=0) * (1 - ending / reaching.clamp(min=LEAST_LIGHT))
+        each = torch.where(on_support, passing, 1 - near)
+        loss = loss + (each.mean() if complete is None else mean_over(each, complete[-count:]))
     return loss
 
 

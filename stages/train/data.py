@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from efficientnerf.capture.supports import Support, opaque_support
+from efficientnerf.geometry.cameras import rays
 from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
@@ -20,6 +22,8 @@ from stages.train.settings import refuse_planes_out_of_order
 
 MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
 MOST_OBSERVATIONS = 2**20  # of sparse points that are used; of more, those of points drawn at random
+NEAR_THE_SCENE = 1.5  # half sides of the scene bounds, within which points may be on what the subject stands on
+SUPPORT_TRIES = 4  # random pixels for each that is wanted
 POINTS_AT_ONCE = 2**16  # observed by equally many, whose cameras are compared
 CUT_SHARE = 0.25  # of a view's range that stated planes leave out, from which a warning says so: the corners of the scene bounds are mostly empty
 GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their integer parts, fill an interval evenly
@@ -99,6 +103,8 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | 
     """Rays to the sparse points that are registered in training images, from the cameras of these and from between each and the nearest of the others that see
     the point, where held-out views may lie and nothing else keeps fog away; None: there are none.
 
+    Where the sparse points show what the subject stands on, rays of random pixels to it come with them (`efficientnerf.capture.supports.opaque_support`).
+
     Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
     or in it, too. Where they are observed more than `MOST_OBSERVATIONS` times, `seed` draws the points.
     """
@@ -125,7 +131,34 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | 
     origins = np.concatenate([centres[view], _between(point, view, centres)])
     offset = np.concatenate([xyz[point]] * 2) - origins
     distance = np.linalg.norm(offset, axis=1)
-    return SparseDepthRays(origins.astype(np.float32), (offset / distance[:, None]).astype(np.float32), distance.astype(np.float32))
+    found = _rays(origins, offset / distance[:, None], distance, on_support=False)
+    middle, reach = s.bounds.mean(axis=0), NEAR_THE_SCENE * (s.bounds[1] - s.bounds[0]).max() / 2
+    near = (np.abs(xyz - middle) <= reach).all(axis=1)
+    to_point = xyz[point] - centres[view]
+    length = np.linalg.norm(to_point, axis=1)
+    support = opaque_support(xyz[tracked & near], centres[in_training], centres[view], to_point / length[:, None], length)
+    return found if support is None else _with_support(found, support, scene.views_of(s, "train"), seed)
+
+
+def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, ...], seed: int) -> SparseDepthRays:
+    """With half as many rays of random pixels to the support, as many of each view if it shows so much of it."""
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 7, 0]))
+    each = max(1, len(found) // (2 * len(views)))
+    parts = []
+    for view in views:
+        pixels = rng.random((SUPPORT_TRIES * each, 2)) * (view.camera.width, view.camera.height)
+        origins, directions = rays(view.camera, pixels)
+        distance = support.distances(origins, directions)
+        meets = np.flatnonzero(np.isfinite(distance))[:each]
+        parts.append((origins[meets], directions[meets], distance[meets]))
+    origins, directions, distance = (np.concatenate(part) for part in zip(*parts, strict=True))
+    own = _rays(origins, directions, distance, on_support=True)
+    return SparseDepthRays(**{name: np.concatenate([values, getattr(own, name)]) for name, values in vars(found).items()})
+
+
+def _rays(origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, *, on_support: bool) -> SparseDepthRays:
+    origins, directions, distance = (np.asarray(array, np.float32) for array in (origins, directions, distance))
+    return SparseDepthRays(origins, directions, distance, np.full(len(distance), on_support))
 
 
 def _between(point: np.ndarray, view: np.ndarray, centres: np.ndarray) -> np.ndarray:

@@ -119,6 +119,8 @@ def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> S
     found = sparse_depth_of(folder, s, settings.seed)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
         job.say("no sparse point is in front of enough of the training cameras that observe it; train.sparse_depth_loss_weight has no effect")
+    if found is not None and found.on_support.any():
+        job.say(f"the subject stands on a plane, where rays end: {int(found.on_support.sum())} rays to it are trained on")
     return found
 
 

@@ -3,6 +3,8 @@
 import itertools
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,18 +110,42 @@ def test_sparse_depth_gathers_the_weight_at_its_points() -> None:
     origins = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (4, 1))
     directions = np.float32([[1, 0, 0], [0.995, 0.0998, 0], [0.995, 0, 0.0998], [0.995, -0.0998, 0]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    rays = SparseDepthRays(origins, directions, np.full(4, 3.0, np.float32))
+    rays = SparseDepthRays(origins, directions, np.full(4, 3.0, np.float32), np.zeros(4, bool))
     adam = Adam(parameter_groups(m))
     losses = []
     for step in range(1, 41):
         rng = np.random.default_rng(step)
         aimed = aimed_rays(m, rays, 16, rng)
-        loss = sparse_depth_loss(render_rays(m, *aimed.bundle, prune=False, rng=rng), aimed.distance, m.settings.samples_per_pivot, None)
+        outputs = render_rays(m, *aimed.bundle, prune=False, rng=rng)
+        loss = sparse_depth_loss(outputs, aimed.distance, aimed.on_support, m.settings.samples_per_pivot, None)
         loss.backward()
         adam.step(step, 3e-2)
         losses.append(float(loss.detach()))
     assert 1.5 < losses[0] <= 2
     assert losses[-1] < 1.2
+
+
+def test_a_support_becomes_opaque_and_what_stands_before_it_stays() -> None:
+    """Gradients in closed form: none of densities before the support or behind it, and none at all where something hides it."""
+    start, extent, at = torch.arange(10) / 10, torch.full((10,), 0.1), torch.tensor([0.56])
+
+    def gradient(before: float, on_support: bool) -> tuple[float, torch.Tensor]:
+        alpha = torch.tensor([0.0, before, 0, 0, 0.2, 0.3, 0.1, 0, 0.4, 0.5], requires_grad=True)
+        weight = alpha * torch.cumprod(torch.cat([torch.ones(1), 1 - alpha[:-1]]), 0)
+        samples = SimpleNamespace(start=start, extent=extent, first=torch.tensor([0, 10]))
+        rays = SimpleNamespace(near=torch.zeros(1), last=lambda count: SimpleNamespace(frame_distance=lambda distance: distance))
+        outputs: Any = SimpleNamespace(coarse=samples, fine=samples, coarse_weight=weight, fine_weight=weight, rays=rays)
+        loss = sparse_depth_loss(outputs, at, torch.tensor([on_support]), 1, None)
+        return float(loss.detach()), torch.autograd.grad(loss, alpha)[0]
+
+    loss, of_support = gradient(0.6, True)
+    assert 0 < loss < 2 * 0.4
+    assert of_support[[0, 1, 2, 3, 8, 9]].abs().max() < 1e-6
+    assert (of_support[4:8] < 0).all()
+    assert gradient(0.6, False)[1][1] > 0, "a floater before a sparse point"
+    hidden, none = gradient(1.0, True)
+    assert hidden == 0
+    assert none.abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("complete", [False, True])
@@ -129,13 +155,13 @@ def test_rays_to_sparse_points_count_alone_though_others_come_first(complete: bo
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(30, 3)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    rays = SparseDepthRays(-3 * directions, directions, rng.uniform(2, 4, 30).astype(np.float32))
+    rays = SparseDepthRays(-3 * directions, directions, rng.uniform(2, 4, 30).astype(np.float32), np.arange(30) % 3 == 0)
     aimed, others = (aimed_rays(m, rays, count, np.random.default_rng(count)) for count in (9, 20))
     counted = torch.tensor([True] * 20 + [complete, True, complete] * 3)
 
     def found(parts: list[AimedRays]) -> tuple[float, torch.Tensor]:
         outputs = render_rays(m, *(torch.cat(each) for each in zip(*(part.bundle for part in parts), strict=True)), prune=False)
-        loss = sparse_depth_loss(outputs, aimed.distance, m.settings.samples_per_pivot, counted[-len(outputs.fine_opacity) :])
+        loss = sparse_depth_loss(outputs, aimed.distance, aimed.on_support, m.settings.samples_per_pivot, counted[-len(outputs.fine_opacity) :])
         (gradient,) = torch.autograd.grad(loss, m.fine.weights[-1])
         return float(loss.detach()), gradient
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,24 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path:
     assert any("resuming training from step 8" in event.get("text", "") for event in events)
 
 
+def test_rays_to_the_table_come_with_those_to_sparse_points(tmp_path: Path) -> None:
+    """Half as many, from all views that see it; within the hull of the points on it."""
+    folder = poses(tmp_path / "poses", points=True)
+    s = scenes.load(folder)
+    views = [view for view in s.views if view.camera.centre[2] > -0.5]
+    s = replace(s, views=tuple(views))
+    scenes.save(s, folder)
+    number = len(views)
+    xyz = np.column_stack([np.random.default_rng(0).uniform(-0.8, 0.8, (60, 2)), np.full(60, -0.6)])
+    scenes.save_points(SparsePoints(xyz, np.zeros((60, 3), np.uint8), np.zeros(60), (tuple(range(number)),) * 60), folder)
+    found = sparse_depth_of(folder, s)
+    assert found is not None
+    ends = (found.origins + found.distance[:, None] * found.directions)[found.on_support]
+    assert 0.2 * len(found) < len(ends) <= len(found) / 3
+    np.testing.assert_allclose(ends[:, 2], xyz[0, 2], atol=1e-5)
+    assert np.abs(ends[:, :2]).max() < 0.8
+
+
 def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) -> None:
     folder = poses(tmp_path / "poses", points=True)
     s = scenes.load(folder)
@@ -144,6 +163,7 @@ def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) ->
         np.testing.assert_allclose(np.cross(way, done), 0, atol=1e-5)
         assert -1e-6 <= way @ done <= way @ way + 1e-6
     assert np.abs(every.origins[half:] - real).max() > 0.01
+    assert not every.on_support.any()
     only = SparsePoints(np.repeat(cameras[0].centre[None], 1, axis=0), points.rgb[:1], points.error[:1], ((0, 0, 0),))
     assert rays(only) == ([], None)
 
