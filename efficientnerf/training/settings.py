@@ -89,7 +89,10 @@ class TrainSettings:
         advanced=True,
     )
     sparse_depth_loss_weight: NonNegative = setting(
-        0.1, "Weight of the depth loss at the sparse points (DS-NeRF); it falls to zero over the first half of the steps.", advanced=True
+        0.1,
+        "Weight of the depth loss at the sparse points (DS-NeRF) and on the floor or table that they show; it falls to zero over the first half of the"
+        " steps.",
+        advanced=True,
     )
     exposure: Literal["auto", "off", "on"] = setting(
         "auto",
