@@ -30,6 +30,7 @@ from efficientnerf.capture.foreground import find_foreground
 from efficientnerf.model import Model
 from efficientnerf.training.pixels import Pixels
 from pipeline.stage import Job
+from stages.bake.holes import END_WEIGHT
 from stages.bake.plan import SceneBake, nested_grids
 from stages.bake.resolution import MAX_BEYOND, finest_of_cascades
 from stages.bake.scratch import rendered_once
@@ -44,8 +45,8 @@ from stages.train.priors import filled_points
 BAKED_CLEARANCE = 0.5
 MAX_RATIO = 0.6  # scene bounds, of the foreground region's longest side. docs/experiments/whole-scene.md
 # Where no training image looks, but the next view, which lies between no two of them, may: what the field shows there is baked too. Rays past the borders of
-# training images, of those within; and weight of a voxel in which one of them ends. docs/experiments/whole-scene.md
-PAST_SHARE, END_WEIGHT = 0.3, 0.02
+# training images, of those within. docs/experiments/whole-scene.md
+PAST_SHARE = 0.3
 FOREGROUND_RAYS = 2**18  # that the foreground region is found from
 CENTRES_PER_BLOCK = 2**20
 KINDS = {

@@ -51,6 +51,6 @@ def test_a_pit_of_which_few_points_are_seen_stays_open(table: np.ndarray) -> Non
     support = found(np.concatenate([table, pit]))
     assert support is not None
     down = np.tile([[0.0, 0, -1]], (2, 1))
-    into, beside = support.distances(np.array([[0.52, 0.52, 1], [-0.5, -0.5, 1]]), down)
+    into, away = support.distances(np.array([[0.52, 0.52, 1], [-0.5, -0.5, 1]]), down)
     assert np.isinf(into)
-    assert beside == pytest.approx(1 - HEIGHT, abs=0.01)
+    assert away == pytest.approx(1 - HEIGHT, abs=0.01)
