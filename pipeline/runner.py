@@ -54,18 +54,18 @@ def run_stages(
     report: Report | None = None,
     dry_run: bool = False,
     execute: Executor = local.execute,
-    beside: SideBySide | None = None,
+    side_by_side: SideBySide | None = None,
 ) -> list[Outcome]:
     """Bring a run up to date; returns an outcome for each stage considered, in order.
 
-    stages   the workflow: each after those that it needs
-    until    the last stage to consider, in the order of the list
-    start    run this stage and those after it even if they are fresh; those before it if they are not
-    only     consider this stage alone, with the artifacts of those before it; warns if they are not fresh
-    force    run the stages considered even if they are fresh
-    memory   handed to the stages; None: no limit
-    report   takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
-    beside   runs stages that do not need each other, at the same time, where the memory admits it; None: one stage after another
+    stages        the workflow: each after those that it needs
+    until         the last stage to consider, in the order of the list
+    start         run this stage and those after it even if they are fresh; those before it if they are not
+    only          consider this stage alone, with the artifacts of those before it; warns if they are not fresh
+    force         run the stages considered even if they are fresh
+    memory        handed to the stages; None: no limit
+    report        takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
+    side_by_side  runs stages that do not need each other, at the same time, where the memory admits it; None: one stage after another
 
     Raises PipelineError. What was published before stays; the next call resumes what was interrupted.
     """
@@ -84,7 +84,7 @@ def run_stages(
         return run.how_to_resume(until=until, start=first)
 
     with run.locked(), stopping() as stop:
-        return _Runner(run, stages, device, memory, report, stop, execute, beside).all(chosen, forced, only, go_on)
+        return _Runner(run, stages, device, memory, report, stop, execute, side_by_side).all(chosen, forced, only, go_on)
 
 
 class _Runner:
@@ -92,7 +92,7 @@ class _Runner:
 
     def __init__(
         self, run: Run, stages: Sequence[Stage], device: str, memory: Limit | None, report: Report | None, stop: Stop, execute: Executor,
-        beside: SideBySide | None,
+        side_by_side: SideBySide | None,
     ) -> None:  # fmt: skip
         self.run = run
         self.stages = stages
@@ -101,7 +101,7 @@ class _Runner:
         self.memory = memory
         self.stop = stop
         self.execute = execute
-        self.beside = beside
+        self.side_by_side = side_by_side
         self._report = None if report is None else _one_at_a_time(report)
         self._lock = threading.Lock()  # of everything but the work of a stage
         self.hashes = Hashes(run.cache, safe_point=self.safe_point)
@@ -133,20 +133,20 @@ class _Runner:
 
     def _are_admitted(self, ready: Sequence[Stage], forced: Collection[str], seconds: float) -> bool:
         """Whether these run at the same time: it is worth it after so many seconds, more than one has to run, and each has enough memory in a share of it."""
-        if self.beside is None or self.beside.jobs < 2 or len(ready) < 2 or seconds < self.beside.least:
+        if self.side_by_side is None or self.side_by_side.jobs < 2 or len(ready) < 2 or seconds < self.side_by_side.least:
             return False
         stale = [stage for stage in ready if stage.name in forced or not decide(stage, self.run, self.hashes).fresh]
         if len(stale) < 2 or self.memory is None:
             return len(stale) > 1
-        needs = [self.beside.need(stage) for stage in stale]
-        return all(need is not None and need <= self.memory.bytes // self.beside.jobs for need in needs)
+        needs = [self.side_by_side.need(stage) for stage in stale]
+        return all(need is not None and need <= self.memory.bytes // self.side_by_side.jobs for need in needs)
 
     def _together(self, ready: Sequence[Stage], forced: Collection[str]) -> list[Outcome]:
         """`one` for each of these, at the same time. The first error is raised once all have ended; no other stage begins after it."""
-        assert self.beside is not None
-        memory = None if self.memory is None else Limit(self.memory.bytes // self.beside.jobs, self.memory.whose)
-        with ThreadPoolExecutor(self.beside.jobs, thread_name_prefix="stage") as pool:
-            futures = [pool.submit(self.one, stage, stage.name in forced, self.beside.execute, memory) for stage in ready]
+        assert self.side_by_side is not None
+        memory = None if self.memory is None else Limit(self.memory.bytes // self.side_by_side.jobs, self.memory.whose)
+        with ThreadPoolExecutor(self.side_by_side.jobs, thread_name_prefix="stage") as pool:
+            futures = [pool.submit(self.one, stage, stage.name in forced, self.side_by_side.execute, memory) for stage in ready]
             pending, asked = set(futures), False
             while pending:
                 ended = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED).done
@@ -155,9 +155,9 @@ class _Runner:
                     pool.shutdown(wait=False, cancel_futures=True)
                 if stop and not asked:
                     asked = True
-                    self.beside.stop()
+                    self.side_by_side.stop()
                 pending = {future for future in pending if not future.done()}
-        self.beside.rest()
+        self.side_by_side.rest()
         self.safe_point()
         for future in futures:
             if not future.cancelled() and (error := future.exception()) is not None:

@@ -162,9 +162,9 @@ def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.n
     return out
 
 
-def _ending_in_view(cells: Cells, beside: np.ndarray, subject: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _ending_in_view(cells: Cells, adjacent: np.ndarray, subject: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(M,) bool: connected parts of the cells next to a subject that end within the pictures, as horns do, and neither go on out of them nor in other cells."""
-    at, out = np.flatnonzero(beside), np.zeros(len(beside), bool)
+    at, out = np.flatnonzero(adjacent), np.zeros(len(adjacent), bool)
     if not len(at) or not subject.any():
         return out
     _, part = connected_parts(cells.centres[at], CONNECTED * cells.side)
@@ -189,23 +189,23 @@ def _volume(points: np.ndarray) -> float:
     return float(np.ptp(points, axis=0).prod()) if len(points) else 0.0
 
 
-def _region_of(found: np.ndarray, side: float, beside: np.ndarray | None = None, *, level: bool = False, margin: float = MARGIN) -> Region:
+def _region_of(found: np.ndarray, side: float, support: np.ndarray | None = None, *, level: bool = False, margin: float = MARGIN) -> Region:
     """A region round the subject's points (N, 3) and the support's points near them; `level`: it may be round in plan."""
     low, high = found.min(axis=0) - side, found.max(axis=0) + side
     size = float((high - low).max())
     room = SUPPORT_MARGIN * size
-    beside = np.zeros((0, 3)) if beside is None else beside
-    beside = beside[((beside >= low - room) & (beside <= high + room)).all(axis=1)]
+    support = np.zeros((0, 3)) if support is None else support
+    support = support[((support >= low - room) & (support <= high + room)).all(axis=1)]
     margin = margin * size + side
     if level:  # the floor is clipped to a disc, or to a rounded rectangle about a long subject
         centre, half = (low + high)[:2] / 2, (high - low)[:2] / 2
         round_one = float(np.linalg.norm(found[:, :2] - centre, axis=1).max()) + side
         half = np.full(2, round_one) if round_one <= 1.3 * half.min() else half
         low, high = np.append(centre - half, low[2]), np.append(centre + half, high[2])
-    if len(beside):
+    if len(support):
         # A support that lies across an axis ends the region there; along the other axes it is clipped.
-        thin = np.ptp(beside, axis=0) < 0.25 * max(np.ptp(beside, axis=0).max(), 1e-12)
-        low, high = np.where(thin, np.minimum(low, beside.min(axis=0)), low), np.where(thin, np.maximum(high, beside.max(axis=0)), high)
+        thin = np.ptp(support, axis=0) < 0.25 * max(np.ptp(support, axis=0).max(), 1e-12)
+        low, high = np.where(thin, np.minimum(low, support.min(axis=0)), low), np.where(thin, np.maximum(high, support.max(axis=0)), high)
     low, high = low - margin, high + margin
     fade = FADE * float((high - low).max())
     radius = float((high - low)[:2].min()) * (0.5 if level and abs((high - low)[0] - (high - low)[1]) < 1e-9 else 0.25 if level else 0.0)

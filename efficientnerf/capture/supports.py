@@ -98,16 +98,16 @@ def _supports(plane: Plane, cells: Cells, on: np.ndarray, before: np.ndarray, ra
     outline = _outline(cells.centres[on] @ across.T, CONNECTED * cells.side)
     if outline is None:
         return False
-    beside = _beside(outline, cells.centres[before] @ across.T)
-    under = float(cells.central[before][beside <= 1.1].sum())
+    apart = _outline_distance(outline, cells.centres[before] @ across.T)
+    under = float(cells.central[before][apart <= 1.1].sum())
     toward = -along(rays.directions, normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (along(rays.origins, normal) - offset) / toward
         meets = (toward > 0.05) & (distance > 0) & (distance <= FARTHEST * reach) & ((rays.ends - distance) * toward > -tolerance)
     at = np.flatnonzero(meets)
-    beside = _beside(outline, (rays.origins[at] + distance[at, None] * rays.directions[at]) @ across.T)
+    apart = _outline_distance(outline, (rays.origins[at] + distance[at, None] * rays.directions[at]) @ across.T)
     goes_on = (rays.ends[at] - distance[at]) * toward[at] > tolerance + 0.02 * distance[at]
-    within, past = beside <= 1, (beside > 1) & (beside <= OUTLINE_MARGIN)
+    within, past = apart <= 1, (apart > 1) & (apart <= OUTLINE_MARGIN)
     on_it = int((within & ~goes_on).sum())
     if under < MIN_UNDER * float(cells.central[before].sum()) or (within & goes_on).sum() > MAX_THROUGH * within.sum():
         return False
@@ -213,7 +213,7 @@ def _outline(places: np.ndarray, apart: float) -> Outline | None:
     return (middle, hull.equations[:, :2] / distance[:, None]) if (distance > 0).all() else None
 
 
-def _beside(outline: Outline, places: np.ndarray) -> np.ndarray:
+def _outline_distance(outline: Outline, places: np.ndarray) -> np.ndarray:
     """(N,) how far places (N, 2) are from the middle of an outline: 1 on it, 2 at twice its size."""
     middle, sides = outline
     return np.asarray(((places - middle) @ sides.T).max(axis=1)) if len(places) else np.zeros(0)

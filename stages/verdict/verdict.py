@@ -361,8 +361,8 @@ def _rows(capture: Capture, looks: Mapping[str, Look], counts: np.ndarray | None
             rows[photo.camera.name]["moving"] = moving[photo.camera.name]
     for name, reason in capture.rejected:
         near = sorted(((n, b if a == name else a) for a, b, n in capture.overlaps if name in (a, b)), reverse=True)
-        beside = [{"image": other, "matches": n} for n, other in near if other in registered or not registered][:NEAREST]
-        rows[name] = {"registered": False, "reason": reason, "nearest": beside}
+        nearest = [{"image": other, "matches": n} for n, other in near if other in registered or not registered][:NEAREST]
+        rows[name] = {"registered": False, "reason": reason, "nearest": nearest}
     for name, row in rows.items():
         if name in looks:
             each = looks[name]

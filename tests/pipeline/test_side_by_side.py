@@ -28,7 +28,7 @@ def beside(jobs: int = 2, cores: int = 4, need: Callable[[Any], int | None] = la
 
 def done(run: Any, jobs: int = 2, **how: Any) -> list[Outcome]:
     with beside(jobs) as together:
-        return run_stages(run, STAGES, beside=together, **how)
+        return run_stages(run, STAGES, side_by_side=together, **how)
 
 
 def test_they_run_at_the_same_time_and_the_artifacts_are_the_same(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_they_run_one_after_another_where_the_memory_is_too_little(tmp_path: Pat
     (tmp_path / "place").mkdir()
     run = make_run(tmp_path / "run", place=tmp_path / "place")
     with beside(2, need=lambda stage: need) as sides:
-        run_stages(run, STAGES, beside=sides, memory=Limit(100, "this machine"))
+        run_stages(run, STAGES, side_by_side=sides, memory=Limit(100, "this machine"))
     ours = {(tmp_path / "place" / name).read_text().split()[0] == str(os.getpid()) for name in MIDDLE}
     assert ours == {not together}
     assert {read_manifest(run.folder(name)).facts["memory"] for name in MIDDLE} == {50 if together else 100}
@@ -121,6 +121,6 @@ def test_they_run_at_the_same_time_only_where_the_stages_before_took_long(tmp_pa
     (tmp_path / "place").mkdir()
     run = make_run(tmp_path / "run", place=tmp_path / "place")
     with SideBySide(CHILD, 2, 2, lambda stage: 1, least) as sides:
-        run_stages(run, STAGES, beside=sides)
+        run_stages(run, STAGES, side_by_side=sides)
     ours = {(tmp_path / "place" / name).read_text().split()[0] == str(os.getpid()) for name in MIDDLE}
     assert ours == {least > 0}

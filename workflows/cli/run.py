@@ -122,9 +122,11 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
             for text in plan.warnings:
                 show(warning(text))
             with nullcontext(run) if dry_run else plan.written() as run, nullcontext() if dry_run else kept_in(run.path):
-                with precompiling(execute_alone, run.settings, device, plan.memory) as execute, _side_by_side(run, device, jobs) as beside:
-                    how: dict[str, Any] = {"device": device, "memory": plan.memory, "report": show, "dry_run": dry_run, "execute": execute, "beside": beside}
-                    outcomes = run_stages(run, workflow().stages, **how, **selection)
+                with precompiling(execute_alone, run.settings, device, plan.memory) as execute, _side_by_side(run, device, jobs) as side_by_side:
+                    outcomes = run_stages(
+                        run, workflow().stages, device=device, memory=plan.memory, report=show, dry_run=dry_run, execute=execute, side_by_side=side_by_side,
+                        **selection,
+                    )  # fmt: skip
                 if not dry_run and (any(outcome.action == "ran" for outcome in outcomes) or not has_pages(run, workflow().stages)):
                     write_pages(run, workflow().stages)
     except (Exception, KeyboardInterrupt) as error:

@@ -38,13 +38,13 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
 
     texel  side of a texel, about, in the mesh's units: faces of a chart nowhere lie over each other, as far as half of that resolves
     """
-    beside, vectors = face_neighbours(faces, len(vertices)), face_vectors(vertices, faces)
+    neighbours, vectors = face_neighbours(faces, len(vertices)), face_vectors(vertices, faces)
     areas = np.linalg.norm(vectors, axis=1)
     normals = np.divide(vectors, areas[:, None], out=np.zeros_like(vectors), where=areas[:, None] > 0)
-    smooth, order = _smoothed(normals, areas, beside)
+    smooth, order = _smoothed(normals, areas, neighbours)
     chart = np.full(len(faces), -1, np.int64)
-    count = grow(order, beside, normals, smooth, areas, MIN_COSINE, LIMIT, 0, chart)
-    chart = _joined(chart, beside, normals, areas)
+    count = grow(order, neighbours, normals, smooth, areas, MIN_COSINE, LIMIT, 0, chart)
+    chart = _joined(chart, neighbours, normals, areas)
     changed = np.arange(len(faces))  # faces of charts that are not those of the round before
     for round_ in range(ROUNDS):
         found = flattened(vertices, faces, chart)
@@ -57,21 +57,21 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
             chart[out] = chart.max(initial=-1) + 1 + np.arange(int(out.sum()))
         else:
             count = int(chart.max(initial=-1)) + 1
-            count = grow(order[out[order]], beside, normals, smooth, areas, MIN_COSINE, LIMIT, count, chart)
-        chart = _connected(chart, beside)
+            count = grow(order[out[order]], neighbours, normals, smooth, areas, MIN_COSINE, LIMIT, count, chart)
+        chart = _connected(chart, neighbours)
     return flattened(vertices, faces, chart)
 
 
-def _smoothed(normals: np.ndarray, areas: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _smoothed(normals: np.ndarray, areas: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals (F, 3) smoothed over neighbours, and the faces in order of how flat their surroundings are (F,), the flattest first."""
     vectors = normals * areas[:, None]
-    known = (beside >= 0)[..., None]
+    known = (neighbours >= 0)[..., None]
     for _ in range(SMOOTHING):
-        vectors = vectors + np.where(known, vectors[beside], 0.0).sum(1)
+        vectors = vectors + np.where(known, vectors[neighbours], 0.0).sum(1)
         vectors /= 4.0
     sizes = areas.copy()
     for _ in range(SMOOTHING):
-        sizes = (sizes + np.where(known[..., 0], sizes[beside], 0.0).sum(1)) / 4.0
+        sizes = (sizes + np.where(known[..., 0], sizes[neighbours], 0.0).sum(1)) / 4.0
     length = np.linalg.norm(vectors, axis=1)
     smooth = np.where(length[:, None] > 0, vectors / np.maximum(length, 1e-300)[:, None], normals)
     flatness = length / np.maximum(sizes, 1e-300)
@@ -123,15 +123,15 @@ def _misplaced(charts: Charts, looked_at: np.ndarray, normals: np.ndarray, vecto
     return out
 
 
-def _joined(chart: np.ndarray, beside: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> np.ndarray:
+def _joined(chart: np.ndarray, neighbours: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> np.ndarray:
     """Small charts as part of the neighbour that they have the most edges in common with, where all their normals fit its axis."""
     for _ in range(3):
         count = int(chart.max(initial=-1)) + 1
         sizes = np.bincount(chart, minlength=count)
         axes = np.stack([np.bincount(chart, normals[:, k] * areas, minlength=count) for k in range(3)], 1)
         axes = axes / np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-300)
-        face, side = np.nonzero((beside >= 0) & (sizes[chart] < SMALL)[:, None])
-        own, other = chart[face], chart[beside[face, side]]
+        face, side = np.nonzero((neighbours >= 0) & (sizes[chart] < SMALL)[:, None])
+        own, other = chart[face], chart[neighbours[face, side]]
         larger = (sizes[other] > sizes[own]) | ((sizes[other] == sizes[own]) & (other < own))
         own, other = own[larger], other[larger]
         if not len(own):
@@ -162,10 +162,10 @@ def _joined(chart: np.ndarray, beside: np.ndarray, normals: np.ndarray, areas: n
     return chart
 
 
-def _connected(chart: np.ndarray, beside: np.ndarray) -> np.ndarray:
+def _connected(chart: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Charts that fell apart as several."""
-    face, side = np.nonzero(beside >= 0)
-    other = beside[face, side]
+    face, side = np.nonzero(neighbours >= 0)
+    other = neighbours[face, side]
     same = chart[face] == chart[other]
     graph = csr_matrix((np.ones(int(same.sum()), np.int8), (face[same], other[same])), shape=(len(chart),) * 2)
     return connected_components(graph, directed=False)[1].astype(np.int64)

@@ -29,7 +29,7 @@ class Format:
     textures: bool = False  # whether it keeps textures, and takes `picture`
     coloured: bool = True  # whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
     extra: str | None = None  # of the package efficientnerf, that has to be installed for it
-    beside: bool = False  # whether a texture lies in files next to it: `companions` of its module
+    companion_files: bool = False  # whether a texture lies in files next to it: `companions` of its module
 
     def __call__(self, what: Any, path: Path, frame: Any, **options: Any) -> None:
         """Write it. `options`: picture, of formats that keep textures; version, of .spz. The module is imported now. Raises BadInput and UsageError."""
@@ -38,7 +38,7 @@ class Format:
 
     def companions(self, path: Path, picture: str = "png") -> list[Path]:
         """The files that it writes next to `path` where the mesh has a texture."""
-        found: list[Path] = import_module(f"{__name__}.{self.module}").companions(path, picture) if self.beside else []
+        found: list[Path] = import_module(f"{__name__}.{self.module}").companions(path, picture) if self.companion_files else []
         return found
 
     def refuse_without_package(self, path: Path) -> None:
@@ -55,11 +55,11 @@ _MESHES = (
     Format(".glb", "shape, normals, texture or colours of vertices; y up; unlit", "the capture's axes (kept as a matrix in its extras)",
            "Blender, trimesh; should: Unity, Unreal, Godot, three.js, Windows", "glb", "write_mesh", textures=True),
     Format(".obj", "shape, normals, texture (a .mtl and an image next to it) or colours of vertices; the capture's frame", "that it is unlit",
-           "Blender, trimesh; should: nearly everything", "obj", "write_mesh", textures=True, beside=True),
+           "Blender, trimesh; should: nearly everything", "obj", "write_mesh", textures=True, companion_files=True),
     Format(".usdz", "shape, normals, texture or colours of vertices, in one file; y up; unlit", "the capture's axes (kept as a matrix)",
            "Blender, OpenUSD; should: iOS and macOS, Houdini, Omniverse", "usd", "write_usdz", textures=True, extra="usd"),
     Format(".usdc", "the same, its image next to it", "the capture's axes (kept as a matrix)",
-           "OpenUSD; should: Blender, Houdini, Omniverse, Maya", "usd", "write_usdc", textures=True, extra="usd", beside=True),
+           "OpenUSD; should: Blender, Houdini, Omniverse, Maya", "usd", "write_usdc", textures=True, extra="usd", companion_files=True),
     Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices", "trimesh; should: slicers for 3D printing, CAD",
            "stl", "write_mesh", coloured=False),
 )  # fmt: skip

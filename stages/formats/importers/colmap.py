@@ -47,9 +47,9 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     files = _files(source, place)
     model = read_model(place, files)
     where = source.name_of(place) if place != source.root else source.root.name
-    beside = _image_folder(source, model)
+    images = _image_folder(source, model)
     frames = [
-        Frame(image.name, beside, f"{where}: {printable(image.name, MAX_NAME)}", _camera(model, image, where), own=number)
+        Frame(image.name, images, f"{where}: {printable(image.name, MAX_NAME)}", _camera(model, image, where), own=number)
         for number, image in sorted(model.images.items(), key=lambda item: item[1].name)
     ]
 

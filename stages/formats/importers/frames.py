@@ -24,8 +24,8 @@ _BESIDE_IMAGES = NOT_PHOTOGRAPHS | {"confidence"}  # folders with files of the n
 class Frame:
     """An image that a file lists."""
 
-    name: str  # as listed, relative to the folder `beside`
-    beside: Path
+    name: str  # as listed, relative to `folder`
+    folder: Path
     where: str  # what messages call it
     # (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
     camera: Callable[[str, tuple[int, int]], Camera]
@@ -121,7 +121,7 @@ def _best_folder(source: Source, names: Sequence[str], parts: tuple[str, ...], t
 def located(source: Source, frames: Sequence[Frame]) -> Listing:
     """The frames with their images, in the order of the frames. Raises BadInput for an image outside of the source."""
     listing = Listing()
-    results = [source.find(frame.name, frame.beside) for frame in frames]
+    results = [source.find(frame.name, frame.folder) for frame in frames]
     taken = {result.path for result in results if result.path is not None}
     present = [frame.name for frame, result in zip(frames, results, strict=True) if result.path is not None]
     missing = [frame.name for frame, result in zip(frames, results, strict=True) if result.path is None]

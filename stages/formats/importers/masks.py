@@ -61,5 +61,5 @@ def _files_inside(folder: Path) -> dict[str, Path]:
 
 def _files_beside(folder: Path) -> dict[str, Path]:
     """The masks in a folder of photographs by the key of their name without what follows the ending."""
-    beside = {name_key(path.stem): path for path in reversed(pictures_in(folder)) if name_key(path.stem).endswith(MASK_ENDINGS)}
-    return beside | {name_key(path.name): path for path in files_in(folder, _SUFFIX)}
+    named = {name_key(path.stem): path for path in reversed(pictures_in(folder)) if name_key(path.stem).endswith(MASK_ENDINGS)}
+    return named | {name_key(path.name): path for path in files_in(folder, _SUFFIX)}

@@ -164,21 +164,21 @@ class Source:
         names = [f"{path.relative_to(self.root)} -> {os.path.realpath(path)}" for path in sorted(self.links)]
         return f"linked folders, which are not followed ({abbreviated(names)}): name the target itself, or pass --allow-outside"
 
-    def find(self, name: str, beside: Path | None = None, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Found:
+    def find(self, name: str, folder: Path | None = None, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Found:
         """The file that a list names.
 
-        name      as listed: relative to `beside` (default: the source folder) or absolute, of any system
+        name      as listed: relative to `folder` (default: the source folder) or absolute, of any system
         suffixes  the extensions tried where the listed one is not there
         Raises BadInput where the name leads out of the source folder.
         """
-        beside = beside or self.root
+        folder = folder or self.root
         if not name.strip() or len(name) > MAX_PATH or not _is_encodable(name):
             return Found(None)
-        windows = ("\\" in name or PureWindowsPath(name).drive) and not os.path.isfile(beside / name)
+        windows = ("\\" in name or PureWindowsPath(name).drive) and not os.path.isfile(folder / name)
         foreign = PureWindowsPath(name) if windows else PurePosixPath(name)
         absolute = bool(foreign.root or foreign.drive)
         parts = [part for part in foreign.parts[1 if foreign.anchor else 0 :] if part != "."]
-        here = Path(name) if absolute and isinstance(foreign, PurePosixPath) else None if absolute else Path(os.path.normpath(beside.joinpath(*parts)))
+        here = Path(name) if absolute and isinstance(foreign, PurePosixPath) else None if absolute else Path(os.path.normpath(folder.joinpath(*parts)))
         inside = here is not None and here.is_relative_to(self.root)
         if here is not None and (inside or self.allow_outside or not absolute):
             if not inside and not self.allow_outside:

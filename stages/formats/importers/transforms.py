@@ -160,11 +160,11 @@ def _masks(source: Source, found: Sequence[tuple[Frame, Path]]) -> Masks:
     for frame, image in found:
         listed = frame.own[1].get("mask_path")
         if isinstance(listed, str) and listed:
-            if (mask := source.find(listed, frame.beside).path) is not None:
+            if (mask := source.find(listed, frame.folder).path) is not None:
                 masks[image] = mask, "black"
             continue
-        beside = (image.with_name(f"dynamic_mask_{name}.png") for name in (image.stem, image.name))
-        dynamic = next((source.check_inside(path) for path in beside if os.path.isfile(path)), None)
+        named = (image.with_name(f"dynamic_mask_{name}.png") for name in (image.stem, image.name))
+        dynamic = next((source.check_inside(path) for path in named if os.path.isfile(path)), None)
         if dynamic is not None:
             masks[image] = dynamic, "white"
         else:
@@ -181,7 +181,7 @@ def _depth(source: Source, frame: Frame, image: Path) -> DepthFile | None:
         listed, unit = entry["depth_path"], finite(document.get("integer_depth_scale")) or 0.0
     else:
         return None
-    path = source.find(listed, frame.beside, (".png",)).path if unit > 0 else None
+    path = source.find(listed, frame.folder, (".png",)).path if unit > 0 else None
     return None if path is None or path == image or path.suffix.lower() != ".png" else depth_file(source, path, unit)
 
 

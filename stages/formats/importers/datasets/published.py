@@ -252,8 +252,8 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
             listed.append(Frame(f"rect_{_mvsnet_number(path) + 1:03d}_{DTU_LIGHT}_r5000.png", scans[0], where, camera))
             continue
         folders = [source.root / name for name in ("images", "blended_images", "image", "rgb", ".")]
-        beside = next((folder for folder in folders if source.find(stem, folder).how == "listed"), source.root)
-        listed.append(Frame(stem, beside, where, camera, bare=True))
+        images = next((folder for folder in folders if source.find(stem, folder).how == "listed"), source.root)
+        listed.append(Frame(stem, images, where, camera, bare=True))
     return Listed(source.name_of(place), listed, signs, facts={"cameras": source.name_of(place)})
 
 
@@ -307,7 +307,7 @@ def _nsvf(source: Source, signs: Sequence[Path]) -> Listed:
     intrinsics, *poses = signs
     frames.check_count(len(poses), "pose")
     k, stated = intrinsics_of(source.real(intrinsics))
-    beside = _folder(source.root, ("rgb", "images", "image", "color"))
+    images = _folder(source.root, ("rgb", "images", "image", "color"))
     splits = {"0_": "train", "1_": "val" if any(path.name.startswith("2_") for path in poses) else "test", "2_": "test"}
     split = splits if all(path.name[:2] in splits for path in poses) else {}
     listed = []
@@ -315,7 +315,7 @@ def _nsvf(source: Source, signs: Sequence[Path]) -> Listed:
         where = source.name_of(path)
         pose = lenses.rigid(numbers(read_text(source.real(path), MAX_CAMERA_BYTES).split(), 16, where).reshape(4, 4), where)
         camera = pinhole_frame(k, pose, intrinsics.name, stated)
-        listed.append(Frame(path.stem, beside, where, camera, bare=True, split=split.get(path.name[:2])))
+        listed.append(Frame(path.stem, images, where, camera, bare=True, split=split.get(path.name[:2])))
     box = source.root / "bbox.txt"
     if not box.is_file():
         return Listed("pose", listed, signs)

@@ -68,7 +68,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
 def _frames(source: Source, file: Path, reconstruction: dict[str, Any]) -> list[frames.Frame]:
     where = source.name_of(file)
     frames.check_count(len(reconstruction["shots"]), where)
-    beside = source.root / "images" if (source.root / "images").is_dir() else source.root
+    folder = source.root / "images" if (source.root / "images").is_dir() else source.root
     listed = []
     for name, shot in sorted(reconstruction["shots"].items()):
         place = f"{where}: shot {printable(name, frames.MAX_NAME)}"
@@ -79,7 +79,7 @@ def _frames(source: Source, file: Path, reconstruction: dict[str, Any]) -> list[
         lens = reconstruction["cameras"].get(shot.get("camera")) if isinstance(shot.get("camera"), str) else None
         if not isinstance(lens, dict):
             raise BadInput(f"{place}: camera {shown(shot.get('camera'))} is not among the cameras. {_REMEDY}")
-        listed.append(frames.Frame(name, beside, place, _camera(lens, pose, place), bare=True))
+        listed.append(frames.Frame(name, folder, place, _camera(lens, pose, place), bare=True))
     return listed
 
 
