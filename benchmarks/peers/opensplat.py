@@ -1,0 +1,169 @@
+"""OpenSplat on the cameras and photographs of a run, and our own Gaussians in the same minutes: PSNR of the same held-out views by the same renderer.
+
+    python -m benchmarks.peers.opensplat --binary opensplat --work FOLDER --minutes 5,10 [--variants default,short] [--out FILE] RUN=SOURCE [RUN=SOURCE ...]
+
+RUN is a run whose poses are made, SOURCE the photographs that it was made from. OpenSplat is built outside of this repository (docs/experiments/peers.md). It
+reads the training photographs at working size, their cameras and the sparse points, all in the training frame, and is ended when its minutes have passed; the
+last Gaussians that it wrote count. Ours is `enerf run --budget`, which covers field, asset and Gaussians. Both begin once cameras are known, one after the
+other. Variants: `default`, OpenSplat's own options for 30,000 steps; `short`, its schedules made as short as the steps that fit, by a trial of half a minute.
+"""
+
+import argparse
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.minutes import code_version
+from benchmarks.stage_runs import read_json
+from efficientnerf.evaluation.metrics import psnr, ssim
+from efficientnerf.geometry.cameras import opengl_from_pose
+from efficientnerf.splats.gaussians import Gaussians
+from efficientnerf.splats.rendering import render
+from pipeline.files import write_json
+from stages.artifacts import EvaluateOutputs
+from stages.formats.exporters.splats.ply import read_splats
+from stages.io import scene
+
+TRIAL = 30.0  # seconds, of a trial that tells how fast steps are
+SAVES = 20  # of a training: what it has learned since the last is lost when it is ended
+BEHIND = (0.6130, 0.0101, 0.3984)  # OpenSplat's colour behind all Gaussians
+
+
+def _unchanged(steps: int) -> list[str]:
+    return ["-n", "30000"]
+
+
+def _short(steps: int) -> list[str]:
+    """Half resolution for a third of the steps, densified thirty times from a tenth of them on, a degree of harmonics each fifth, opacities never reset."""
+    return [
+        "-n", str(steps), "--num-downscales", "1", "--resolution-schedule", str(steps // 3), "--warmup-length", str(steps // 10),
+        "--refine-every", str(max(1, steps // 30)), "--sh-degree-interval", str(max(1, steps // 5)), "--reset-alpha-every", "100",
+    ]  # fmt: skip
+
+
+VARIANTS: dict[str, Callable[[int], list[str]]] = {"default": _unchanged, "short": _short}
+
+
+def write_project(poses: Path, folder: Path) -> None:
+    """The training views of a scene as nerfstudio has them: transforms.json, images, and the sparse points as PLY."""
+    found, frames = scene.load(poses), []
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for number, view in enumerate(scene.views_of(found, "train")):
+        lens, path = view.camera.intrinsics, f"images/{number:04d}.png"
+        cv2.imwrite(str(folder / path), cv2.cvtColor(scene.read_image(poses, view)[..., :3], cv2.COLOR_RGB2BGR))
+        frames.append({
+            "file_path": path, "w": view.camera.width, "h": view.camera.height, "fl_x": lens["fx"], "fl_y": lens["fy"], "cx": lens["cx"], "cy": lens["cy"],
+            **{key: lens.get(key, 0.0) for key in ("k1", "k2", "k3", "p1", "p2")}, "transform_matrix": opengl_from_pose(view.camera.world_from_camera).tolist(),
+        })  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames}), encoding="utf-8")
+    points = scene.read_points(poses)
+    rows = np.empty(len(points.xyz), [*((name, "<f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))])
+    for names, values in (("xyz", points.xyz), (("red", "green", "blue"), points.rgb)):
+        for n, name in enumerate(names):
+            rows[name] = values[:, n]
+    properties = "".join(f"property {'float' if name in 'xyz' else 'uchar'} {name}\n" for name in rows.dtype.names or ())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    (folder / "points.ply").write_bytes(header.encode() + rows.tobytes())
+
+
+def trained(binary: Path, project: Path, out: Path, seconds: float, options: list[str], save_every: int) -> int:
+    """Let OpenSplat train for so long; the last step that it reached. Its Gaussians are out/splat*.ply."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    command = [str(binary), str(project), "-o", str(out / "splat.ply"), "--keep-crs", "--cpu", "-s", str(save_every), *options]
+    with open(out / "log.txt", "w", encoding="utf-8") as log:
+        child = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        try:
+            child.wait(seconds)
+        except subprocess.TimeoutExpired:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+    steps = [line for line in (out / "log.txt").read_text(encoding="utf-8").splitlines() if line.startswith("Step ")]
+    if not steps:
+        raise SystemExit(f"opensplat took no step; see {out / 'log.txt'}")
+    return int(steps[-1].split()[1].rstrip(":"))
+
+
+def gaussians_of(out: Path) -> Gaussians:
+    """The last Gaussians that OpenSplat wrote whole: by their step, the end's before all. Its quaternions have any length; ours are unit quaternions."""
+    for path in sorted(out.glob("splat*.ply"), key=lambda path: int(path.stem.partition("_")[2] or 2**31), reverse=True):
+        header, _, body = path.read_bytes().partition(b"end_header\n")
+        columns = header.count(b"property float ")
+        count = int(header.partition(b"element vertex ")[2].split()[0])
+        if len(body) == 4 * columns * count:
+            rows = np.frombuffer(body, "<f4").reshape(count, columns).copy()
+            rows[:, -4:] /= np.linalg.norm(rows[:, -4:], axis=1, keepdims=True)
+            unit = out / "unit.ply"
+            unit.write_bytes(header + b"end_header\n" + rows.tobytes())
+            return read_splats(unit)
+    raise SystemExit(f"{out}: no Gaussians were written")
+
+
+def quality(poses: Path, gaussians: Gaussians) -> dict[str, float]:
+    """Mean PSNR and SSIM over the test views, by our renderer, of 8-bit images."""
+    pairs = [
+        (np.clip(render(gaussians, view.camera, BEHIND).colour, 0, 1), scene.read_image(poses, view)[..., :3].astype(np.float32) / 255)
+        for view in scene.views_of(scene.load(poses), "test")
+    ]
+    return {
+        "psnr": math.fsum(psnr(*pair) for pair in pairs) / len(pairs), "ssim": math.fsum(ssim(*pair) for pair in pairs) / len(pairs), "views": len(pairs),
+        "gaussians": len(gaussians),
+    }  # fmt: skip
+
+
+def ours(run: Path, source: Path, out: Path, minutes: float) -> dict[str, Any]:
+    """Field, asset and Gaussians of a copy of the run's poses, in so many minutes."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    shutil.copytree(run / "poses", out / "poses")
+    shutil.copyfile(run / "run.json", out / "run.json")
+    with open(out / "log.txt", "w", encoding="utf-8") as log:
+        command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(out), "--budget", f"{minutes:g}m"]
+        subprocess.run([*command, "--set", "turntable.frames=8"], stdout=log, stderr=subprocess.STDOUT, check=True)
+    report = read_json(EvaluateOutputs.of_run(out).metrics)
+    return {"asset": report["asset"]["psnr"], "psnr": report["splats"]["psnr"], "ssim": report["splats"]["ssim"], "views": len(report["views"])}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", metavar="RUN=SOURCE")
+    parser.add_argument("--binary", type=Path, required=True)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--minutes", default="5")
+    parser.add_argument("--variants", default="default,short")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "results" / "opensplat.json")
+    given = parser.parse_args()
+    rows = read_json(given.out)["rows"] if given.out.exists() else []
+    for word in given.runs:
+        run, source = (Path(part).resolve() for part in word.split("=", 1))
+        project, folder = given.work / run.name / "project", given.work / run.name
+        write_project(run / "poses", project)
+        for minutes in (float(word) for word in given.minutes.split(",")):
+            speed = trained(given.binary, project, folder / "trial", TRIAL, ["-n", "30000", "--num-downscales", "0"], 10**6) / TRIAL
+            steps = max(30, int(speed * 60 * minutes))
+            for variant in given.variants.split(","):
+                out, began, load = folder / f"{variant}-{minutes:g}", time.perf_counter(), os.getloadavg()[0]
+                reached = trained(given.binary, project, out, 60 * minutes, VARIANTS[variant](steps), max(10, steps // SAVES))
+                row = {"method": f"OpenSplat ({variant})", "set": run.name, "minutes": minutes, "steps": reached, "load": load}
+                rows.append(row | {"seconds": time.perf_counter() - began} | quality(run / "poses", gaussians_of(out)))
+                print(rows[-1], flush=True)
+            load = os.getloadavg()[0]
+            row = {"method": "efficientnerf", "set": run.name, "minutes": minutes, "load": load, "code": code_version()}
+            rows.append(row | ours(run, source, folder / f"ours-{minutes:g}", minutes))
+            print(rows[-1], flush=True)
+            write_json(given.out, {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()
