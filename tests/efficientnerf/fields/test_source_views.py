@@ -278,11 +278,15 @@ def test_source_views_for_a_target_leave_it_out_and_name_the_nearest_of_each_gro
         assert references[0] == 0
 
 
-def test_training_over_scenes_reaches_every_parameter(network: SourceViewNetwork) -> None:
+def test_training_over_scenes_reaches_every_parameter_and_gives_the_same_weights_again(network: SourceViewNetwork) -> None:
     images = np.stack([picture(camera) for camera in CAMERAS])
     scene = PosedImages(BoundedSpace(np.array([[-1.0] * 3, [1.0] * 3])), CAMERAS, images)
     before = {name: p.detach().clone() for name, p in network.named_parameters()}
-    assert np.isfinite(list(pretrain(network, [scene], 2))).all()
+    torch.manual_seed(0)
+    again = type(network)()
+    for each in (network, again):
+        assert np.isfinite(list(pretrain(each, [scene], 2))).all()
+    assert all(torch.equal(p, q) for p, q in zip(network.parameters(), again.parameters(), strict=True))
     assert {name for name, p in network.named_parameters() if (p == before[name]).all()} == set()
 
 
