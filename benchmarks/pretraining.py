@@ -2,8 +2,10 @@
 
     python -m benchmarks.scenes SCENES --drawn 150 --size 128 --train 40 --val 0 --test 0
     python -m benchmarks.pretraining train SCENES ibrnet workflows/paper/weights/ibrnet.safetensors --steps 4000
+    python -m benchmarks.pretraining train SCENES mvsnerf workflows/paper/weights/mvsnerf.safetensors --steps 5000
     python -m benchmarks.pretraining measure SCENES ibrnet workflows/paper/weights/ibrnet.safetensors
 
+These made the weights of this package, with one thread.
 The last HELD_OUT scenes are those to measure on. `measure` renders views of them from the others without finetuning, and compares with a picture that is
 blended from the nearest views by warping without depth.
 """
@@ -99,7 +101,7 @@ def main() -> None:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("method", choices=list(NETWORKS))
     parser.add_argument("weights", type=Path)
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--views", type=int, default=2, help="views of each scene to measure on")
     given = parser.parse_args()
