@@ -29,8 +29,8 @@ class SplatsSettings:
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
     iterations: Count | Auto = setting(
         "auto",
-        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: eight passes over all pixels, 600 to 1800 steps; with"
-        " time_budget sixteen, up to 8000 steps, if they fit.",
+        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: sixteen passes over all pixels, 600 to 3600"
+        " steps; with time_budget up to 8000, if they fit.",
         advanced=True,
     )
     time_budget: Seconds | Off = setting(
@@ -48,4 +48,4 @@ class SplatsSettings:
     seed: Seed = setting(0, "Seed of the order of the images.", advanced=True)
 
 
-STAGE = Stage(name="splats", version=9, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))
+STAGE = Stage(name="splats", version=10, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))
