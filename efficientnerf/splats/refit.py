@@ -20,7 +20,9 @@ from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import LANES, LOG_SCALES, gaussians_from, grouped, lens_of, ungrouped, values_of
 
 # docs/experiments/splats.md
-MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.001  # learning rates of `fitting.Rates`
+MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
+# Of photographs that of the harmonics is lower the fewer there are, as that of the asset is: view dependence is overfitted. Share for each, least and most.
+HARMONICS_PER_VIEW, LEAST_HARMONICS, MOST_HARMONICS = 1 / 320, 0.25, 0.75
 PIXELS = 2**18  # of a step
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
@@ -73,6 +75,7 @@ def refitted(
     used = began = 0.0 if time_used is None else time_used()
     times, relocated = _divisions(steps)
     order: list[int] = []
+    harmonics = harmonics_rate(views)
     for number in range(steps):
         if time_used is not None:
             used = time_used()
@@ -98,7 +101,7 @@ def refitted(
         lost = np.zeros(len(pairs.begin) - 1)
         for tiles in pieces(len(lost)):
             raster.fit_tiles(tiles, records, pairs, picture, sums, lost)
-        fitting.step(values, moments, lens, degree, pairs.first, sums, _rates(max(number / max(steps - 1, 1), used)), errors)
+        fitting.step(values, moments, lens, degree, pairs.first, sums, _rates(max(number / max(steps - 1, 1), used), harmonics), errors)
         if reached is not None:
             reached(number + 1, float(lost.sum()) / max(3 * int(picture.mask.sum()), 1))
     fitted = gaussians_from(values, count)
@@ -157,10 +160,17 @@ def _picture(view: View, background: tuple[float, float, float] | None) -> Pictu
     return Picture(np.ascontiguousarray(pixels), mask, over_all, np.asarray(background or (0, 0, 0), np.float32))
 
 
-def _rates(done: float) -> Rates:
+def harmonics_rate(views: Sequence[View]) -> float:
+    """The learning rate of the view-dependent harmonics at the first step. Pictures with alpha are of an object whose cameras all see it."""
+    if any(view.pixels.shape[2] == 4 for view in views):
+        return HARMONICS
+    return HARMONICS * min(max(HARMONICS_PER_VIEW * len(views), LEAST_HARMONICS), MOST_HARMONICS)
+
+
+def _rates(done: float, harmonics: float) -> Rates:
     """The rates when so much, 0 to 1, of the steps is done."""
     fall = LAST_RATE**done
-    rates = np.asarray([MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS], np.float32) * np.float32(fall)
+    rates = np.asarray([MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, harmonics], np.float32) * np.float32(fall)
     return Rates(
         rates, np.float32(MOMENTUM), np.float32(DECAY), np.float32(EPSILON), _corrections(MOMENTUM), _corrections(DECAY), *map(np.float32, LOG_SCALES)
     )  # fmt: skip

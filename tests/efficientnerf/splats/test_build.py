@@ -201,6 +201,13 @@ def test_the_refit_ends_with_its_time_and_learning_rates_and_divisions_follow_it
     assert ample.means.tobytes() == refitted(begun, views, 40, most=150).means.tobytes()
     assert len(short) > len(begun) >= len(none), "they are divided although a quarter of 40 steps is all that was taken"
 
+@pytest.mark.parametrize(("channels", "count", "rate"), [(3, 5, 0.001), (3, 80, 0.001), (3, 160, 0.002), (3, 1000, 0.003), (4, 5, 0.004)])
+def test_few_photographs_move_view_dependence_less_than_many_and_than_pictures_with_alpha(channels: int, count: int, rate: float) -> None:
+    camera = Camera("view", 4, 3, "SIMPLE_PINHOLE", (4.0, 2.0, 1.5), np.eye(4))
+    views = [refit.View(camera, np.zeros((3, 4, channels), np.uint8))] * count
+    assert refit.harmonics_rate(views) == pytest.approx(rate)
+
+
 
 def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkeypatch: pytest.MonkeyPatch) -> None:
     view = photographs(ball(16, 0), ring(1, 50))[0]
