@@ -146,7 +146,7 @@ def main() -> None:
     given = parser.parse_args()
     rows = read_json(given.out)["rows"] if given.out.exists() else []
     for word in given.runs:
-        run, source = (Path(part).resolve() for part in word.split("=", 1))
+        run, source = (Path(part).absolute() for part in word.split("=", 1))
         project, folder = given.work / run.name / "project", given.work / run.name
         write_project(run / "poses", project)
         for minutes in (float(word) for word in given.minutes.split(",")):
