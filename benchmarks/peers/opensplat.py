@@ -24,13 +24,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.minutes import code_version
+from benchmarks.minutes import code_version, read_rows, write_rows
 from benchmarks.stage_runs import read_json
 from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import opengl_from_pose
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.rendering import render
-from pipeline.files import write_json
 from stages.artifacts import EvaluateOutputs
 from stages.formats.exporters.splats.ply import read_splats
 from stages.io import scene
@@ -144,7 +143,7 @@ def main() -> None:
     parser.add_argument("--variants", default="default,short")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "results" / "opensplat.json")
     given = parser.parse_args()
-    rows = read_json(given.out)["rows"] if given.out.exists() else []
+    rows = read_rows(given.out)
     for word in given.runs:
         run, source = (Path(part).absolute() for part in word.split("=", 1))
         project, folder = given.work / run.name / "project", given.work / run.name
@@ -162,7 +161,7 @@ def main() -> None:
             row = {"method": "efficientnerf", "set": run.name, "minutes": minutes, "load": load, "code": code_version()}
             rows.append(row | ours(run, source, folder / f"ours-{minutes:g}", minutes))
             print(rows[-1], flush=True)
-            write_json(given.out, {"rows": rows})
+            write_rows(given.out, rows)
 
 
 if __name__ == "__main__":
