@@ -9,7 +9,6 @@ other. Variants: `default`, OpenSplat's own options for 30,000 steps; `short`, i
 """
 
 import argparse
-import json
 import math
 import os
 import shutil
@@ -18,21 +17,25 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from benchmarks.minutes import code_version, read_rows, write_rows
+from benchmarks.minutes import OURS, RESULTS, code_version, read_rows, with_row, write_rows
 from benchmarks.stage_runs import read_json
 from efficientnerf.evaluation.metrics import psnr, ssim
-from efficientnerf.geometry.cameras import opengl_from_pose
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.rendering import render
+from efficientnerf.surface.mesh import PointCloud
+from pipeline.files import write_json
 from stages.artifacts import EvaluateOutputs
+from stages.formats.exporters.cameras import transforms_from_scene
+from stages.formats.exporters.ply import write_points
 from stages.formats.exporters.splats.ply import read_splats
 from stages.io import scene
+from stages.io.png import write_png
 
 TRIAL = 30.0  # seconds, of a trial that tells how fast steps are
 SAVES = 20  # of a training: what it has learned since the last is lost when it is ended
@@ -55,25 +58,17 @@ VARIANTS: dict[str, Callable[[int], list[str]]] = {"default": _unchanged, "short
 
 
 def write_project(poses: Path, folder: Path) -> None:
-    """The training views of a scene as nerfstudio has them: transforms.json, images, and the sparse points as PLY."""
-    found, frames = scene.load(poses), []
+    """The training views of a scene at working size as nerfstudio has them: transforms.json, images, and the sparse points as PLY."""
+    found, views = scene.load(poses), []
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for number, view in enumerate(scene.views_of(found, "train")):
-        lens, path = view.camera.intrinsics, f"images/{number:04d}.png"
-        cv2.imwrite(str(folder / path), cv2.cvtColor(scene.read_image(poses, view)[..., :3], cv2.COLOR_RGB2BGR))
-        frames.append({
-            "file_path": path, "w": view.camera.width, "h": view.camera.height, "fl_x": lens["fx"], "fl_y": lens["fy"], "cx": lens["cx"], "cy": lens["cy"],
-            **{key: lens.get(key, 0.0) for key in ("k1", "k2", "k3", "p1", "p2")}, "transform_matrix": opengl_from_pose(view.camera.world_from_camera).tolist(),
-        })  # fmt: skip
-    (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames}), encoding="utf-8")
+        camera = replace(view.camera, name=f"images/{number:04d}.png")
+        views.append(replace(view, camera=camera, source_camera=camera))
+        write_png(scene.read_image(poses, view)[..., :3], folder / camera.name)
+    document = {"camera_model": "OPENCV", "ply_file_path": "points.ply"} | transforms_from_scene(replace(found, views=tuple(views)))
+    write_json(folder / "transforms.json", document)
     points = scene.read_points(poses)
-    rows = np.empty(len(points.xyz), [*((name, "<f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))])
-    for names, values in (("xyz", points.xyz), (("red", "green", "blue"), points.rgb)):
-        for n, name in enumerate(names):
-            rows[name] = values[:, n]
-    properties = "".join(f"property {'float' if name in 'xyz' else 'uchar'} {name}\n" for name in rows.dtype.names or ())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    (folder / "points.ply").write_bytes(header.encode() + rows.tobytes())
+    write_points(PointCloud(points.xyz, np.tile([0.0, 0.0, 1.0], (len(points.xyz), 1)), points.rgb.astype(np.float32) / 255), folder / "points.ply")
 
 
 def trained(binary: Path, project: Path, out: Path, seconds: float, options: list[str], save_every: int) -> int:
@@ -141,7 +136,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--minutes", default="5")
     parser.add_argument("--variants", default="default,short")
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "results" / "opensplat.json")
+    parser.add_argument("--out", type=Path, default=RESULTS / "opensplat.json")
     given = parser.parse_args()
     rows = read_rows(given.out)
     for word in given.runs:
@@ -154,13 +149,12 @@ def main() -> None:
             for variant in given.variants.split(","):
                 out, began, load = folder / f"{variant}-{minutes:g}", time.perf_counter(), os.getloadavg()[0]
                 reached = trained(given.binary, project, out, 60 * minutes, VARIANTS[variant](steps), max(10, steps // SAVES))
-                row = {"method": f"OpenSplat ({variant})", "set": run.name, "minutes": minutes, "steps": reached, "load": load}
-                rows.append(row | {"seconds": time.perf_counter() - began} | quality(run / "poses", gaussians_of(out)))
-                print(rows[-1], flush=True)
+                row = {"method": "OpenSplat", "set": run.name, "minutes": minutes, "options": variant, "steps": reached, "load": load}
+                rows = with_row(rows, row | {"seconds": time.perf_counter() - began} | quality(run / "poses", gaussians_of(out)))
             load = os.getloadavg()[0]
-            row = {"method": "efficientnerf", "set": run.name, "minutes": minutes, "load": load, "code": code_version()}
-            rows.append(row | ours(run, source, folder / f"ours-{minutes:g}", minutes))
-            print(rows[-1], flush=True)
+            row = {"method": OURS, "set": run.name, "minutes": minutes, "options": "", "load": load, "code": code_version()}
+            rows = with_row(rows, row | ours(run, source, folder / f"ours-{minutes:g}", minutes))
+            print(*(row for row in rows if (row["set"], row["minutes"]) == (run.name, minutes)), sep="\n", flush=True)
             write_rows(given.out, rows)
 
 
