@@ -199,8 +199,9 @@ def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras
             sentence = f"The asset shows hardly more than one colour: {figures['psnr']:.1f} dB on {figures['views']}, a picture of the mean colour has"
             sentence += f" {figures['mean_colour']:.1f} dB."
         else:
-            sentence = f"The asset's renders are {'strongly ' if grade == 'poor' else ''}blurred: {figures['psnr']:.1f} dB on {figures['views']},"
-            sentence += f" {blur_in_words(blur)}, where captures that went well have {100 * USABLE_BLUR:.2f} % at most."
+            sentence = f"The asset's renders differ {'strongly ' if grade == 'poor' else ''}from the photographs: {figures['psnr']:.1f} dB on"
+            sentence += f" {figures['views']}, as much as a blur of {100 * blur:.2f} % of their longest side would; captures that went well have"
+            sentence += f" {100 * USABLE_BLUR:.2f} % at most."
         found.append(ResultProblem("pictures", grade, sentence, *_cause(metrics, figures, cameras, strip)))
     off = figures["psnr_colour_fitted"] - figures["psnr"]
     if grade in ("good", "usable") and off > COLOURS_OFF:
@@ -281,7 +282,7 @@ def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
 
 
 def _mostly_holes(metrics: Mapping[str, Any]) -> bool:
-    """Whether more than half of the asset's squared error is in its holes: then its pictures are not blurred."""
+    """Whether more than half of the asset's squared error is in its holes: then these come before its pictures."""
     errors = [10 ** (-view["asset"]["psnr"] / 10) for view in metrics["views"] if view["asset"]["psnr"] is not None]
     excess = metrics["holes_excess_error"]
     return bool(errors) and excess is not None and excess > 0.5 * math.fsum(errors) / len(errors)
@@ -320,7 +321,7 @@ def _of_sparse_points(metrics: Mapping[str, Any]) -> list[ResultProblem]:
 
 
 def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[ResultProblem]:
-    """Of the mesh where the asset is not strongly blurred itself; and whether there is one."""
+    """Of the mesh where the asset's pictures are not poor themselves; and whether there is one."""
     picture = f"{MeshOutputs.stage}/{MeshOutputs.check}"
     if metrics["mesh"]["faces"] == 0:
         remedy = "Train longer, or set mesh.density_threshold by hand."
@@ -350,7 +351,7 @@ def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[R
 
 
 def _only_of_this(blur: float | None, figures: Mapping[str, Any]) -> bool:
-    """Whether pictures are strongly blurred, and the asset's are not: else that is reported."""
+    """Whether pictures are poor, and the asset's are not: else that is reported."""
     return blur is not None and blur > POOR_BLUR and figures["blur"] is not None and figures["blur"] <= POOR_BLUR
 
 

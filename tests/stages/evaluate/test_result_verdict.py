@@ -132,7 +132,7 @@ def test_holes_that_nobody_sees_are_not_reported(off: float, reported: bool) -> 
 
 
 @pytest.mark.parametrize(("share", "first"), [(0.4, "pictures"), (0.6, "holes")])
-def test_pictures_whose_error_is_in_holes_are_not_called_blurred(share: float, first: str) -> None:
+def test_holes_come_first_where_they_hold_most_of_the_error(share: float, first: str) -> None:
     mean_colour, blurred, *_ = CAPTURES["still life"]
     found = a_result(24.5, mean_colour=mean_colour, blurred=blurred)
     error = np.mean([10 ** (-view["asset"]["psnr"] / 10) for view in found["views"]])
