@@ -5,8 +5,9 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NoReturn
 
 from pipeline import artifact, files, manifest
@@ -116,11 +117,11 @@ class _Runner:
                 _warn_of_stale_needs(self.run, self.stages, only, self._report, self.hashes)
             waiting = list(chosen)
             while waiting:
-                ready = [stage for stage in waiting if not {each.name for each in waiting} & set(stage.needs)]
+                ready = _ready(waiting)
                 current = ready[0].name
                 self.safe_point()
                 together = self._are_admitted(ready, forced, sum(outcome.seconds for outcome in outcomes))
-                outcomes += self._together(ready, forced) if together else [self.one(ready[0], current in forced, self.execute, self.memory)]
+                outcomes += self._together(waiting, forced) if together else [self.one(ready[0], current in forced, self.execute, self.memory)]
                 waiting = [stage for stage in waiting if stage.name not in {outcome.stage for outcome in outcomes}]
         except (Interrupted, KeyboardInterrupt) as error:
             raise self._interrupted(error, current, go_on(current)) from error
@@ -136,33 +137,48 @@ class _Runner:
         if self.side_by_side is None or self.side_by_side.jobs < 2 or len(ready) < 2 or seconds < self.side_by_side.least:
             return False
         stale = [stage for stage in ready if stage.name in forced or not decide(stage, self.run, self.hashes).fresh]
-        if len(stale) < 2 or self.memory is None:
-            return len(stale) > 1
-        needs = [self.side_by_side.need(stage) for stage in stale]
-        return all(need is not None and need <= self.memory.bytes // self.side_by_side.jobs for need in needs)
+        return len(stale) > 1 and self._have_memory(stale)
 
-    def _together(self, ready: Sequence[Stage], forced: Collection[str]) -> list[Outcome]:
-        """`one` for each of these, at the same time. The first error is raised once all have ended; no other stage begins after it."""
+    def _have_memory(self, stages: Sequence[Stage]) -> bool:
+        """Whether each has enough in the share of the memory that a stage has which runs next to others."""
         assert self.side_by_side is not None
-        memory = None if self.memory is None else Limit(self.memory.bytes // self.side_by_side.jobs, self.memory.whose)
-        with ThreadPoolExecutor(self.side_by_side.jobs, thread_name_prefix="stage") as pool:
-            futures = [pool.submit(self.one, stage, stage.name in forced, self.side_by_side.execute, memory) for stage in ready]
-            pending, asked = set(futures), False
-            while pending:
-                ended = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED).done
+        if self.memory is None:
+            return True
+        share = self.memory.bytes // self.side_by_side.jobs
+        return all((need := self.side_by_side.need(stage)) is not None and need <= share for stage in stages)
+
+    def _together(self, waiting: Sequence[Stage], forced: Collection[str]) -> list[Outcome]:
+        """`one` for each that is ready, at the same time, and for those that become ready while others still run: what is left then has all cores again.
+        The first error is raised once all have ended; no other stage begins after it."""
+        assert self.side_by_side is not None
+        side_by_side, left, begun = self.side_by_side, list(waiting), dict[Future[Outcome], Stage]()
+        memory = None if self.memory is None else Limit(self.memory.bytes // side_by_side.jobs, self.memory.whose)
+        with ThreadPoolExecutor(side_by_side.jobs, thread_name_prefix="stage") as pool:
+            pending, new, asked = set[Future[Outcome]](), _ready(left), False
+            while new or pending:
+                execute = partial(side_by_side.execute, among=len(pending) + len(new))
+                submitted = {pool.submit(self.one, stage, stage.name in forced, execute, memory): stage for stage in new}
+                begun |= submitted
+                pending |= submitted.keys()
+                wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
+                ended = {future for future in pending if future.done()}
+                pending -= ended
                 stop = self._is_to_stop()
-                if stop or any(not future.cancelled() and future.exception() is not None for future in ended):
+                if stop or any(future.cancelled() or future.exception() is not None for future in ended):
                     pool.shutdown(wait=False, cancel_futures=True)
+                    left = []
                 if stop and not asked:
                     asked = True
-                    self.side_by_side.stop()
-                pending = {future for future in pending if not future.done()}
-        self.side_by_side.rest()
+                    side_by_side.stop()
+                left = [stage for stage in left if stage.name not in {begun[future].name for future in ended}]
+                free = [stage for stage in _ready(left) if stage.name not in {each.name for each in begun.values()}] if ended and pending else []
+                new = [stage for stage in free if self._have_memory([stage])]
+        side_by_side.rest()
         self.safe_point()
-        for future in futures:
+        for future in begun:
             if not future.cancelled() and (error := future.exception()) is not None:
                 raise error
-        return [future.result() for future in futures]
+        return [future.result() for future in begun]
 
     def one(self, stage: Stage, forced: bool, execute: Executor, memory: Limit | None) -> Outcome:
         """Decide about one stage, and run it if needed."""
@@ -295,6 +311,11 @@ class _Runner:
 
     def emit(self, event: str, stage: str, **facts: Any) -> None:
         _emit(self._report, event, stage, **facts)
+
+
+def _ready(waiting: Sequence[Stage]) -> list[Stage]:
+    """Those that need none of the others."""
+    return [stage for stage in waiting if not {each.name for each in waiting} & set(stage.needs)]
 
 
 def _one_at_a_time(report: Report) -> Report:

@@ -43,8 +43,8 @@ class SideBySide:
     def __exit__(self, *error: object) -> None:
         self._children.close()
 
-    def execute(self, stage: Stage, job: Job) -> Usage:
-        """Run the stage to its end, in a child that a stage before it may have left. Raises what the stage raised."""
+    def execute(self, stage: Stage, job: Job, among: int) -> Usage:
+        """Run the stage to its end on its part of the cores, `among` so many stages, in a child that one before it may have left. Raises what it raised."""
         facts = {
             "settings": settings_dict(job.settings),
             "inputs": {need: str(folder) for need, folder in job.inputs.items()},
@@ -54,9 +54,9 @@ class SideBySide:
             "device": job.device,
             "memory": None if job.memory is None else [job.memory.bytes, job.memory.whose],
         }
-        name = self._free.get()
+        name, cores = self._free.get(), max(1, self.cores // min(self.jobs, among))
         try:
-            answer = self._children.work({"kind": "job", "run": name, "stage": stage.name, "job": facts}, job.pass_on, cores=max(1, self.cores // self.jobs))
+            answer = self._children.work({"kind": "job", "run": name, "stage": stage.name, "job": facts}, job.pass_on, cores=cores)
         finally:
             self._free.put(name)
         if not answer["ok"]:

@@ -77,12 +77,13 @@ STAGES = (
     *(Stage(name, 1, MiddleSettings, ("top",), run_middle) for name in MIDDLE),
     Stage("bottom", 1, BottomSettings, ("top", *MIDDLE), run_bottom),
 )
+AFTER_LEFT = Stage("after_left", 1, MiddleSettings, ("top", "left"), run_middle)
 
 
 def make_run(folder: Path, *, place: Path | None = None, meets: dict[str, tuple[str, ...]] | None = None, does: dict[str, str] | None = None) -> Run:
     """A run in which stages of the middle meet others and end as said."""
-    settings = {stage.name: settings_dict(stage.settings()) for stage in STAGES}
-    for name in MIDDLE:
+    settings = {stage.name: settings_dict(stage.settings()) for stage in (*STAGES, AFTER_LEFT)}
+    for name in (*MIDDLE, AFTER_LEFT.name):
         settings[name] |= {"place": str(place or ""), "meets": list((meets or {}).get(name, ())), "does": (does or {}).get(name, "ends")}
     return Run.create(folder, None, settings)
 
@@ -90,7 +91,7 @@ def make_run(folder: Path, *, place: Path | None = None, meets: dict[str, tuple[
 class Diamond:
     """The child's program; what fleets ask for is not asked here."""
 
-    stages = STAGES
+    stages = (*STAGES, AFTER_LEFT)
     prepare: Callable[..., list[str]]
     describe: Callable[..., dict[str, object]]
     space: Callable[..., int]

@@ -15,7 +15,7 @@ from pipeline.executors.memory import Limit
 from pipeline.executors.side_by_side import FailureInChild, SideBySide
 from pipeline.manifest import read_manifest
 from pipeline.runner import Outcome, run_stages
-from tests.pipeline.diamond import MIDDLE, STAGES, make_run
+from tests.pipeline.diamond import AFTER_LEFT, MIDDLE, STAGES, make_run
 from tests.pipeline.toy import Events, actions, contents
 
 CHILD = "tests.pipeline.diamond"
@@ -48,6 +48,17 @@ def test_they_run_at_the_same_time_and_the_artifacts_are_the_same(tmp_path: Path
     made, expected = ({name: data for name, data in contents(folder.path).items() if name != "run.json"} for folder in (run, alone))
     assert made == expected
     assert actions(done(run)) == dict.fromkeys(actions(outcomes), "skipped")
+
+
+def test_a_stage_begins_once_those_that_it_needs_have_ended_while_others_run(tmp_path: Path) -> None:
+    place = tmp_path / "place"
+    place.mkdir()
+    run = make_run(tmp_path / "run", place=place, meets={"right": ("after_left",)})
+    stages = [stage for stage in STAGES if stage.name in ("top", "left", "right")] + [AFTER_LEFT]
+    with beside(2) as together:
+        outcomes = run_stages(run, stages, side_by_side=together)
+    assert actions(outcomes) == {"top": "ran", "left": "ran", "right": "ran", "after_left": "ran"}
+    assert (place / "after_left").read_text().split()[1] == "2", "4 cores for the two that run"
 
 
 @pytest.mark.parametrize(
