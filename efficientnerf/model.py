@@ -14,7 +14,7 @@ from efficientnerf.fields.field import Field
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import RayBundle, Space, voxel_centres
 from efficientnerf.rendering.compositing import Composite
-from efficientnerf.rendering.harmonics import basis, harmonics_count
+from efficientnerf.rendering.harmonics import C0, basis, harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples
 from efficientnerf.sampling.strategies import Efficient, Hierarchical, Intervals, SamplingRequest, Strategy, Uniform, Valid
@@ -22,6 +22,7 @@ from efficientnerf.settings import resolved
 from efficientnerf.training.settings import TrainSettings
 
 SKY_DEGREE = 2
+SKY_LEAST = 0.01  # of a channel that the sky begins with: from 0 nothing would ever change it
 UNSEEN = 0.5  # grey: drawn behind a space that reaches to infinity, where nothing can lie
 
 
@@ -35,6 +36,11 @@ class Sky(nn.Module):
     def forward(self, directions: Tensor) -> Tensor:
         """Colours (R, 3) along unit directions (R, 3)."""
         return torch.sigmoid(basis(directions, SKY_DEGREE) @ self.sh)
+
+    @torch.no_grad()
+    def begin_with(self, colour: np.ndarray) -> None:
+        """Start from one colour (3,), 0-1, in all directions."""
+        self.sh[0] = torch.logit(torch.from_numpy(colour.astype(np.float32)), SKY_LEAST) / C0
 
 
 @dataclass

@@ -14,6 +14,7 @@ EXACT = 2**23  # pixels of all lenses together up to which each has a direction 
 STRIDE = 8  # beyond it: pixels between knots
 LISTED_SHARE = 1 / 8  # of the pixels that masks allow, below which these are listed: else most that are drawn would be thrown away
 PART = 2**24  # pixels whose bits are unpacked at a time
+BORDER, BORDER_TRIES = 0.05, 4096  # of the sides; pixels that are drawn of each view to find some there
 
 
 class PixelRows(Protocol):
@@ -177,6 +178,17 @@ class Pixels:
         view = self.view_of(index)
         y, x = np.divmod(index - self.offsets[view], self.width[view])
         return (np.abs(2 * x + 1 - self.width[view]) < self.width[view] / 2) & (np.abs(2 * y + 1 - self.height[view]) < self.height[view] / 2)
+
+    def border_colours(self) -> np.ndarray:
+        """(C, 3) median colour of each view, 0-1, in the strip BORDER of its sides wide along its borders; NaN where no pixel there is usable."""
+        rng, found = np.random.Generator(np.random.Philox(key=0)), []
+        for begin, width, height in zip(self.offsets[:-1].tolist(), self.width.tolist(), self.height.tolist(), strict=True):
+            x, y = rng.integers(width, size=BORDER_TRIES), rng.integers(height, size=BORDER_TRIES)
+            near = (np.minimum(x, width - 1 - x) < BORDER * width) | (np.minimum(y, height - 1 - y) < BORDER * height)
+            index = begin + (y * width + x)[near]
+            index = index[self.usable_at(index)]
+            found.append(np.median(self.images[index][:, :3] / 255.0, axis=0) if len(index) else np.full(3, np.nan))
+        return np.array(found)
 
     def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from efficientnerf.capture.supports import Support, opaque_support
 from efficientnerf.geometry.cameras import rays
+from efficientnerf.model import Model
 from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
@@ -20,6 +21,7 @@ from stages.scratch import Warn
 from stages.train.averaged import averaged_views
 from stages.train.settings import refuse_planes_out_of_order
 
+DARK, DARK_VIEWS = 0.12, 0.9  # of a channel at the borders of a photograph; of the photographs. docs/experiments/whole-scene.md
 MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
 MOST_OBSERVATIONS = 2**20  # of sparse points that are used; of more, those of points drawn at random
 NEAR_THE_SCENE = 1.5  # half sides of the scene bounds, within which points may be on what the subject stands on
@@ -97,6 +99,21 @@ def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
         raise UsageError(f"{ranges}: rays would miss all of it. Leave both auto, or set planes that enclose it.")
     if np.median(inside / (last - first)) < 1 - CUT_SHARE:
         warn(f"{ranges}: rays miss a part of it. Leave both auto, or set planes that enclose it.")
+
+
+def begin_sky(m: Model, pixels: Pixels) -> bool:
+    """Whether the photographs of an unbounded scene are dark along their borders, as by a flash at night: then the sky of an untrained model begins as dark.
+
+    Before a grey one darkness is first learned as black fog round each camera, which hides the subject and costs nothing: it stays.
+    """
+    if m.background is not None or m.space.reaches_infinity:
+        return False
+    colours = pixels.border_colours()
+    dark = colours.max(axis=1) <= DARK
+    if dark.mean() < DARK_VIEWS:
+        return False
+    m.sky.begin_with(np.median(colours[dark], axis=0))
+    return True
 
 
 def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | None:

@@ -39,7 +39,7 @@ from stages.train.budget import UNKNOWN, Budget, training_budget
 from stages.train.checkpoints import Checkpoints
 from stages.train.checks.watch import Watch
 from stages.train.checks.wrong_views import cameras_of, draw_wrong_views, findings_of, left_out_of, train_and_check
-from stages.train.data import count_pixels, depth_range, pixels_of, sparse_depth_of
+from stages.train.data import begin_sky, count_pixels, depth_range, pixels_of, sparse_depth_of
 from stages.train.exposure import begin_exposure, exposure_facts, saved_exposure
 from stages.train.hash_resolution import with_auto_sizes
 from stages.train.log import TrainLog
@@ -68,6 +68,8 @@ def trained(job: Job) -> bool:
     near, far = depth_range(s, pixels, settings, job.warn)
     exposure = begin_exposure(folder, s, pixels, settings.exposure, job.device, job.say)
     m = model(space, replace(settings, exposure="off" if exposure is None else "on"), s.background, job.device, (near, far))
+    if begin_sky(m, pixels):
+        job.say("the photographs are dark along their borders: darkness is expected behind the scene")
     priors = mask_uncovered_cells(m, views, job)
 
     t = loop.trainer(m, exposure, cameras=[view.camera for view in views])

@@ -31,7 +31,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="train",
-    version=15,
+    version=16,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=ByName("stages.train.run:run"),

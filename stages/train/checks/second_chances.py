@@ -25,7 +25,7 @@ from stages.io.scene import Scene, View, views_of
 from stages.scratch import note, noted
 from stages.train.checks.early_check import EarlyResult, HeldOutView, judge
 from stages.train.choices import TrainingChoices
-from stages.train.data import depth_range, sparse_depth_of
+from stages.train.data import begin_sky, depth_range, sparse_depth_of
 from stages.train.exposure import begin_exposure
 from stages.train.priors import filled_points, mask_cells_by
 
@@ -114,6 +114,7 @@ def _train(
     own = _with_views(pixels, views)
     near, far = depth_range(s, own, small)
     m = model(space_of(s), small, s.background, job.device, (near, far))
+    begin_sky(m, own)
     cameras, folder = [view.camera for view in views], job.inputs[PosesOutputs.stage]
     mask_cells_by(m, cameras, own.near.tolist(), kept_pixels(folder, views), filled_points(folder, len(views)))
     exposure = begin_exposure(folder, s, own, small.exposure, job.device)
