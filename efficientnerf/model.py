@@ -22,7 +22,7 @@ from efficientnerf.settings import resolved
 from efficientnerf.training.settings import TrainSettings
 
 SKY_DEGREE = 2
-SKY_LEAST = 0.01  # of a channel that the sky begins with: from 0 nothing would ever change it
+SKY_LEAST = 0.01  # of a channel that the sky begins with, and of what is left to 1: from 0 or 1 nothing would ever change it
 UNSEEN = 0.5  # grey: drawn behind a space that reaches to infinity, where nothing can lie
 
 

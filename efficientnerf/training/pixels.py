@@ -179,16 +179,21 @@ class Pixels:
         y, x = np.divmod(index - self.offsets[view], self.width[view])
         return (np.abs(2 * x + 1 - self.width[view]) < self.width[view] / 2) & (np.abs(2 * y + 1 - self.height[view]) < self.height[view] / 2)
 
-    def border_colours(self) -> np.ndarray:
-        """(C, 3) median colour of each view, 0-1, in the strip BORDER of its sides wide along its borders; NaN where no pixel there is usable."""
-        rng, found = np.random.Generator(np.random.Philox(key=0)), []
-        for begin, width, height in zip(self.offsets[:-1].tolist(), self.width.tolist(), self.height.tolist(), strict=True):
+    def border_colours(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Of the strip along the borders of each view that is BORDER of its sides wide: the median colour (C, 3), 0-1, NaN where no pixel there is usable; and
+        the share (C,) of its pixels whose channels are no farther from that."""
+        rng = np.random.Generator(np.random.Philox(key=0))
+        colours, shares = np.full((len(self.width), 3), np.nan), np.zeros(len(self.width))
+        for view, (begin, width, height) in enumerate(zip(self.offsets[:-1].tolist(), self.width.tolist(), self.height.tolist(), strict=True)):
             x, y = rng.integers(width, size=BORDER_TRIES), rng.integers(height, size=BORDER_TRIES)
             near = (np.minimum(x, width - 1 - x) < BORDER * width) | (np.minimum(y, height - 1 - y) < BORDER * height)
             index = begin + (y * width + x)[near]
             index = index[self.usable_at(index)]
-            found.append(np.median(self.images[index][:, :3] / 255.0, axis=0) if len(index) else np.full(3, np.nan))
-        return np.array(found)
+            if len(index):
+                seen = self.images[index][:, :3] / 255.0
+                colours[view] = np.median(seen, axis=0)
+                shares[view] = (np.abs(seen - colours[view]).max(axis=1) <= tolerance).mean()
+        return colours, shares
 
     def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""

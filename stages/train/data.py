@@ -21,7 +21,8 @@ from stages.scratch import Warn
 from stages.train.averaged import averaged_views
 from stages.train.settings import refuse_planes_out_of_order
 
-DARK, DARK_VIEWS = 0.12, 0.9  # of a channel at the borders of a photograph; of the photographs. docs/experiments/whole-scene.md
+# A plain backdrop: how far channels may be from one colour, of what share of the pixels along the borders, of which share of the photographs.
+ALIKE, PLAIN, PLAIN_VIEWS = 0.06, 0.7, 0.9  # docs/experiments/whole-scene.md
 MIN_TRACK = 3  # images that a sparse point must be observed in, or as many as are trained on where these are fewer
 MOST_OBSERVATIONS = 2**20  # of sparse points that are used; of more, those of points drawn at random
 NEAR_THE_SCENE = 1.5  # half sides of the scene bounds, within which points may be on what the subject stands on
@@ -102,17 +103,21 @@ def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
 
 
 def begin_sky(m: Model, pixels: Pixels) -> bool:
-    """Whether the photographs of an unbounded scene are dark along their borders, as by a flash at night: then the sky of an untrained model begins as dark.
+    """Whether the photographs of an unbounded scene have one plain colour along their borders, as before white or at night: then the sky of an untrained model
+    begins with it.
 
-    Before a grey one darkness is first learned as black fog round each camera, which hides the subject and costs nothing: it stays.
+    Before a sky of another colour a plain backdrop is first learned as fog round each camera, which hides the subject and costs nothing: it stays.
     """
     if m.background is not None or m.space.reaches_infinity:
         return False
-    colours = pixels.border_colours()
-    dark = colours.max(axis=1) <= DARK
-    if dark.mean() < DARK_VIEWS:
+    colours, shares = pixels.border_colours(ALIKE)
+    plain = shares >= PLAIN
+    if not plain.any():
         return False
-    m.sky.begin_with(np.median(colours[dark], axis=0))
+    colour = np.median(colours[plain], axis=0)
+    if (plain & (np.abs(colours - colour).max(axis=1) <= ALIKE)).mean() < PLAIN_VIEWS:
+        return False
+    m.sky.begin_with(colour)
     return True
 
 

@@ -69,7 +69,7 @@ def trained(job: Job) -> bool:
     exposure = begin_exposure(folder, s, pixels, settings.exposure, job.device, job.say)
     m = model(space, replace(settings, exposure="off" if exposure is None else "on"), s.background, job.device, (near, far))
     if begin_sky(m, pixels):
-        job.say("the photographs are dark along their borders: darkness is expected behind the scene")
+        job.say("the photographs have one plain colour along their borders: the sky begins with it")
     priors = mask_uncovered_cells(m, views, job)
 
     t = loop.trainer(m, exposure, cameras=[view.camera for view in views])
