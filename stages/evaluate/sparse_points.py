@@ -106,7 +106,7 @@ def agreement(views: Sequence[Mapping[str, Any] | None]) -> dict[str, float | in
         return None
     nearer, farther = total["nearer"] / total["points"], total["farther"] / total["points"]
     subject = total["subject_farther"] / total["subject_points"] if total["subject_points"] >= FEW else None
-    return {"points": total["points"], "agreeing": 1.0 - nearer - farther, "nearer": nearer, "farther": farther, "subject_farther": subject}
+    return {"points": total["points"], "agreeing": max(0.0, 1.0 - nearer - farther), "nearer": nearer, "farther": farther, "subject_farther": subject}
 
 
 def picture(photograph: np.ndarray, depth: np.ndarray, pixels: np.ndarray, kinds: np.ndarray) -> np.ndarray:
