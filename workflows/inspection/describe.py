@@ -7,11 +7,11 @@ from typing import Any
 from pipeline.decide import survey
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
-from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS
+from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.splats.description import describe_splats
 from stages.formats.importers.description import describe_source
 from stages.io import scene
-from stages.io.meshes.description import describe_mesh
+from stages.io.meshes.description import MESHES, describe_mesh
 from stages.video import SUFFIXES
 from workflows.asset import STAGES
 from workflows.cli.output import plain
@@ -20,8 +20,6 @@ from workflows.cli.target import ASSET, is_run, open_run
 from workflows.loading import describe_asset
 from workflows.report import documents
 from workflows.report.summary import artifacts
-
-MESHES = tuple(dict.fromkeys(each.extension for each in (*MESH_EXPORTERS.values(), *POINT_EXPORTERS.values()) if each.extra is None))
 
 
 def describe(path: Path) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from stages.io.meshes.ply import read_ply
 from stages.io.meshes.text import read_obj, read_stl, read_xyz
 
 READERS = {".ply": read_ply, ".obj": read_obj, ".stl": read_stl, ".xyz": read_xyz}
+MESHES = (".glb", *READERS)  # what can be described
 
 
 def describe_mesh(path: Path) -> dict[str, Any]:

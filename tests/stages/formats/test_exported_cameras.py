@@ -10,6 +10,7 @@ from efficientnerf.geometry.cameras import project
 from pipeline.errors import BadInput
 from stages.formats import importers
 from stages.formats.importers.description import describe_source
+from stages.formats.importers.source import IMAGE_SUFFIXES
 from stages.io.capture import Capture
 from tests.stages import captures, exports
 from tests.stages.captures import Settings
@@ -108,18 +109,15 @@ def test_splits_bounds_masks_and_bad_frames(tmp_path: Path) -> None:
     assert indoor.metric
 
 
-# --- images elsewhere
-
-
 # --- hostile
 
 
 BESIDE = ("pair.txt", "mesh_info.json", "bbox.txt", "points3d.txt", "observations.txt")
-LISTS = (".xml", ".csv", ".xmp", ".json", ".txt", ".npz", ".log")
 
 
 def lists_of(folder: Path) -> list[Path]:
-    return [path for path in sorted(folder.rglob("*")) if path.suffix in LISTS and path.name not in BESIDE]
+    """Files that state cameras."""
+    return [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix.lower() not in (*IMAGE_SUFFIXES, ".exr") and path.name not in BESIDE]
 
 
 @pytest.mark.parametrize("how", EXPORTS)

@@ -17,10 +17,9 @@ import trimesh
 from efficientnerf.surface.mesh import PointCloud
 from pipeline.errors import BadInput
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
-from stages.io.meshes.description import describe_mesh
+from stages.io.meshes.description import MESHES, describe_mesh
 from tests.stages.io.meshes import Y_DOWN, block
 from workflows.cli.main import main
-from workflows.inspection.describe import MESHES
 
 TIMES, ROOM = 16, 4_000_000  # of the file's bytes, and more, that describing a file may take
 
