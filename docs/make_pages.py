@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
@@ -13,6 +15,7 @@ from workflows.asset import STAGES
 from workflows.cli.main import enerf
 from workflows.cli.resolve import meaning, preset_names, read_preset, shown
 
+Record = tuple[str, str]  # an option as it is written, and its meaning
 FOLDER = Path(__file__).parent
 COMMON = {  # options of all commands, and two of nearly all
     "--help": "Show this message and exit.",
@@ -76,19 +79,33 @@ def presets_section() -> list[str]:
     return lines
 
 
-def command_section(command: click.Command, name: str, above: click.Context) -> list[str]:
-    """What a command does and its options, a row each, and those under it."""
+def contexts_of(command: click.Command, name: str, above: click.Context) -> Iterator[click.Context]:
+    """A command, and those under it."""
     context = click.Context(command, info_name=name, parent=above, max_content_width=2**16)
-    usage = " ".join(command.get_usage(context).removeprefix("Usage: ").split())
-    lines = ["", f"{'#' * (1 + context.command_path.count(' '))} {context.command_path}", "", f"`{usage}`", "", *paragraphs(command)]
-    options = [each for each in command.params if isinstance(each, click.Option) and not COMMON.keys() & {*each.opts}]
-    records = [record for each in options if (record := each.get_help_record(context)) is not None]
-    if records:
-        lines += ["", "| option | meaning |", "|---|---|", *(f"| `{cell(option)}` | {cell(text)} |" for option, text in records)]
+    yield context
     if isinstance(command, click.Group):
         for inner in command.list_commands(context):
-            lines += command_section(command.commands[inner], inner, context)
-    return lines
+            yield from contexts_of(command.commands[inner], inner, context)
+
+
+def records_of(context: click.Context) -> list[Record]:
+    """The options of a command that are not COMMON, and their meanings."""
+    options = [each for each in context.command.params if isinstance(each, click.Option) and not COMMON.keys() & {*each.opts}]
+    return [record for each in options if (record := each.get_help_record(context)) is not None]
+
+
+def command_section(context: click.Context, shared: Sequence[Record]) -> list[str]:
+    """What a command does and its options, a row each; of those that many commands have, which."""
+    usage = " ".join(context.command.get_usage(context).removeprefix("Usage: ").split())
+    text, records = paragraphs(context.command), records_of(context)
+    also = "`, `".join(option.split()[0] for option, meaning in records if (option, meaning) in shared)
+    lines = ["", f"{'#' * (1 + context.command_path.count(' '))} {context.command_path}", "", f"`{usage}`: {text[0]}", *text[1:]]
+    return lines + table("option", [record for record in records if record not in shared] + ([(also, "As above.")] if also else []))
+
+
+def table(head: str, records: Sequence[Record]) -> list[str]:
+    rows = [f"| `{cell(option)}` | {cell(text)} |" for option, text in records]
+    return ["", f"| {head} | meaning |", "|---|---|", *rows] if rows else []
 
 
 def paragraphs(command: click.Command) -> list[str]:
@@ -101,14 +118,17 @@ def paragraphs(command: click.Command) -> list[str]:
 
 
 def commands_page() -> str:
-    context = click.Context(enerf, info_name="enerf", max_content_width=2**16)
-    lines = [NOTE, "# Commands", "", *paragraphs(enerf), "", enerf.epilog or "", "", "| common option | meaning |", "|---|---|"]
-    lines += [f"| `{option}` | {meaning} |" for option, meaning in COMMON.items()]
-    for name in enerf.list_commands(context):
-        command = enerf.get_command(context, name)
-        assert command is not None
-        lines += command_section(command, name, context)
-    return "\n".join(lines) + "\n"
+    above = click.Context(enerf, info_name="enerf", max_content_width=2**16)
+    contexts = [context for name in enerf.list_commands(above) for context in contexts_of(found(enerf.get_command(above, name)), name, above)]
+    counts = Counter(record for context in contexts for record in records_of(context))
+    shared = [record for record, count in counts.items() if count > 1]
+    lines = [NOTE, "# Commands", "", *paragraphs(enerf), "", enerf.epilog or "", *table("common option", [*COMMON.items(), *shared])]
+    return "\n".join([*lines, *(line for context in contexts for line in command_section(context, shared))]) + "\n"
+
+
+def found(command: click.Command | None) -> click.Command:
+    assert command is not None
+    return command
 
 
 PAGES = {"settings.md": settings_page, "commands.md": commands_page}
