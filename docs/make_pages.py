@@ -54,7 +54,7 @@ def settings_page() -> str:
     lines += ["", "## Advanced"]
     for stage, infos in described.items():
         if any(info.advanced for info in infos):
-            lines += ["", f"### {stage}", "", "| setting | default | may be | meaning |", "|---|---|---|---|"]
+            lines += ["", f"### {stage}", "| setting | default | may be | meaning |", "|---|---|---|---|"]
             lines += [row(stage, info) for info in infos if info.advanced]
     return "\n".join(lines) + "\n"
 
@@ -68,7 +68,6 @@ def presets_section() -> list[str]:
     lines = [
         "",
         "## Presets",
-        "",
         'A preset is a TOML file in `workflows/presets`. With `inherits = "NAME"` it begins with the values of another preset, and changes some.',
         "",
     ]
@@ -99,7 +98,7 @@ def command_section(context: click.Context, shared: Sequence[Record]) -> list[st
     usage = " ".join(context.command.get_usage(context).removeprefix("Usage: ").split())
     text, records = paragraphs(context.command), records_of(context)
     also = "`, `".join(option.split()[0] for option, meaning in records if (option, meaning) in shared)
-    lines = ["", f"{'#' * (1 + context.command_path.count(' '))} {context.command_path}", "", f"`{usage}`: {text[0]}", *text[1:]]
+    lines = ["", f"{'#' * (1 + context.command_path.count(' '))} {context.command_path}", f"`{usage}`: {text[0]}", *text[1:]]
     return lines + table("option", [record for record in records if record not in shared] + ([(also, "As above.")] if also else []))
 
 
