@@ -136,9 +136,10 @@ def model(
     settings = replace(settings, num_coarse_samples=coarse_samples)
     generator = torch.Generator().manual_seed(settings.seed)
     coarse, fine = _fields(settings, generator) if fields is None else fields
-    if settings.far_plane != "auto" and (span is None or space.contracted):
+    if resolved(settings.far_plane) is None:
+        span = None
+    elif span is None or space.contracted:
         raise ValueError("train.near_plane and train.far_plane need a scene on a constant background. Leave them auto.")
-    span = span if settings.far_plane != "auto" else None
     step = space.sampled_length(span) / coarse_samples
     voxels = _voxels(settings, space, step, device)
     intervals = Intervals(space, voxels, step, space.max_intervals(step), coarse_samples, span is not None, settings.field != "hash")

@@ -31,8 +31,6 @@ FISHEYE_FOCAL = 0.4  # of the longest side: 180 degrees along the diagonal of a 
 TIED = "markers"  # folder in a scratch folder, of the database with corners of markers
 OVERLAPPING = 30  # verified matches, from which two photographs count as overlapping
 HOMOGRAPHIES = (4, 5, 6)  # of COLMAP's two-view geometries: planar, panoramic, either of them
-PLANAR = HOMOGRAPHIES[0]
-ROUND_MARKER = 1.2  # times its size, within which features are on a marker
 
 Row = dict[str, Any]
 

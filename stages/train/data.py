@@ -9,7 +9,6 @@ import numpy as np
 from efficientnerf.capture.supports import Support, opaque_support
 from efficientnerf.geometry.cameras import rays
 from efficientnerf.model import Model
-from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import SparseDepthRays
@@ -19,7 +18,7 @@ from stages.io import scene
 from stages.io.scene import Scene, View
 from stages.scratch import Warn
 from stages.train.averaged import averaged_views
-from stages.train.settings import refuse_planes_out_of_order
+from stages.train.settings import UNBOUNDED, stated_planes
 
 # A plain backdrop: how far channels may be from one colour, of what share of the pixels along the borders, of which share of the photographs.
 ALIKE, PLAIN, PLAIN_VIEWS = 0.06, 0.7, 0.9  # docs/experiments/whole-scene.md
@@ -63,29 +62,22 @@ def channels_of(folder: Path, views: tuple[View, ...]) -> int:
 
 
 def depth_range(s: Scene, pixels: Pixels, settings: TrainSettings, warn: Warn = lambda text: None) -> tuple[float, float]:
-    """Nearest and farthest of all views along their axes; where the settings state planes these, which are set for the pixels too.
+    """Nearest and farthest of all views along their axes; where the settings state planes these, which are set for the pixels too. UsageError where the scene
+    has no place for them, or they are not in order.
 
     warn  is called where the stated planes cut into most views' range
     """
-    if (settings.near_plane, settings.far_plane) != ("auto", "auto"):
-        near, far = stated_planes(s, settings)
-        compare_with_views(s, near, far, warn)
-        pixels.near[:], pixels.far[:] = near, far
-        return near, far
-    return min(view.near for view in s.views), max(view.far for view in s.views)
-
-
-def stated_planes(s: Scene, settings: TrainSettings) -> tuple[float, float]:
-    """train.near_plane and train.far_plane in the training frame; UsageError where the scene has none, or they are not in order."""
+    planes = stated_planes(settings)
+    if planes is None:
+        return min(view.near for view in s.views), max(view.far for view in s.views)
     if s.background is None:
         raise UsageError("train.near_plane and train.far_plane are for scenes on a constant background; this one is unbounded. Leave them auto.")
     if s.contracted:
-        raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
-    refuse_planes_out_of_order(settings)
-    near, far = resolved(settings.near_plane), resolved(settings.far_plane)
-    assert near is not None
-    assert far is not None
-    return near * float(s.world_from_capture.scale), far * float(s.world_from_capture.scale)
+        raise UsageError(UNBOUNDED)
+    near, far = (plane * float(s.world_from_capture.scale) for plane in planes)
+    compare_with_views(s, near, far, warn)
+    pixels.near[:], pixels.far[:] = near, far
+    return near, far
 
 
 def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:

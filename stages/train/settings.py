@@ -9,24 +9,26 @@ from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
 from stages.artifacts import TrainInputs, TrainOutputs, needs_of
 
+UNBOUNDED = "train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto."
 
-def refuse_planes_out_of_order(settings: TrainSettings) -> None:
-    """UsageError where one of train.near_plane and train.far_plane is stated without the other, for N_c samples lie between both; or where they are not in
-    order."""
+
+def stated_planes(settings: TrainSettings) -> tuple[float, float] | None:
+    """train.near_plane and train.far_plane, in the capture's units; None where neither is stated. UsageError where one is stated without the other, for N_c
+    samples lie between both; or where they are not in order."""
     near, far = resolved(settings.near_plane), resolved(settings.far_plane)
     if near is None and far is None:
-        return
+        return None
     if near is None or far is None or near >= far:
         found = f"train.near_plane={settings.near_plane}, train.far_plane={settings.far_plane}"
         raise UsageError(f"{found}: expected two numbers, the second one greater, or auto for both.")
+    return near, far
 
 
 def check(settings: Mapping[str, Any]) -> None:
     """UsageError where near and far planes are stated that cannot be used."""
-    own, poses = settings["train"], settings.get("poses")
-    refuse_planes_out_of_order(own)
-    if own.far_plane != "auto" and poses is not None and poses.space == "contracted":
-        raise UsageError("train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto.")
+    planes, poses = stated_planes(settings["train"]), settings.get("poses")
+    if planes is not None and poses is not None and poses.space == "contracted":
+        raise UsageError(UNBOUNDED)
 
 
 STAGE = Stage(

@@ -28,6 +28,7 @@ from stages.train.choices import TrainingChoices
 from stages.train.data import begin_sky, depth_range, sparse_depth_of
 from stages.train.exposure import begin_exposure
 from stages.train.priors import filled_points, mask_cells_by
+from stages.train.settings import stated_planes
 
 # docs/experiments/early-check.md
 SMALL = TrainSettings(
@@ -51,7 +52,7 @@ def candidates(s: Scene, settings: TrainSettings) -> dict[str, TrainingChoices]:
     """The choices that would change anything, by their names in messages; first the stated ones."""
     own = TrainingChoices()
     found, priors = {AS_STATED: own}, own
-    if s.forward is None and settings.near_plane == "auto":
+    if s.forward is None and stated_planes(settings) is None:
         if _lowers(replace(own, near="median"), s):
             found["near planes at most their median"] = replace(own, near="median")
         if _lowers(replace(own, near="off"), s):
