@@ -22,13 +22,13 @@ import numpy as np
 import torch
 
 from benchmarks.scenes.drawn import MIDDLE
+from benchmarks.source_view_training import FAR, SETTINGS, SOURCES, WHITE, PosedImages, pretrain
 from efficientnerf.evaluation.metrics import psnr
 from efficientnerf.fields.source_views import SourceViews, angles, bilinear, projected
 from efficientnerf.geometry.cameras import Camera, pose_from_opengl, rays, resized
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import model
 from efficientnerf.rendering.field_renderer import FieldRenderer
-from efficientnerf.training.pretraining import FAR, SETTINGS, SOURCES, WHITE, PosedImages, pretrain
 from stages.evaluate.views import evenly_spaced, subsample, subsample_camera
 from stages.io.field_file import write_tensors
 from stages.io.png import read_png

@@ -25,7 +25,6 @@ from efficientnerf.model import Model, model
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training import loop
 from efficientnerf.training.occupancy_update import sweep_occupancy
-from efficientnerf.training.pretraining import SourceViewNetwork
 from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
 from pipeline.run import NAME, Run
@@ -38,6 +37,7 @@ from stages.train.data import depth_range, pixels_of
 from workflows import asset
 from workflows.paper.result import PAPER, Request, Result
 
+SourceViewNetwork = IbrNet | MvsNerf
 NETWORKS: dict[str, type[IbrNet] | type[MvsNerf]] = {"ibrnet": IbrNet, "mvsnerf": MvsNerf}
 Sampling = Literal["uniform", "efficient"]
 BOTH: tuple[Sampling, Sampling] = ("uniform", "efficient")

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.source_view_training import SETTINGS, WHITE, PosedImages, pretrain
 from efficientnerf.fields.ibrnet import IbrNet, RayAttention, moments, normalised
 from efficientnerf.fields.mvsnerf import ENCODING, SIDE, MvsNerf, cost_volume
 from efficientnerf.fields.source_views import SourceViews, as_logit, bilinear, look_up, source_views, trilinear
@@ -18,8 +19,8 @@ from efficientnerf.model import model
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.sampling.occupancy import sweep_cells
 from efficientnerf.training.occupancy_update import sweep_occupancy
-from efficientnerf.training.pretraining import SETTINGS, WHITE, PosedImages, SourceViewNetwork, pretrain
 from tests.efficientnerf.balls import cameras, picture
+from workflows.paper.pretrained import SourceViewNetwork
 
 BOX = BoundedSpace(np.array([[-1.0, -0.8, -0.9], [1.0, 0.8, 0.9]]))
 CAMERAS = cameras(7, 16)

@@ -9,11 +9,10 @@ import torch
 from benchmarks.pretraining import warped
 from efficientnerf.fields.source_views import source_views
 from efficientnerf.geometry.spaces import BoundedSpace
-from efficientnerf.training.pretraining import SourceViewNetwork
 from tests.efficientnerf.balls import cameras
 from tests.workflows.paper.scenes import ball
 from workflows.paper import pretrained
-from workflows.paper.pretrained import BOTH, CHECKS, Finetuned, finetuned
+from workflows.paper.pretrained import BOTH, CHECKS, Finetuned, SourceViewNetwork, finetuned
 from workflows.paper.result import Request
 from workflows.paper.runs import Row, settings_of
 

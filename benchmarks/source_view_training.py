@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.fields.ibrnet import IbrNet
-from efficientnerf.fields.mvsnerf import VIEWS, MvsNerf
+from efficientnerf.fields.mvsnerf import VIEWS
 from efficientnerf.fields.source_views import SourceViews, source_views
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.spaces import BoundedSpace
@@ -22,6 +21,7 @@ from efficientnerf.model import Model, model, render_rays
 from efficientnerf.training.losses import colour_losses
 from efficientnerf.training.optimiser import Adam, ParameterGroup
 from efficientnerf.training.settings import TrainSettings
+from workflows.paper.pretrained import SourceViewNetwork
 
 WHITE = (1.0, 1.0, 1.0)
 RAYS = 96
@@ -34,7 +34,6 @@ SETTINGS = TrainSettings(
     occupancy_rule="momentum", occupancy_resolution=8,
 )  # fmt: skip
 FAR = 100.0  # beyond every box
-SourceViewNetwork = IbrNet | MvsNerf
 
 
 @dataclass(frozen=True)
