@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.errors import PipelineError
-from stages.formats.importers import detect
+from stages.formats.importers import formats_of
 from stages.formats.importers.photographs import is_video, photographs
 from stages.formats.importers.source import ImportSettings, Source
 from stages.io.photo import working_size
@@ -50,18 +50,12 @@ def train_share(sources: Sequence[Path], poses: PosesSettings) -> float:
     Photographs of a source are taken to be as large as its first; videos have many pixels; a source that cannot be read has none (the stage poses reports it).
     """
     try:
-        if _format(sources, poses) in WITHOUT_SURROUNDINGS:
+        if len(sources) == 1 and formats_of(sources[0], poses)[0] in WITHOUT_SURROUNDINGS:
             return TRAIN_SHARE
         pixels = sum(_pixels(source, poses) for source in sources)
     except (PipelineError, OSError, UnreadableImage):
         pixels = 0.0
     return FEW_PIXELS_TRAIN_SHARE if pixels < FEW_PIXELS else TRAIN_SHARE
-
-
-def _format(sources: Sequence[Path], poses: PosesSettings) -> str:
-    if poses.format != "auto":
-        return poses.format
-    return detect(sources[0], poses.allow_outside, poses.llff_factor) if len(sources) == 1 else "photographs"
 
 
 def _pixels(source: Path, poses: PosesSettings) -> float:

@@ -23,7 +23,7 @@ def read_source(folder: Path, data: bytes) -> None:
     from stages.formats import importers
 
     settings = captures.Settings()
-    name = importers.detect(folder)
+    name = importers.candidates(folder)[0]
     importer = importers.IMPORTERS[name]
     if len(data) % 4 == 0:
         importer.files(folder, settings)  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from efficientnerf.settings import resolved
 from pipeline.errors import PipelineError
 from pipeline.stage import Job
 from stages.cores import count_cores
-from stages.formats.importers import detect
+from stages.formats.importers import formats_of
 from stages.formats.importers.source import IMAGE_SUFFIXES
 from stages.io.capture import FOREGROUND
 from stages.io.photo import working_size
@@ -134,8 +134,6 @@ def _films(sources: Sequence[Path]) -> list[tuple[int, int]]:
 
 def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
     """Whether structure from motion has to find them, as far as is known before."""
-    if own.format != "auto" or len(sources) != 1:
-        return own.format in ("auto", "photographs")
     with contextlib.suppress(PipelineError, OSError):  # the stage says so
-        return detect(sources[0], own.allow_outside, own.llff_factor) == "photographs"
+        return len(sources) != 1 or formats_of(sources[0], own)[0] == "photographs"
     return True

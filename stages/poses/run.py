@@ -142,7 +142,7 @@ def _formats(job: Job, settings: PosesSettings) -> list[str]:
     """The formats that the source can be read as, best first; of several sources photographs alone. Raises BadInput."""
     found: list[str] = []
     for path in job.sources.values():
-        found = importers.candidates(path, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else [settings.format]
+        found = importers.formats_of(path, settings)
         if len(job.sources) > 1 and found[0] != "photographs":
             remedy = "Give it alone, or use --as photographs to find all cameras anew."
             raise BadInput(f"{path}: is read as {found[0]}; several sources can only be photographs and videos. {remedy}")

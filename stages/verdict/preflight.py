@@ -87,7 +87,7 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
     Raises BadInput where there is nothing that could be read.
     """
     source = Source(folder, settings.allow_outside)
-    kind = importers.detect(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else settings.format
+    kind = importers.formats_of(folder, settings)[0]
     files = {source.name_of(path): source.real(path) for path in photographs(source)}
     names = sorted(files)
     chosen = names[:: -(-len(names) // CHOSEN)]

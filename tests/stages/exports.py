@@ -22,7 +22,7 @@ Pixels = dict[str, np.ndarray]  # name of an image -> (9, 2), the centre of the 
 
 def read(folder: Path, **settings: object) -> Capture:
     """The capture of a folder, by the importer that takes it."""
-    return importers.IMPORTERS[importers.detect(folder)].read(folder, Settings(**settings))  # type: ignore[arg-type]
+    return importers.IMPORTERS[importers.candidates(folder)[0]].read(folder, Settings(**settings))  # type: ignore[arg-type]
 
 
 def cameras(suffix: str = ".png") -> list[Camera]:

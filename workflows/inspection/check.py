@@ -9,7 +9,7 @@ from pipeline.errors import BadInput
 from pipeline.executors.memory import Limit
 from pipeline.text import printable
 from stages.cores import count_cores
-from stages.formats.importers import candidates
+from stages.formats.importers import formats_of
 from stages.io.material import find_material
 from stages.verdict.preflight import check
 from stages.verdict.verdict import plural
@@ -52,7 +52,7 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
 
 def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
     """The folder itself; for a video, or a folder of videos, one with the frames that a run would choose. Raises BadInput."""
-    if (candidates(source, poses.allow_outside, poses.llff_factor)[0] if poses.format == "auto" else poses.format) != "photographs":
+    if formats_of(source, poses)[0] != "photographs":
         return source
     videos = find_material({"": source}, poses.allow_outside, _nothing).videos
     if not videos:

@@ -92,9 +92,9 @@ IMPORTERS: dict[str, Importer] = {
 FORMATS = ("auto", *IMPORTERS)
 
 
-def detect(folder: Path, allow_outside: bool = False, llff_factor: int | str = "auto") -> str:
-    """The name of the format of a source folder; BadInput where it is none."""
-    return candidates(folder, allow_outside, llff_factor)[0]
+def formats_of(folder: Path, settings: Any) -> list[str]:
+    """The format that the settings state, else every one that the folder could be read as, the one to choose first; BadInput where there is none."""
+    return candidates(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else [settings.format]
 
 
 def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str = "auto") -> list[str]:
@@ -135,8 +135,7 @@ def posed_format(folder: Path, settings: Any) -> str | None:
 
 def files(folder: Path, settings: Any) -> list[Path]:
     """The files that the poses stage depends on: those that the format reads, and for photographs those that state their cameras."""
-    name = detect(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else settings.format
-    found, stated = set(IMPORTERS[name].files(folder, settings)), posed_format(folder, settings)
+    found, stated = set(IMPORTERS[formats_of(folder, settings)[0]].files(folder, settings)), posed_format(folder, settings)
     if stated is not None:
         with suppress(BadInput):  # reported where it is read
             found |= set(IMPORTERS[stated].files(folder, settings))

@@ -65,7 +65,7 @@ def test_values_that_cannot_be_are_refused(tmp_path: Path) -> None:
         with pytest.raises(BadInput, match=r"frame_00002\.json"):
             read(folder)
     (folder / "frame_00000.json").write_text('{"cameraPoseARFrame": [1, 0')
-    assert importers.detect(folder) == NAME, "no other format is chosen"
+    assert importers.candidates(folder)[0] == NAME, "no other format is chosen"
     with pytest.raises(BadInput, match=r"frame_00000\.json"):
         read(folder)
 
