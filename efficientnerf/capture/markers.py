@@ -19,6 +19,7 @@ MIN_AGREEING = 0.7  # share of the views of a marker that stood still
 CORNER_BIAS = 0.1  # px of an edge's length that is no noise: what blur does to small markers, alike in all views
 CONFIDENCE = 2.58  # standard deviations of the stated error: 99 %
 ROUNDS = 30
+FLAT = 0.01  # of the second extent of corners: a third up to this is a plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ def common_ratio(ratios: np.ndarray, spread: np.ndarray) -> tuple[float, float, 
     return float(np.exp(mean)), CONFIDENCE * float((spread**-2).sum() ** -0.5) * max(1.0, excess), excess
 
 
-def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> tuple[np.ndarray, float] | None:
+def common_normal(fits: Sequence[SquareFit]) -> tuple[np.ndarray, float] | None:
     """The unit normal of the plane of three markers or more, towards those who see them, and its error (99 %), degrees; None where they lie in none, or along a
     line."""
     if len(fits) < 3:
@@ -95,7 +96,7 @@ def common_normal(fits: Sequence[SquareFit], flat: float = 0.01) -> tuple[np.nda
     points = np.concatenate([fit.corners for fit in fits])
     _, extent, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     faces = np.array([fit.square.rotation[:, 2] for fit in fits])
-    if extent[2] > flat * extent[1] or extent[1] < 0.1 * extent[0]:
+    if extent[2] > FLAT * extent[1] or extent[1] < 0.1 * extent[0]:
         return None
     uneven = extent[2] / np.sqrt(len(fits) - 2)  # corners of one marker miss the plane alike
     shift = 2 * float(np.median([fit.shift for fit in fits]))  # `extent` counts each of the places four times

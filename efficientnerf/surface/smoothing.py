@@ -3,14 +3,12 @@
 V vertices, F faces (counter-clockwise seen from outside).
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from efficientnerf.backends.numba.mesh.normals import smooth_face_normals
-from efficientnerf.backends.pieces import pieces
 from efficientnerf.surface.mesh import face_neighbours, face_vectors, vertex_normals
 
 LEAST_ROUNDS = 6
@@ -68,19 +66,14 @@ def rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
     return max(LEAST_ROUNDS, int(min((reach / max(edge, 1e-300)) ** 2, 1e6)))
 
 
-def smoothed_face_normals(
-    vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float, tick: Callable[[], None] = lambda: None
-) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) unit normals of faces after `rounds` of bilateral smoothing (`smooth_normals`), and twice their areas (F,). `tick` is called often; what it
-    raises stops the work."""
+def smoothed_face_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) unit normals of faces after `rounds` of bilateral smoothing (`smooth_normals`), and twice their areas (F,)."""
     vectors, beside = face_vectors(vertices, faces), face_neighbours(faces, len(vertices))
     area = np.linalg.norm(vectors, axis=1)
     normals = vectors / np.maximum(area, 1e-300)[:, None]
     other = np.empty_like(normals)
     for _ in range(rounds):
-        for part in pieces(len(faces), first=4096):
-            tick()
-            smooth_face_normals(normals, area, beside, sharpness, part.start, part.stop, other)
+        smooth_face_normals(normals, area, beside, sharpness, other)
         normals, other = other, normals
     return normals, area
 

@@ -10,13 +10,14 @@ from efficientnerf.surface.rasteriser import MeshImage
 
 _PAPER = np.array([0.93, 0.93, 0.93])
 _SAMPLES = 600_000
+SIZE = 420  # pixels of a side of `render_sides`
 _MISSED, _ADDED = np.array([0.85, 0.15, 0.1]), np.array([0.1, 0.35, 0.9])
 ROUND = (0.0, 90.0, 180.0, 270.0)
 IN_FRONT = (-36.0, -12.0, 12.0, 36.0)  # of forward-facing captures
 
 
 def render_sides(
-    mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, size: int = 420, turns: Sequence[float] = ROUND, shown: float = 1.0
+    mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, turns: Sequence[float] = ROUND, shown: float = 1.0
 ) -> np.ndarray:
     """Orthographic views of a mesh in a frame with z up, from several sides.
 
@@ -24,7 +25,7 @@ def render_sides(
     elevation  degrees above the horizon
     turns      degrees around z of each view
     shown      share of the vertices, nearest to the middle, that the views are fitted to
-    returns    (2 size, size times the number of views, 3) uint8 sRGB
+    returns    (2 SIZE, SIZE times the number of views, 3) uint8 sRGB
 
     The surface is splatted as a dense point cloud with a depth buffer.
     """
@@ -46,7 +47,7 @@ def render_sides(
         right, up, back = _axes(heading + turn, elevation)
         facing = np.flatnonzero((normals @ back > -0.2) & near)
         visible = local[facing]
-        picked = _front_samples(visible @ right, visible @ up, visible @ back, size)  # (size, size), -1 where nothing is
+        picked = _front_samples(visible @ right, visible @ up, visible @ back)  # (SIZE, SIZE), -1 where nothing is
         picked = np.where(picked >= 0, facing[picked], -1) if len(facing) else picked
         light = back + 0.5 * up - 0.4 * right
         shade = np.clip(normals @ (light / np.linalg.norm(light)), 0, 1) * 0.7 + 0.2
@@ -63,15 +64,15 @@ def _axes(heading: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.
     return right, np.cross(back, right), back
 
 
-def _front_samples(x: np.ndarray, y: np.ndarray, height: np.ndarray, size: int) -> np.ndarray:
-    """(size, size) index of the sample nearest to the viewer in each pixel, of those with x and y in -1..1; -1: none."""
+def _front_samples(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """(SIZE, SIZE) index of the sample nearest to the viewer in each pixel, of those with x and y in -1..1; -1: none."""
     order = np.argsort(height, kind="stable")
-    column = ((x * 0.97 + 1) / 2 * (size - 1)).astype(np.int64)[order]
-    row = ((1 - y * 0.97) / 2 * (size - 1)).astype(np.int64)[order]
-    front = np.full((size, size), -1)
+    column = ((x * 0.97 + 1) / 2 * (SIZE - 1)).astype(np.int64)[order]
+    row = ((1 - y * 0.97) / 2 * (SIZE - 1)).astype(np.int64)[order]
+    front = np.full((SIZE, SIZE), -1)
     # A sample covers two by two pixels, against holes where samples are sparse.
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        last = np.full((size, size), -1)
+        last = np.full((SIZE, SIZE), -1)
         last[row + i, column + j] = np.arange(len(order))  # of several samples in a pixel the last stays
         front = np.maximum(front, last)
     return np.where(front >= 0, order[front], -1) if len(order) else front

@@ -26,7 +26,7 @@ def cells_of_points(point, side, cell):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def update_cells(cell, raw, exponential, flat, parts):  # type: ignore[no-untyped-def]
+def update_occupancy_maximum(cell, raw, exponential, flat, parts):  # type: ignore[no-untyped-def]
     """Raise voxels `flat` (D^3,) to the density of samples in cells (N,) int32, `raw` (N,) activated; masked voxels (-inf) stay masked.
 
     parts  of the voxels, one for each thread, which looks at all samples: no two threads write to one voxel

@@ -55,7 +55,7 @@ def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activat
     if cell is None:
         cell = torch.empty(len(point), dtype=torch.int32)
         occupancy.cells_of_points(_array(point), values.shape[0], cell.numpy())
-    occupancy.update_cells(_array(cell.int()), _array(raw), activation == "exp", values.view(-1).numpy(), numba.get_num_threads())
+    occupancy.update_occupancy_maximum(_array(cell.int()), _array(raw), activation == "exp", values.view(-1).numpy(), numba.get_num_threads())
 
 
 def random_cells(values: Tensor, threshold: float, count: int, seed: int) -> Tensor:
