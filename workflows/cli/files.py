@@ -1,7 +1,7 @@
 """`enerf export`, `enerf render` and `enerf inspect`: commands on a run or an asset file."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from pipeline.run import Run
 from stages.figures.frames import RenderOptions, encode_frames, render_frames
+from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
 from stages.formats.exporters.frames import frame_background
 from stages.framing.restriction import restricted, with_region
 from stages.io.camera_path import read_camera_path
@@ -40,7 +41,19 @@ EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
 Crop = tuple[float, float, float, float, float, float] | None
 
 
-@click.command()
+def _either(formats: Iterable[str]) -> str:
+    *others, last = formats
+    return f"{', '.join(others)} or {last}"
+
+
+@click.command(
+    help=f"""Export RUN or ASSET: a mesh as {_either(MESH_EXPORTERS)}; with --points a point cloud as {_either(POINT_EXPORTERS)}; with --splats 3D Gaussians as
+    {_either(SPLAT_EXPORTERS)}; the voxels as a volume ({", ".join(VOLUME_EXPORTERS)}); a viewer page (.html); or the cameras of RUN as .json (nerfstudio).
+
+    Each file is written completely or not at all. An existing file is replaced only with --force, a file of a run never. Results of the run's stages mesh
+    and splats are reused if their settings are the same. Settings of the stages mesh, points and splats apply: '--set mesh.max_faces=...'.
+    """
+)
 @click.argument("what", metavar="RUN|ASSET", required=False, type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
@@ -68,12 +81,6 @@ def export(
     what: Path | None, first: Path | None, more: tuple[Path, ...], as_list: bool, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool,
     **given: Any,
 ) -> None:
-    """Export RUN or ASSET: a mesh as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl; with --points a point cloud as .ply, .xyz, .las or .laz; with
-    --splats 3D Gaussians as .ply, .spz, .sog or .glb; the voxels as a volume (.vdb); a viewer page (.html); or the cameras of RUN as .json (nerfstudio).
-
-    Each file is written completely or not at all. An existing file is replaced only with --force, a file of a run never. Results of the run's stages mesh
-    and splats are reused if their settings are the same. Settings of the stages mesh, points and splats apply: '--set mesh.max_faces=...'.
-    """
     if as_list:
         rows = exporting.formats()
         if as_json:
