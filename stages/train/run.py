@@ -18,9 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import model
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.settings import resolved
@@ -76,7 +73,7 @@ def trained(job: Job) -> bool:
     checkpoints = Checkpoints(job)
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
-    render = partial(colours_seen, FieldRenderer(m, near, far))
+    render = FieldRenderer(m, near, far).colour
     previews = Previews(render, m.background, folder, s, job.work, resolved(settings.preview_every))
     previews.draw_when_due(t.step)
     budget = begin_budget(job, t, watch.seconds + spent + clock() - began)
@@ -109,11 +106,6 @@ def trained(job: Job) -> bool:
     log.draw_curve(outputs.curve)
     previews.publish(outputs.previews, job.warn)
     return True
-
-
-def colours_seen(renderer: FieldRenderer, camera: Camera) -> np.ndarray:
-    """Colours (H, W, 3) that a camera sees."""
-    return renderer.colour(camera)
 
 
 def sparse_depth(job: Job, folder: Path, s: Scene, settings: TrainSettings) -> SparseDepthRays | None:
