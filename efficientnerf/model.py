@@ -14,7 +14,7 @@ from efficientnerf.fields.field import Field
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import RayBundle, Space, voxel_centres
 from efficientnerf.rendering.compositing import Composite
-from efficientnerf.rendering.harmonics import C0, basis, harmonics_count
+from efficientnerf.rendering.harmonics import C0, harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples
 from efficientnerf.sampling.strategies import Efficient, Hierarchical, Intervals, SamplingRequest, Strategy, Uniform, Valid
@@ -35,7 +35,7 @@ class Sky(nn.Module):
 
     def forward(self, directions: Tensor) -> Tensor:
         """Colours (R, 3) along unit directions (R, 3)."""
-        return torch.sigmoid(basis(directions, SKY_DEGREE) @ self.sh)
+        return torch.sigmoid(dispatch.basis(directions, SKY_DEGREE) @ self.sh)
 
     @torch.no_grad()
     def begin_with(self, colour: np.ndarray) -> None:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends import Notice
+from efficientnerf.backends.layout import PixelTables
 from efficientnerf.backends.torch.hash_grid import HashLevels
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import Space
@@ -36,13 +37,15 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
     "pivotal_samples": {"torch": "sampling.pivotal", "numba": "backends.numba.operations", "triton": "backends.triton.sampling"},
     "composite": {"torch": "rendering.compositing", "numba": "backends.numba.operations", "triton": "backends.triton.compositing"},
     "scaled_by_distance": {"torch": "rendering.compositing", "numba": "backends.numba.operations"},
+    "basis": {"torch": "rendering.harmonics", "numba": "backends.numba.operations"},
+    "sparse_depth_errors": {"torch": "backends.torch.sparse_depth", "numba": "backends.numba.operations"},
     "encode": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "hash_network": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "update_occupancy_maximum": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
     "random_cells": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
     "points_in_cells": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
     "adam": {"torch": "backends.torch.adam", "numba": "backends.numba.operations", "triton": "backends.triton.adam"},
-    "ray_directions": {"torch": "backends.torch.rays", "numba": "backends.numba.operations"},
+    "pixel_rays": {"torch": "backends.torch.rays", "numba": "backends.numba.operations"},
     "tree_rays": {"numba": "backends.numba.operations", "triton": "backends.triton.tree"},
 }
 # The module whose `optimise`, `total_loss` and `max_weights` fit trees to photographs; see `efficientnerf.asset.refinement.fit`.
@@ -67,8 +70,13 @@ def on_device(*tensors: Tensor) -> bool:
 def implementation(name: str, backend: Backend) -> Callable[..., Any]:
     """The function of a backend, or torch's where it has none."""
     modules = OPERATIONS[name]
-    module = modules[backend] if backend in modules else modules["torch"]
-    return getattr(importlib.import_module(f"efficientnerf.{module}"), name)
+    return _function(modules[backend] if backend in modules else modules["torch"], name)
+
+
+@functools.cache
+def _function(module: str, name: str) -> Callable[..., Any]:
+    function: Callable[..., Any] = getattr(importlib.import_module(f"efficientnerf.{module}"), name)
+    return function
 
 
 def fitting(backend: Backend) -> Any:
@@ -146,6 +154,17 @@ def scaled_by_distance(values: Tensor, start: Tensor, first: Tensor, subject: Te
     return implementation("scaled_by_distance", backend_of(values, start, subject))(values, start, first, subject)
 
 
+def basis(directions: Tensor, degree: int) -> Tensor:
+    """See `efficientnerf.rendering.harmonics.basis`; without gradients but for torch."""
+    return implementation("basis", backend_of(directions))(directions, degree)
+
+
+def sparse_depth_errors(weight: Tensor, start: Tensor, extent: Tensor, first: Tensor, distance: Tensor, on_support: Tensor, width: float) -> Tensor:
+    """See `efficientnerf.backends.torch.sparse_depth.sparse_depth_errors`."""
+    errors = implementation("sparse_depth_errors", backend_of(weight, start, extent, distance))
+    return errors(weight, start, extent, first, distance, on_support, width)
+
+
 def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
     """See `efficientnerf.backends.torch.hash_grid.encode`. With numba the gradient of the table is added to the buffer, not handed to autograd."""
     return implementation("encode", backend_of(points, table))(points, table, levels, gradient)
@@ -182,9 +201,10 @@ def adam(
     step(value, grad, first, second, rate, beta1, beta2, correction1, correction2, epsilon, skip_zeros=skip_zeros)
 
 
-def ray_directions(lookup: Tensor, begin: Tensor, knots: Tensor, stride: int, pixel: Tensor, width: Tensor, rotation: Tensor, view: Tensor) -> Tensor:
-    """See `efficientnerf.backends.torch.rays.ray_directions`."""
-    return implementation("ray_directions", backend_of(lookup, rotation))(lookup, begin, knots, stride, pixel, width, rotation, view)
+def pixel_rays(tables: PixelTables, stride: int, index: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `efficientnerf.backends.torch.rays.pixel_rays`."""
+    found: tuple[Tensor, Tensor, Tensor, Tensor] = implementation("pixel_rays", backend_of(tables.lookup, tables.rotation))(tables, stride, index)
+    return found
 
 
 def tree_backend(tree: NerfTree) -> Backend:

@@ -30,6 +30,20 @@ class SampleColumns(NamedTuple):
     point: Any
 
 
+class PixelTables(NamedTuple):
+    """What the rays of pixels are made of; C views, their pixels end to end, row by row."""
+
+    lookup: Any  # (K, 3) unit directions in the camera at every `stride`-th pixel, the tables of all lenses end to end
+    lens: Any  # (C,) first entry of each view in `lookup`
+    knots: Any  # (C,) entries of a row
+    offsets: Any  # (C + 1,) first pixel of each view
+    width: Any  # (C,) pixels of a row
+    rotation: Any  # (C, 3, 3) camera to world
+    centre: Any  # (C, 3)
+    near: Any  # (C,) along the view axis
+    far: Any
+
+
 class RayTargets(NamedTuple):
     """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
 

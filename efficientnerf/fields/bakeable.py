@@ -2,8 +2,8 @@
 
 from torch import Tensor, nn
 
+from efficientnerf.backends import dispatch
 from efficientnerf.fields.gradient_buffer import GradientBuffer
-from efficientnerf.rendering.harmonics import basis
 
 
 class BakeableField(nn.Module):
@@ -20,4 +20,4 @@ class BakeableField(nn.Module):
         return out
 
     def harmonics(self, directions: Tensor) -> Tensor:
-        return basis(directions, self.degree)
+        return dispatch.basis(directions, self.degree)

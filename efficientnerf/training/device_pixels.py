@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.backends import dispatch
+from efficientnerf.backends.layout import PixelTables
 from efficientnerf.backends.transfer import to_device
 from efficientnerf.training.pixels import Pixels
 
@@ -17,9 +18,7 @@ class DevicePixels:
 
     def __init__(self, pixels: Pixels, device: str | torch.device) -> None:
         self.pixels, self.device = pixels, torch.device(device)
-        self.offsets, self.width, self.near, self.far = (self._to_device(a) for a in (pixels.offsets, pixels.width, pixels.near, pixels.far))
-        self.lens, self.knots, self.rotation = (self._to_device(a) for a in (pixels.lens, pixels.knots, pixels.rotation))
-        self.centre, self.lookup = self._to_device(pixels.centre), self._to_device(pixels.lookup)
+        self.tables = PixelTables(*map(self._to_device, pixels.tables))
         room = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else np.inf
         self.images = self._images_to_device() if pixels.images.nbytes <= MEMORY_FRACTION * room else None
 
@@ -56,8 +55,4 @@ class DevicePixels:
         """`Pixels.bundle` on the device."""
         at = self.to_device(index)
         colour = self.to_device(self.pixels.images[index]) if self.images is None else self.images[at]
-        view = torch.searchsorted(self.offsets, at, right=True) - 1
-        pixel = at - self.offsets[view]
-        directions = dispatch.ray_directions(self.lookup, self.lens, self.knots, self.pixels.stride, pixel, self.width, self.rotation, view)
-        cosine = (directions * self.rotation[view, :, 2]).sum(dim=1).clamp(min=1e-3)  # near and far are measured along the view axis
-        return self.centre[view], directions, self.near[view] / cosine, self.far[view] / cosine, colour.float() / 255
+        return *dispatch.pixel_rays(self.tables, self.pixels.stride, at), colour.float() / 255

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from efficientnerf.backends import dispatch
+from efficientnerf.backends.layout import PixelTables
 from efficientnerf.geometry.cameras import Camera, rays
 
 EXACT = 2**23  # pixels of all lenses together up to which each has a direction of its own (12 bytes each)
@@ -197,22 +198,19 @@ class Pixels:
 
     def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""
-        view = self.view_of(index)
-        origins, directions, colours = self._rays(index, view)
-        slant = np.einsum("ri,ri->r", directions, self.rotation[view, :, 2])
-        slant = np.maximum(slant, 1e-3)  # near and far are measured along the view axis
-        return origins, directions, self.near[view] / slant, self.far[view] / slant, colours
+        tables = PixelTables(*map(torch.from_numpy, self.tables))
+        origins, directions, near, far = (t.numpy() for t in dispatch.pixel_rays(tables, self.stride, torch.from_numpy(index)))
+        return origins, directions, near, far, self.images[index].astype(np.float32) / np.float32(255)
 
     def rays(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """origins, directions and colours of `bundle`."""
-        return self._rays(index, self.view_of(index))
+        origins, directions, _, _, colours = self.bundle(index)
+        return origins, directions, colours
 
-    def _rays(self, index: np.ndarray, view: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        lookup, lens, knots, pixel, width, rotation, of = map(
-            torch.from_numpy, (self.lookup, self.lens, self.knots, index - self.offsets[view], self.width, self.rotation, view)
-        )
-        directions = dispatch.ray_directions(lookup, lens, knots, self.stride, pixel, width, rotation, of).numpy()
-        return self.centre[view], directions, self.images[index].astype(np.float32) / np.float32(255)
+    @property
+    def tables(self) -> PixelTables:
+        """What rays are made of, as arrays."""
+        return PixelTables(self.lookup, self.lens, self.knots, self.offsets, self.width, self.rotation, self.centre, self.near, self.far)
 
 
 def _set_at(bits: np.ndarray | None, index: np.ndarray) -> np.ndarray:

@@ -7,17 +7,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.backends import transfer
+from efficientnerf.backends import dispatch
 from efficientnerf.backends.transfer import to_device
 from efficientnerf.model import UNSEEN, Model, RayOutputs
-from efficientnerf.rendering.compositing import ray_of_sample
-from efficientnerf.sampling.samples import Samples
 from efficientnerf.training.losses import mean_over
 
 # docs/experiments/losses.md
 RAYS_PER_RAY = 8  # one ray to a sparse point for so many rays of pixels
 POINTS_PER_SUPPORT_RAY = 4
-LEAST_LIGHT = 0.05  # that reaches a support, below which what stands before it hides it
 WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as at the point
 
 
@@ -77,27 +74,9 @@ def sparse_depth_loss(outputs: RayOutputs, distance: Tensor, on_support: Tensor,
     distance, on_support  (A,) of `AimedRays`, in the world
     complete              (R + A,) bool, rays that count; None: all
     """
-    count, rays = len(distance), len(outputs.rays.near)
-    distance = outputs.rays.last(count).frame_distance(distance)
+    distance = outputs.rays.last(len(distance)).frame_distance(distance)
     loss = distance.new_zeros(())
     for samples, weight, parts in ((outputs.coarse, outputs.coarse_weight, 1), (outputs.fine, outputs.fine_weight, samples_per_pivot)):
-        start, extent, of_last, ray = _of_last(samples, weight, rays - count)
-        past = (start + extent / 2 - distance[ray]) / (WIDTH * parts * extent).clamp(min=1e-12)
-        zero = of_last.new_zeros(count)
-        near = zero.index_add(0, ray, of_last * (1 - past.abs()).clamp(min=0))
-        reaching, ending = (1 - zero.index_add(0, ray, of_last * (past <= -1))), zero.index_add(0, ray, of_last * (past.abs() < 1))
-        passing = reaching.detach().clamp(min=0) * (1 - ending / reaching.clamp(min=LEAST_LIGHT))
-        each = torch.where(on_support, passing, 1 - near)
-        loss = loss + (each.mean() if complete is None else mean_over(each, complete[-count:]))
+        each = dispatch.sparse_depth_errors(weight, samples.start, samples.extent, samples.first, distance, on_support, WIDTH * parts)
+        loss = loss + (each.mean() if complete is None else mean_over(each, complete[-len(distance) :]))
     return loss
-
-
-def _of_last(samples: Samples, weight: Tensor, before: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Starts, extents and weights of the samples of all rays but the first `before`, and their rays, from 0. On a device, whose host would wait for their
-    number, those of all rays, the others with a weight of zero."""
-    if transfer.is_on_device(samples.first):
-        ray = ray_of_sample(samples.first, len(samples.start)) - before
-        return samples.start, samples.extent, torch.where(ray >= 0, weight, 0), ray.clamp(min=0)
-    begin = int(samples.first[before])
-    ray = ray_of_sample(samples.first[before:] - begin, len(samples.start) - begin)
-    return samples.start[begin:], samples.extent[begin:], weight[begin:], ray

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import RayBundle, SampleColumns
+from efficientnerf.backends.layout import PixelTables, RayBundle, SampleColumns
 from efficientnerf.backends.numba import adam as kernel
-from efficientnerf.backends.numba import compositing, hash_grid, mlp, occupancy, rays, sampling
+from efficientnerf.backends.numba import compositing, harmonics, hash_grid, mlp, occupancy, rays, sampling, sparse_depth
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.sampling import Box
 from efficientnerf.backends.numba.tree import nearest
@@ -19,11 +19,12 @@ from efficientnerf.backends.torch.hash_grid import HashLevels
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.rendering.compositing import Composite
+from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.sampling.samples import Samples
 
 
 def _array(t: Tensor) -> np.ndarray:
-    return t.detach().contiguous().numpy()
+    return (t.detach() if t.requires_grad else t).contiguous().numpy()
 
 
 def _box(space: Space) -> Box:
@@ -102,6 +103,32 @@ def scaled_by_distance(values: Tensor, start: Tensor, first: Tensor, subject: Te
     return out
 
 
+def basis(directions: Tensor, degree: int) -> Tensor:
+    out = torch.empty(len(directions), harmonics_count(degree))
+    harmonics.basis(_array(directions), degree, out.numpy())
+    return out
+
+
+def sparse_depth_errors(weight: Tensor, start: Tensor, extent: Tensor, first: Tensor, distance: Tensor, on_support: Tensor, width: float) -> Tensor:
+    errors: Tensor = _SparseDepthErrors.apply(weight, start, extent, first, distance, on_support, width)
+    return errors
+
+
+class _SparseDepthErrors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *given: Any) -> Tensor:
+        *tensors, width = given
+        ctx.arrays, ctx.width, out = [_array(t) for t in tensors], np.float32(width), torch.empty(len(tensors[4]))
+        sparse_depth.sparse_depth_errors(*ctx.arrays, ctx.width, out.numpy())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        grad_weight = torch.zeros(len(ctx.arrays[0]))
+        sparse_depth.sparse_depth_errors_backward(_array(grads[0]), *ctx.arrays, ctx.width, grad_weight.numpy())
+        return grad_weight, None, None, None, None, None, None
+
+
 def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
     """Differentiable in the table, whose gradient is added to the buffer `gradient`, not handed to autograd."""
     return _Encode.apply(points, table, levels, gradient)
@@ -173,9 +200,9 @@ def adam(
     kernel.adam(*flat, *(np.float32(x) for x in (rate, beta1, beta2, correction1, correction2, epsilon)), skip_zeros)
 
 
-def ray_directions(lookup: Tensor, begin: Tensor, knots: Tensor, stride: int, pixel: Tensor, width: Tensor, rotation: Tensor, view: Tensor) -> Tensor:
-    out = torch.empty(len(view), 3)
-    rays.ray_directions(*(_array(t) for t in (lookup, begin, knots)), stride, *(_array(t) for t in (pixel, width, rotation, view)), out.numpy())
+def pixel_rays(tables: PixelTables, stride: int, index: Tensor) -> tuple[Tensor, ...]:
+    out = torch.empty(len(index), 3), torch.empty(len(index), 3), torch.empty(len(index)), torch.empty(len(index))
+    rays.pixel_rays(PixelTables(*map(_array, tables)), stride, _array(index), *(t.numpy() for t in out))
     return out
 
 

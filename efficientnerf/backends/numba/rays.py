@@ -1,4 +1,4 @@
-"""Rays on the CPU (numba, all cores): into normalised device coordinates and hits back into the world, and directions of pixels.
+"""Rays on the CPU (numba, all cores): into normalised device coordinates and hits back into the world, and rays of pixels.
 
 The reference of the first, and the meaning of the letters, is `efficientnerf.geometry.ndc`; here each ray is warped in one pass. R rays.
 """
@@ -6,6 +6,7 @@ The reference of the first, and the meaning of the letters, is `efficientnerf.ge
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.torch.rays import LEAST_SLANT
 from efficientnerf.geometry.ndc import BEYOND, Ndc, NdcRays
 
 BLOCK = 4096  # rays per task
@@ -106,19 +107,21 @@ def unwarp_hits(ndc: Ndc, warped: NdcRays, distance: np.ndarray, normal: np.ndar
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def ray_directions(lookup, begin, knots, stride, pixel, width, rotation, view, out):  # type: ignore[no-untyped-def]
-    """World directions of pixels of several views into out (N, 3): rotation[view] of a direction interpolated in the view's lens table.
-
-    lookup               (., 3) camera-frame directions at knots `stride` pixels apart, the tables of all lenses end to end
-    begin, knots, width  of each view: start of its table, knots per row, and pixels per row
-    pixel, view          (N,) row-major pixel and its view
-    rotation             (V, 3, 3) world from camera
-    """
+def pixel_rays(tables, stride, index, origins, directions, near, far):  # type: ignore[no-untyped-def]
+    """`efficientnerf.backends.torch.rays.pixel_rays` into origins and directions (R, 3), near and far (R,)."""
+    lookup, lens, knots, offsets, width, rotation, centre, all_near, all_far = tables
     one = np.float32(1)
-    for n in numba.prange(len(view)):
-        v = view[n]
-        row, column = pixel[n] // width[v], pixel[n] % width[v]
-        at = begin[v] + row // stride * knots[v] + column // stride
+    for n in numba.prange(len(index)):
+        v, last = 0, len(offsets) - 1  # the view whose pixels these are
+        while last - v > 1:
+            middle = (v + last) // 2
+            if offsets[middle] <= index[n]:
+                v = middle
+            else:
+                last = middle
+        pixel = index[n] - offsets[v]
+        row, column = pixel // width[v], pixel % width[v]
+        at = lens[v] + row // stride * knots[v] + column // stride
         x, y, z = lookup[at, 0], lookup[at, 1], lookup[at, 2]
         if stride > 1:
             f, g = np.float32(column % stride) / np.float32(stride), np.float32(row % stride) / np.float32(stride)
@@ -129,5 +132,10 @@ def ray_directions(lookup, begin, knots, stride, pixel, width, rotation, view, o
             z = a * z + b * lookup[right, 2] + c * lookup[at + below, 2] + d * lookup[right + below, 2]
             length = np.sqrt(x * x + y * y + z * z)
             x, y, z = x / length, y / length, z / length
+        slant = np.float32(0)
         for axis in range(3):
-            out[n, axis] = rotation[v, axis, 0] * x + rotation[v, axis, 1] * y + rotation[v, axis, 2] * z
+            along = rotation[v, axis, 0] * x + rotation[v, axis, 1] * y + rotation[v, axis, 2] * z
+            origins[n, axis], directions[n, axis] = centre[v, axis], along
+            slant += along * rotation[v, axis, 2]
+        slant = max(slant, np.float32(LEAST_SLANT))
+        near[n], far[n] = all_near[v] / slant, all_far[v] / slant

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.backends.dispatch import OPERATIONS, Backend, backend_of, implementation
+from efficientnerf.backends.layout import PixelTables
 from efficientnerf.backends.torch.hash_grid import HashLevels
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import space_from
@@ -345,26 +346,75 @@ def scaled_by_distance_case() -> Case:
     return Case(lambda operation, **given: [operation(**given)], loop, inputs)
 
 
-def ray_directions_case(stride: int) -> Case:
-    """Two views of different sizes, every pixel."""
+def basis_case(degree: int) -> Case:
+    """More directions than a block of the kernel, those along the axes among them."""
+    directions = np.random.default_rng(0).normal(size=(700, 3))
+    directions[:6] = np.concatenate([np.eye(3), -np.eye(3)])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+
+    def loop(directions: np.ndarray) -> list[np.ndarray]:
+        return [np.array([reference.harmonics(direction.tolist(), degree) for direction in directions])]
+
+    return Case(lambda basis, directions: [basis(directions, degree)], loop, {"directions": torch.from_numpy(directions.astype(np.float32))}, atol=2e-6)
+
+
+def sparse_depth_errors_case() -> Case:
+    """More aimed rays than a block of the kernel, half of them to a support, some without samples, some whose support is hidden; other rays before them."""
+    rng = np.random.default_rng(0)
+    counts = rng.integers(0, 9, 150)
+    first, samples = np.concatenate([[0], np.cumsum(counts)]), int(counts.sum())
+    rays = np.repeat(np.arange(150), counts)
+    weight = rng.random(samples) * (0.9 / counts[rays]) * np.where(rays % 5 == 0, 1.1, rng.random(samples))
+    inputs = {
+        "weight": torch.from_numpy(weight.astype(np.float32)), "start": torch.from_numpy(rng.uniform(0, 3, samples).astype(np.float32)),
+        "extent": torch.from_numpy(rng.uniform(0.05, 0.4, samples).astype(np.float32)), "first": torch.from_numpy(first),
+        "distance": torch.from_numpy(rng.uniform(0.5, 3.5, 100).astype(np.float32)), "on_support": torch.from_numpy(np.arange(100) >= 50),
+    }  # fmt: skip
+
+    def loop(weight: np.ndarray, start: np.ndarray, extent: np.ndarray, first: np.ndarray, distance: np.ndarray, on_support: np.ndarray) -> list[np.ndarray]:
+        found = []
+        for a, (at, support) in enumerate(zip(distance, on_support, strict=True)):
+            own = range(first[50 + a], first[51 + a])
+            past = {n: (start[n] + extent[n] / 2 - at) / (2 * extent[n]) for n in own}
+            if not support:
+                found.append(1 - sum(weight[n] * max(0, 1 - abs(past[n])) for n in own))
+                continue
+            light = 1 - sum(weight[n] for n in own if past[n] <= -1)
+            fixed = 1 - sum(float(inputs["weight"][n]) for n in own if past[n] <= -1)  # the light before it has no gradient
+            found.append(max(0, fixed) * (1 - sum(weight[n] for n in own if abs(past[n]) < 1) / max(light, 0.05)))
+        return [np.array(found)]
+
+    return Case(lambda operation, **given: [operation(**given, width=2.0)], loop, inputs, ("weight",))
+
+
+def pixel_rays_case(stride: int) -> Case:
+    """Two views of different sizes, every pixel; some rays run so far off the axis that the planes are as of 1e-3."""
     rng = np.random.default_rng(0)
     width, height = np.array([9, 12]), np.array([7, 5])
     knots, rows = -(-(width - 1) // stride) + 1, -(-(height - 1) // stride) + 1
     lookup = rng.normal(size=(int((knots * rows).sum()), 3)) * 0.1 + [0, 0, 1]
-    view = np.repeat([0, 1], width * height)
-    inputs = {
+    lookup[:9] = rng.normal(size=(9, 3)) * [1, 1, 1e-4]
+    tables = {
         "lookup": torch.from_numpy((lookup / np.linalg.norm(lookup, axis=1, keepdims=True)).astype(np.float32)),
-        "begin": torch.tensor([0, int(knots[0] * rows[0])]), "knots": torch.from_numpy(knots),
-        "pixel": torch.cat([torch.arange(63), torch.arange(60)]), "width": torch.from_numpy(width),
-        "rotation": torch.from_numpy(np.stack([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2)]).astype(np.float32)), "view": torch.from_numpy(view),
+        "lens": torch.tensor([0, int(knots[0] * rows[0])]), "knots": torch.from_numpy(knots), "offsets": torch.tensor([0, 63, 123]),
+        "width": torch.from_numpy(width), "rotation": torch.from_numpy(np.stack([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2)]).astype(np.float32)),
+        "centre": torch.from_numpy(rng.normal(size=(2, 3)).astype(np.float32)), "near": torch.tensor([0.5, 0.7]), "far": torch.tensor([2.0, 3.0]),
     }  # fmt: skip
 
-    def loop(**given: np.ndarray) -> list[np.ndarray]:
-        lookup, begin, knots, pixel, width, rotation, view = given.values()
-        found = [reference.pixel_direction(lookup, begin[v], knots[v], stride, int(p), int(width[v]), rotation[v]) for p, v in zip(pixel, view, strict=True)]
-        return [np.array(found) / (np.linalg.norm(found, axis=1, keepdims=True) if stride > 1 else 1)]
+    def loop(index: np.ndarray, **tables: np.ndarray) -> list[np.ndarray]:
+        found, t = [], PixelTables(**tables)
+        for p, v in zip(index, np.searchsorted(t.offsets, index, side="right") - 1, strict=True):
+            pixel = int(p - t.offsets[v])
+            along = reference.pixel_direction(t.lookup, t.lens[v], t.knots[v], stride, pixel, int(t.width[v]), t.rotation[v])
+            along = along if stride == 1 else along / np.linalg.norm(along)
+            slant = max(float(along @ t.rotation[v][:, 2]), 1e-3)
+            found.append((t.centre[v], along, t.near[v] / slant, t.far[v] / slant))
+        return [np.array(column) for column in zip(*found, strict=True)]
 
-    return Case(lambda operation, **given: [operation(**given, stride=stride)], loop, inputs)
+    def call(operation: Operation, index: Tensor, **tables: Tensor) -> list[Tensor]:
+        return list(operation(PixelTables(**tables), stride, index))
+
+    return Case(call, loop, {**tables, "index": torch.arange(123)})
 
 
 def tree_rays_case(lookup: str) -> Case:
@@ -397,6 +447,8 @@ CASES: dict[str, dict[str, Callable[[], Case]]] = {
     "pivotal_samples": {f"{'contracted' if c else 'box'}": lambda c=c: pivotal_samples_case(c, 3) for c in (False, True)},  # type: ignore[misc]
     "composite": {f"{a}-{d}": lambda a=a, d=d: composite_case(a, d) for a, d in (("exp", 0), ("softplus", 1), ("exp", 2))},  # type: ignore[misc]
     "scaled_by_distance": {"": scaled_by_distance_case},
+    "basis": {f"{degree}": lambda degree=degree: basis_case(degree) for degree in range(5)},  # type: ignore[misc]
+    "sparse_depth_errors": {"": sparse_depth_errors_case},
     "encode": {"": encode_case},
     "hash_network": {f"{n}": lambda n=n: hash_network_case(n) for n in (1, 2)},  # type: ignore[misc]
     "update_occupancy_maximum": {a: lambda a=a: update_occupancy_case(a) for a in ("exp", "softplus")}  # type: ignore[misc]
@@ -404,7 +456,7 @@ CASES: dict[str, dict[str, Callable[[], Case]]] = {
     "random_cells": {f"{valid}": lambda valid=valid: random_cells_case(valid) for valid in (0, 1, 60)},  # type: ignore[misc]
     "points_in_cells": {"": points_in_cells_case},
     "adam": {"dense": lambda: adam_case(False), "sparse": lambda: adam_case(True)},
-    "ray_directions": {"each": lambda: ray_directions_case(1), "knots": lambda: ray_directions_case(4)},
+    "pixel_rays": {"each": lambda: pixel_rays_case(1), "knots": lambda: pixel_rays_case(4)},
     "tree_rays": {lookup: lambda lookup=lookup: tree_rays_case(lookup) for lookup in ("trilinear", "nearest")},  # type: ignore[misc]
 }
 ALL = [
@@ -437,3 +489,17 @@ def test_the_backend_is_chosen_by_device_and_type() -> None:
     assert backend_of(single, double) == "torch"
     assert backend_of(torch.zeros(2, device="meta")) == "torch"
     assert implementation("update_occupancy_maximum", "triton") is implementation("update_occupancy_maximum", "torch")
+
+
+@pytest.mark.parametrize(("name", "differentiable"), [("sparse_depth_errors", "weight"), ("basis", "")])
+def test_a_kernel_gives_the_references_bytes(name: str, differentiable: str) -> None:
+    for case in CASES[name].values():
+        found = []
+        for backend in ("torch", "numba"):
+            inputs = placed(case(), "cpu")
+            values = case().call(implementation(name, backend), **inputs)
+            if differentiable:
+                sum((value * torch.linspace(-1, 2, value.numel()).reshape(value.shape)).sum() for value in values).backward()  # type: ignore[union-attr]
+                values = [*values, gradient_of(inputs[differentiable])]
+            found.append(values)
+        assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
