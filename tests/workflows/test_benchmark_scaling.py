@@ -5,7 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.scaling import Watch, as_markdown, predicted, serial_seconds
+from benchmarks.scaling import CACHED, Bytes, Watch, as_markdown, bandwidth, predicted, serial_seconds
+from efficientnerf.backends.numba.adam import adam
 from pipeline.text import printable
 
 
@@ -35,9 +36,40 @@ def test_time_counts_with_the_innermost_function_of_the_project() -> None:
     assert watch.seconds["libraries"] > 0.2
 
 
+def test_seconds_are_no_fewer_than_bytes_take() -> None:
+    # Of 10 s, 2 are serial; 80 GB take 8 s at 10 GB/s.
+    assert predicted(10.0, 6.0, 4, 8e10, 4e10) == pytest.approx(4.0)  # either takes 2 s
+    assert predicted(10.0, 6.0, 16, 8e10, 4e10) == pytest.approx(4.0)  # the bytes take longer
+    assert predicted(10.0, 6.0, 16, 8e10, 16e10) == pytest.approx(2.5)
+
+
+def test_bandwidth_grows_with_the_cores_up_to_the_machines() -> None:
+    machine = {4: 3e10, 64: 1e11}
+    assert [bandwidth(cores, 1e10, machine) for cores in (1, 2, 4, 64)] == [1e10, 2e10, 3e10, 1e11]
+    assert bandwidth(4, 5e9, machine) == 2e10
+
+
+def test_large_arrays_of_kernels_are_counted_once_a_call() -> None:
+    large, small = (np.zeros(count, np.float32) for count in (CACHED // 4, 8))
+    with Bytes() as counted:
+        counted.add((large, (small, large), 3, (large[: CACHED // 8],)))
+    assert counted.moved == CACHED
+    rates = (np.float32(0.1),) * 6
+    with Bytes() as counted:
+        adam(*(large.copy() for _ in range(4)), *rates, False)
+        adam(*(small.copy() for _ in range(4)), *rates, False)
+    assert counted.moved == 4 * CACHED
+    adam(*(large.copy() for _ in range(4)), *rates, False)
+    assert counted.moved == 4 * CACHED
+
+
 def test_the_table_begins_with_what_is_most_serial() -> None:
-    found = {"processor": "P", "triad": [1e10, 2e10], "stages": {"train": {"": [10.0, 6.0], "a f": [4.0, 4.0], "b g": [6.0, 3.0]}}}
-    table = as_markdown(found)
+    found = {"processor": "P", "triad": [1e10, 2e10], "stages": {"train": {"": [10.0, 6.0], "a f": [4.0, 4.0], "b g": [6.0, 3.0]}}, "bytes": {"train": 6e10}}
+    table = as_markdown(found, {8: 3e10, 64: 1.2e11})
     assert "10.0 GB/s on one core, 20.0 on two" in table
-    assert "| train | 10.0 | 6.0 | 2.0 | 20% | 4.0 | 3.0 | 2.5 | 2.1 |" in table
-    assert table.index("| a f | 4.0 | 4.0 | 4.0 | 100% |") < table.index("| b g | 6.0 | 3.0 | 0.0 | 0% |")
+    assert "assumed 40 GB/s on 4, 30 GB/s on 8, 160 GB/s on 16, 120 GB/s on 64" in table
+    assert "| train | 10.0 | 6.0 | 2.0 | 20% | 60 | 4.0 | 4.0 | 2.5 | 2.5 |" in table
+    assert "| all | 10.0 | 6.0 | 2.0 | 20% | 60 | 4.0 | 4.0 | 2.5 | 2.5 |" in table
+    assert table.index("| a f | 4.0 | 4.0 | 4.0 | 100% |  |") < table.index("| b g | 6.0 | 3.0 | 0.0 | 0% |")
+    found["bytes"] = {"train": 1e13}  # more than one core can have moved in eight seconds
+    assert "| train | 10.0 | 6.0 | 2.0 | 20% | 80 |" in as_markdown(found)
