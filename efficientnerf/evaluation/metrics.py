@@ -13,7 +13,7 @@ from skimage.metrics import structural_similarity
 
 WINDOW = 11  # pixels a side of SSIM's Gaussian window
 BAND = 256  # rows of an image that are compared at a time
-SSIM_BAND = 64  # that a thread compares at a time
+SSIM_BAND, SSIM_THREADS = 64, 16  # that a thread compares at a time, and threads at most: each takes about 100 bytes a pixel of its band
 
 
 def mean_squared_error(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -98,7 +98,7 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         )  # fmt: skip
         similarity[rows][border:-border] = part[border:-border]
 
-    with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # SciPy's filters let Python go on
+    with ThreadPoolExecutor(min(SSIM_THREADS, torch.get_num_threads())) as threads:  # SciPy's filters let Python go on
         deque(threads.map(compare, range(border, len(image) - border, SSIM_BAND)), maxlen=0)
     return similarity[border:-border, border:-border]
 

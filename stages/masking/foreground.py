@@ -31,6 +31,7 @@ from stages.masking.first_training import RAYS, SIDE, FirstField, first_field, f
 from stages.masking.made import write_mask
 from stages.masking.subject import Subject, coverage, subject_of
 from stages.memory.need import refuse_what_does_not_fit
+from stages.poses.memory import reading_threads
 from stages.scratch import note, noted
 
 # docs/experiments/silhouettes.md
@@ -102,7 +103,8 @@ def _pictures(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[np.n
         except UnreadableImage as error:
             return error
 
-    found = list(in_order(read, capture.photos, count_cores(), job.safe_point))
+    threads = reading_threads(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos], count_cores())
+    found = list(in_order(read, capture.photos, threads, job.safe_point))
     images = [each for each in found if isinstance(each, np.ndarray)]
     failed = [(photo.camera.name, str(each)) for photo, each in zip(capture.photos, found, strict=True) if isinstance(each, UnreadableImage)]
     if failed:

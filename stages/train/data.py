@@ -27,13 +27,14 @@ MOST_OBSERVATIONS = 2**20  # of sparse points that are used; of more, those of p
 NEAR_THE_SCENE = 1.5  # half sides of the scene bounds, within which points may be on what the subject stands on
 SUPPORT_TRIES = 4  # random pixels for each that is wanted
 POINTS_AT_ONCE = 2**16  # observed by equally many, whose cameras are compared
+READERS = 8  # threads that read images, at most: each holds two, and disks and memory would be the limit
 CUT_SHARE = 0.25  # of a view's range that stated planes leave out, from which a warning says so: the corners of the scene bounds are mostly empty
 GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their integer parts, fill an interval evenly
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
 
 
 def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None, trained: Path | None = None) -> Pixels:
-    """All pixels of some views of a scene, as bytes; two images for each core are held besides them.
+    """All pixels of some views of a scene, as bytes; two images for each of `reading_threads` are held besides them.
 
     rows     where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
     trained  of the stage train, where it learned the photographs' exposure: they are as if all had been exposed alike; None: as they are
@@ -42,13 +43,18 @@ def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = No
     kept: list[np.ndarray | None] = []
 
     def images() -> Iterator[np.ndarray]:
-        for image, mask in in_order(read, views, count_cores(), lambda: None):
+        for image, mask in in_order(read, views, reading_threads(), lambda: None):
             kept.append(None if mask is None else np.packbits(mask))  # images are taken before masks
             yield image
 
     masks = (None if bits is None else np.unpackbits(bits, count=view.camera.width * view.camera.height) for bits, view in zip(kept, views, strict=True))
     near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
     return Pixels([view.camera for view in views], images(), masks, near, far, channels_of(folder, views), rows)
+
+
+def reading_threads() -> int:
+    """Threads that `pixels_of` reads images on."""
+    return min(READERS, count_cores())
 
 
 def count_pixels(views: tuple[View, ...]) -> int:

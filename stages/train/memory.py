@@ -15,7 +15,7 @@ from stages.io.field_file import space_of
 from stages.io.scene import View, load, views_of
 from stages.memory.forecast import Known
 from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
-from stages.train.data import MOST_OBSERVATIONS, channels_of, count_pixels
+from stages.train.data import MOST_OBSERVATIONS, channels_of, count_pixels, reading_threads
 from stages.train.hash_resolution import with_auto_sizes
 from stages.train.pixel_file import PixelFile
 
@@ -25,7 +25,6 @@ PIXELS = "training pixels"
 DIRECTION, DENSITY_VOXEL = 220, 26
 TABLES, SAVED = 4, 6  # of float32 for each parameter: itself, its gradient, Adam's moments; and while a checkpoint is written, three of these twice
 POINTS, OBSERVATION = 4, 250
-DECODED = 3  # images at a time while they are read: as decoded, and as they are put in rows
 # Bytes written. Of a parameter in the field's file, and in a checkpoint, with Adam's moments; of a density voxel in either; of a training pixel. Checkpoints
 # that are there while the newest is written.
 WRITTEN, CHECKPOINT, WRITTEN_VOXEL, CHANNELS = 4, 12, 5, 4
@@ -47,7 +46,7 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
     largest = max(camera.width * camera.height for camera in cameras)
     return {
         PIXELS: (0 if stored else total * channels) + masks,
-        "reading images": DECODED * channels * largest,
+        "reading images": (1 + 2 * reading_threads()) * channels * largest,  # as decoded, and one as it is put in rows
         "directions of pixels": 12 * sum(knots) + DIRECTION * max(knots),
     }
 
