@@ -397,7 +397,8 @@ def pixel_rays_case(stride: int) -> Case:
     tables = {
         "lookup": torch.from_numpy((lookup / np.linalg.norm(lookup, axis=1, keepdims=True)).astype(np.float32)),
         "lens": torch.tensor([0, int(knots[0] * rows[0])]), "knots": torch.from_numpy(knots), "offsets": torch.tensor([0, 63, 123]),
-        "width": torch.from_numpy(width), "rotation": torch.from_numpy(np.stack([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2)]).astype(np.float32)),
+        "width": torch.from_numpy(width),
+        "rotation": torch.from_numpy(np.stack([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2)]).astype(np.float32)),
         "centre": torch.from_numpy(rng.normal(size=(2, 3)).astype(np.float32)), "near": torch.tensor([0.5, 0.7]), "far": torch.tensor([2.0, 3.0]),
     }  # fmt: skip
 
