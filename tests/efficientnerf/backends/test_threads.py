@@ -1,4 +1,4 @@
-"""The kernels give the same bytes on one thread and on two, whichever way these are kept busy."""
+"""The kernels give the same bytes on one thread, on two and on 64, whichever way these are kept busy; a thread takes little memory."""
 
 import os
 import subprocess
@@ -10,6 +10,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
 import hashlib
+import re
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -42,7 +44,10 @@ for values in (seen.colour, seen.opacity, seen.depth, seen.normal, density_at(tr
 view = View(looking(tree, 40), rng.integers(0, 256, (43, 40, 4), dtype=np.uint8))
 for values in vars(refitted(merged(tree, [view.camera], 300, 1), [view], 6, most=400)).values():
     print(hashlib.sha256(values.tobytes()).hexdigest())
+status = Path("/proc/self/status")
+print(re.search(r"VmHWM:\\s+(\\d+)", status.read_text())[1] if status.exists() else 0)
 """
+A_THREAD = 2048  # KiB
 
 
 def lines(threads: int, layer: str = "default") -> list[str]:
@@ -53,7 +58,8 @@ def lines(threads: int, layer: str = "default") -> list[str]:
 
 @pytest.mark.slow
 def test_the_number_of_threads_changes_no_byte() -> None:
-    (one, *alone), (two, *together), (queued, *in_queue) = lines(1), lines(2), lines(2, "workqueue")
-    assert (one, two, queued) == ("1", "2", "2")
+    (one, *alone, small), (two, *together, _), (queued, *in_queue, _), (many, *crowded, large) = lines(1), lines(2), lines(2, "workqueue"), lines(64)
+    assert (one, two, queued, many) == ("1", "2", "2", "64")
     assert len(alone) > 10
-    assert alone == together == in_queue
+    assert alone == together == in_queue == crowded
+    assert int(large) - int(small) < 64 * A_THREAD
