@@ -10,7 +10,7 @@ from torch import Tensor
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import PixelTables, RayBundle, SampleColumns
 from efficientnerf.backends.numba import adam as kernel
-from efficientnerf.backends.numba import compositing, harmonics, hash_grid, mlp, occupancy, rays, sampling, sparse_depth
+from efficientnerf.backends.numba import compositing, hash_grid, mlp, occupancy, rays, sampling, sparse_depth
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.sampling import Box
 from efficientnerf.backends.numba.tree import nearest
@@ -105,7 +105,7 @@ def scaled_by_distance(values: Tensor, start: Tensor, first: Tensor, subject: Te
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     out = torch.empty(len(directions), harmonics_count(degree))
-    harmonics.basis(_array(directions), degree, out.numpy())
+    rays.basis(_array(directions), degree, out.numpy())
     return out
 
 
