@@ -50,6 +50,8 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
 }
 # The module whose `optimise`, `total_loss` and `max_weights` fit trees to photographs; see `efficientnerf.asset.refinement.fit`.
 FITTING: dict[Backend, str] = {"numba": "asset.refinement.host", "triton": "asset.refinement.device"}
+# The module whose `splat_image` renders 3D Gaussians, and whose `SplatFit` fits them to pictures.
+SPLATS: dict[Backend, str] = {"numba": "backends.numba.splats.fit"}
 
 
 def backend_of(*tensors: Tensor) -> Backend:
@@ -82,6 +84,11 @@ def _function(module: str, name: str) -> Callable[..., Any]:
 def fitting(backend: Backend) -> Any:
     """The module of FITTING."""
     return importlib.import_module(f"efficientnerf.{FITTING[backend]}")
+
+
+def splats_on(device: str) -> Any:
+    """The module of SPLATS for "cpu" or "cuda"; on the CPU where the kernels of the device cannot be built."""
+    return importlib.import_module(f"efficientnerf.{SPLATS['triton' if device != 'cpu' and triton_usable() else 'numba']}")
 
 
 @functools.cache

@@ -34,12 +34,13 @@ class NothingToShow(ValueError):
 
 
 def gaussians_of_asset(
-    tree: NerfTree, views: Sequence[View], budget: Budget, progress: Progress | None = None, time_used: Callable[[], float] | None = None
-) -> Gaussians:
+    tree: NerfTree, views: Sequence[View], budget: Budget, progress: Progress | None = None, time_used: Callable[[], float] | None = None,
+    device: str = "cpu",
+) -> Gaussians:  # fmt: skip
     """Gaussians that show what the tree shows.
 
-    views      what they are fitted to, and whose cameras say which voxels show
-    time_used  see `refitted`
+    views              what they are fitted to, and whose cameras say which voxels show
+    time_used, device  see `refitted`
 
     Raises NothingToShow, and ValueError without views.
     """
@@ -61,7 +62,7 @@ def gaussians_of_asset(
     report(1, "fitting Gaussians")
     fitted = refitted(
         gaussians, views, budget.steps, most=budget.count, background=tree.background, seed=budget.seed,
-        reached=lambda step, error: report(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used,
+        reached=lambda step: report(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used, device=device,
     )  # fmt: skip
     if not len(fitted):
         raise NothingToShow("no Gaussian is left that shows in any picture")

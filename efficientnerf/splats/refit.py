@@ -1,7 +1,8 @@
 """Gaussians fitted to pictures: Adam on means, scales, rotations, opacities and harmonics.
 
 A step takes a picture, or rows of a large one with about PIXELS. It minimises the squared error; for a picture with alpha, over all
-backgrounds at once. The order of the pictures and the rows are drawn by (seed, step). The same pictures give the same bytes on any number of threads.
+backgrounds at once. The order of the pictures and the rows are drawn by (seed, step). On the CPU the same pictures give the same bytes, on any number of
+threads.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,15 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from efficientnerf.backends.numba.splats import fitting, raster
-from efficientnerf.backends.numba.splats.fitting import Rates
-from efficientnerf.backends.numba.splats.pairs import pairs_of
-from efficientnerf.backends.numba.splats.projection import OPACITY, RECORD, ROTATION, SCALE, project
-from efficientnerf.backends.numba.splats.raster import Picture
-from efficientnerf.backends.pieces import pieces
+from efficientnerf.backends.dispatch import splats_on
+from efficientnerf.backends.splat_layout import GRADIENTS, OPACITY, ROTATION, SCALE, TILE, Picture, Rates, SplatState
 from efficientnerf.geometry.cameras import Camera, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
-from efficientnerf.splats.rendering import LANES, LOG_SCALES, gaussians_from, grouped, lens_of, ungrouped, values_of
+from efficientnerf.splats.rendering import LOG_SCALES, gaussians_from, lens_of, values_of
 
 # docs/experiments/splats.md
 MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
@@ -59,19 +56,18 @@ class View:
 
 def refitted(
     gaussians: Gaussians, views: Sequence[View], steps: int, *, most: int = 0, background: tuple[float, float, float] | None = None, seed: int = 0,
-    reached: Callable[[int, float], None] | None = None, time_used: Callable[[], float] | None = None,
+    reached: Callable[[int], None] | None = None, time_used: Callable[[], float] | None = None, device: str = "cpu",
 ) -> Gaussians:  # fmt: skip
     """The Gaussians after so many steps, without those that no longer show.
 
     most        Gaussians up to whose number some are divided on the way; 0: none is
     background  sRGB colour behind pictures without alpha; None: these are opaque
-    reached     called after each step, with their number and the picture's mean squared error of a channel
+    reached     called after each step, with their number
+    device      that computes, "cpu" or "cuda", the latter where its kernels can be built
     time_used   the share of the time allowed that has passed: it ends the steps at 1, and rates and divisions follow it where it is ahead of the steps
     """
-    values, degree = values_of(gaussians), gaussians.degree
-    count, sums = len(gaussians), np.zeros((0, raster.SUMS), np.float32)
-    moments = np.zeros((len(values), fitting.GRADIENTS + values.shape[1], LANES), np.float32)
-    records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
+    begin, values = splats_on(device).SplatFit, values_of(gaussians)
+    fit = begin(values, np.zeros((len(values), GRADIENTS + values.shape[1]), np.float32), gaussians.degree, device)
     used = began = 0.0 if time_used is None else time_used()
     times, relocated = _divisions(steps)
     order: list[int] = []
@@ -89,22 +85,13 @@ def refitted(
         due = sum(int(share * steps) <= number or share <= used for share in times)
         times = times[due:]
         if due and number and most:
-            values, moments, count = _divided(values, moments, errors[:count], most, relocated)
-            records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
+            fit = begin(*_divided(fit.state(), most, relocated), gaussians.degree, device)
         whole = views[order.pop()]
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
-        lens, picture = lens_of(view.camera, whole.camera), _picture(view, background)
-        project(values, lens, degree, records)
-        pairs = pairs_of(records, view.camera.width, view.camera.height)
-        if len(sums) < len(pairs.gaussian):
-            sums = np.zeros((len(pairs.gaussian) * 5 // 4, raster.SUMS), np.float32)
-        lost = np.zeros(len(pairs.begin) - 1)
-        for tiles in pieces(len(lost)):
-            raster.fit_tiles(tiles, records, pairs, picture, sums, lost)
-        fitting.step(values, moments, lens, degree, pairs.first, sums, _rates(max(number / max(steps - 1, 1), used), harmonics), errors)
+        fit.step(lens_of(view.camera, whole.camera), _picture(view, background), _rates(max(number / max(steps - 1, 1), used), harmonics))
         if reached is not None:
-            reached(number + 1, float(lost.sum()) / max(3 * int(picture.mask.sum()), 1))
-    fitted = gaussians_from(values, count)
+            reached(number + 1)
+    fitted = gaussians_from(fit.state().rows)
     return fitted.subset(fitted.opacities >= LEAST_OPACITY)
 
 
@@ -113,13 +100,13 @@ def _divisions(steps: int) -> tuple[tuple[float, ...], float]:
     return (RELOCATE_AT, RELOCATED) if steps >= MANY_STEPS else (SPLIT_AT, 0.0)
 
 
-def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: int, relocated: float = 0.0) -> tuple[np.ndarray, np.ndarray, int]:
-    """Values, moments and number of the Gaussians without those that hide nothing any more, and without a share `relocated` that hides least; those with the
-    greatest part in the errors (N,) are split.
+def _divided(state: SplatState, most: int, relocated: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Values and moments of the Gaussians without those that hide nothing any more, and without a share `relocated` that hides least; those with the
+    greatest part in the errors are split.
 
     The halves lie along the longest axis, next to each other in memory, and begin without momentum.
     """
-    rows, state = ungrouped(values, len(errors)), ungrouped(moments, len(errors))
+    rows, moments, errors = state
     alive = rows[:, OPACITY] > np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
     alive[np.argsort(rows[:, OPACITY], kind="stable")[: int(relocated * len(rows))]] = False
     copies = alive.astype(np.int64)
@@ -127,8 +114,8 @@ def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: 
     copies[worst[alive[worst] & (errors[worst] > 0)]] = 2
     index = np.repeat(np.arange(len(rows)), copies)
     halves = copies[index] == 2
-    rows, state = rows[index], state[index]
-    state[halves] = 0
+    rows, moments = rows[index], moments[index]
+    moments[halves] = 0
     first = np.concatenate([[True], np.diff(index) > 0])[halves]
     parts = rows[halves]
     longest = np.argmax(parts[:, SCALE : SCALE + 3], axis=1)
@@ -137,12 +124,12 @@ def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: 
     parts[:, :3] += apart[:, None] * rotation_matrices(parts[:, ROTATION:OPACITY])[here, :, longest]
     parts[here, SCALE + longest] += np.log(SPLIT_SHARE)
     rows[halves] = parts
-    return grouped(rows), grouped(state, unseen=False), len(rows)
+    return rows, moments
 
 
 def _band(view: View, rng: np.random.Generator) -> View:
     """The view, or rows of it that have about PIXELS: those around a row that is drawn."""
-    height = max(LANES, round(PIXELS / view.camera.width / LANES) * LANES)
+    height = max(TILE, round(PIXELS / view.camera.width / TILE) * TILE)
     if height >= view.camera.height:
         return view
     begin = int(np.clip(rng.integers(view.camera.height) - height // 2, 0, view.camera.height - height))

@@ -4,10 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from efficientnerf.backends.numba.splats import raster
-from efficientnerf.backends.numba.splats.pairs import pairs_of
-from efficientnerf.backends.numba.splats.projection import RECORD, Lens, project
-from efficientnerf.backends.pieces import pieces
+from efficientnerf.backends.dispatch import splats_on
+from efficientnerf.backends.splat_layout import Lens
 from efficientnerf.geometry.cameras import Camera, fold_radius, rays
 from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.splats.gaussians import Gaussians
@@ -15,7 +13,6 @@ from efficientnerf.splats.gaussians import Gaussians
 NEAR = 0.05  # depth in front of which nothing is rendered, units of the training frame
 OVERSCAN = 0.15  # of the picture's width and height, outside of it, up to where derivatives of the projection follow the means; as 3DGS
 LOG_SCALES = (-30.0, 20.0)  # values beyond are rendered as these: float32 holds their squares
-LANES = 16
 
 
 class SplatImage(NamedTuple):
@@ -25,19 +22,9 @@ class SplatImage(NamedTuple):
     opacity: np.ndarray  # (H, W) float32, 0 to 1
 
 
-def render(gaussians: Gaussians, camera: Camera, background: tuple[float, float, float] | None = None) -> SplatImage:
+def render(gaussians: Gaussians, camera: Camera, background: tuple[float, float, float] | None = None, device: str = "cpu") -> SplatImage:
     """The image that a camera takes, as 3DGS renders it; lenses that distort included (`efficientnerf.backends.numba.splats.projection`)."""
-    return render_values(values_of(gaussians), gaussians.degree, camera, background)
-
-
-def render_values(values: np.ndarray, degree: int, camera: Camera, background: tuple[float, float, float] | None = None) -> SplatImage:
-    """`render` of Gaussians in groups of sixteen, see `values_of`."""
-    records = np.zeros((len(values) * LANES, RECORD), np.float32)
-    project(values, lens_of(camera), degree, records)
-    pairs = pairs_of(records, camera.width, camera.height)
-    colour, light = np.empty((camera.height, camera.width, 3), np.float32), np.empty((camera.height, camera.width), np.float32)
-    for tiles in pieces(len(pairs.begin) - 1):
-        raster.render_tiles(tiles, records, pairs, colour, light)
+    colour, light = splats_on(device).splat_image(values_of(gaussians), gaussians.degree, lens_of(camera), device)
     if background is not None:
         colour += light[..., None] * np.asarray(background, np.float32)
     return SplatImage(colour, 1 - light)
@@ -71,32 +58,17 @@ def _limits(camera: Camera) -> np.ndarray:
 
 
 def values_of(gaussians: Gaussians) -> np.ndarray:
-    """(G, 11 + 3 K, 16) float32, rows as `efficientnerf.backends.numba.splats.projection` names them; the last group's padding cannot be seen."""
+    """(N, 11 + 3 K) float32, columns as `efficientnerf.backends.splat_layout` names them."""
     count = len(gaussians)
     logits = np.log(gaussians.opacities) - np.log1p(-gaussians.opacities)
     parts = gaussians.means, np.log(gaussians.scales).clip(*LOG_SCALES), gaussians.rotations, logits[:, None], gaussians.harmonics.reshape(count, -1)
-    return grouped(np.concatenate(parts, axis=1))
+    return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
-def grouped(rows: np.ndarray, unseen: bool = True) -> np.ndarray:
-    """Groups (G, width, 16) of rows (N, width) float32, the last filled with Gaussians that cannot be seen, or with zeros."""
-    count, width = rows.shape
-    out = np.zeros((-(-count // LANES) * LANES, width), np.float32)
-    out[:count] = rows
-    if unseen:
-        out[count:, 6], out[count:, 10] = 1, -30
-    return np.ascontiguousarray(out.reshape(-1, LANES, width).transpose(0, 2, 1))
-
-
-def ungrouped(groups: np.ndarray, count: int) -> np.ndarray:
-    """The first `count` rows of groups, see `grouped`."""
-    return np.ascontiguousarray(groups.transpose(0, 2, 1)).reshape(-1, groups.shape[1])[:count]
-
-
-def gaussians_from(values: np.ndarray, count: int) -> Gaussians:
-    """The first `count` Gaussians of groups, see `values_of`."""
-    rows = ungrouped(values, count).astype(np.float64)
+def gaussians_from(values: np.ndarray) -> Gaussians:
+    """See `values_of`."""
+    rows = values.astype(np.float64)
     rotations = rows[:, 6:10] / np.linalg.norm(rows[:, 6:10], axis=1, keepdims=True)
     opacities = np.clip(sigmoid(rows[:, 10]), 1e-4, 1 - 1e-4)
-    parts = rows[:, :3], np.exp(rows[:, 3:6]), rotations, opacities, rows[:, 11:].reshape(count, -1, 3)
+    parts = rows[:, :3], np.exp(rows[:, 3:6]), rotations, opacities, rows[:, 11:].reshape(len(rows), -1, 3)
     return Gaussians(*(np.ascontiguousarray(part, np.float32) for part in parts))

@@ -9,6 +9,7 @@ import pytest
 from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.rendering import render as render_tree
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.backends.splat_layout import SplatState
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.rendering.harmonics import C0
@@ -16,7 +17,7 @@ from efficientnerf.splats import merging, refit
 from efficientnerf.splats.build import Budget, View, gaussians_of_asset
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.refit import refitted
-from efficientnerf.splats.rendering import gaussians_from, lens_of, render, ungrouped, values_of
+from efficientnerf.splats.rendering import gaussians_from, lens_of, render, values_of
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import random_cascades
 
@@ -193,7 +194,7 @@ def test_the_refit_ends_with_its_time_and_learning_rates_and_divisions_follow_it
 
     def run(a_step: float, steps: int = 40) -> tuple[Gaussians, int]:
         clock, taken = itertools.count(), []
-        found = refitted(begun, views, steps, most=150, reached=lambda number, _: taken.append(number), time_used=lambda: next(clock) * a_step)
+        found = refitted(begun, views, steps, most=150, reached=taken.append, time_used=lambda: next(clock) * a_step)
         return found, len(taken)
 
     (ample, all_steps), (short, some), (none, no_steps) = run(0.0), run(1 / 12), run(2.0)
@@ -237,11 +238,11 @@ def test_gaussians_are_divided_by_error_and_faint_ones_go() -> None:
     errors = np.zeros(count, np.float32)
     errors[[2, 20, 30]] = 9, 2, 3
     errors[40] = 1
-    moments = np.ones((len(values_of(begun)), 30, 16), np.float32)
-    values, state, found = refit._divided(values_of(begun), moments, errors, count - 5 + 2)
-    assert found == count - 5 + 2
-    after = gaussians_from(values, found)
-    halves = np.flatnonzero((ungrouped(state, found) == 0).all(axis=1))
+    moments = np.ones((count, 30), np.float32)
+    values, moments = refit._divided(SplatState(values_of(begun), moments, errors), count - 5 + 2)
+    assert len(values) == len(moments) == count - 5 + 2
+    after = gaussians_from(values)
+    halves = np.flatnonzero((moments == 0).all(axis=1))
     assert halves.tolist() == [15, 16, 26, 27]
     np.testing.assert_allclose(after.means[halves].reshape(2, 2, 3).mean(axis=1), begun.means[[20, 30]], atol=1e-6)
     longest = begun.scales[[20, 30]].max(axis=1)
@@ -249,7 +250,7 @@ def test_gaussians_are_divided_by_error_and_faint_ones_go() -> None:
     next_to = np.sort(begun.scales[[20, 30]], axis=1)[:, 1]
     np.testing.assert_allclose(after.scales.max(axis=1)[[15, 26]], np.maximum(refit.SPLIT_SHARE * longest, next_to), rtol=1e-4)
     kept = np.setdiff1d(np.arange(5, count), [20, 30])
-    np.testing.assert_allclose(after.means[np.setdiff1d(np.arange(found), halves)], begun.means[kept], atol=1e-7)
+    np.testing.assert_allclose(after.means[np.setdiff1d(np.arange(len(values)), halves)], begun.means[kept], atol=1e-7)
 
 
 def test_the_most_transparent_give_way_to_halves_where_the_error_is() -> None:
@@ -258,9 +259,9 @@ def test_the_most_transparent_give_way_to_halves_where_the_error_is() -> None:
     begun = replace(begun, opacities=np.linspace(0.9, 0.1, count, dtype=np.float32))
     errors = np.zeros(count, np.float32)
     errors[:20] = errors[-1] = 1  # that of one that is left out does not count
-    moments = np.ones((len(values_of(begun)), 30, 16), np.float32)
-    values, state, found = refit._divided(values_of(begun), moments, errors, count, 0.1)
+    moments = np.ones((count, 30), np.float32)
+    values, moments = refit._divided(SplatState(values_of(begun), moments, errors), count, 0.1)
     gone = int(0.1 * count)
-    assert found == count
-    assert (ungrouped(state, found) == 0).all(axis=1).sum() == 2 * gone
-    np.testing.assert_allclose(gaussians_from(values, found).means[2 * gone :], begun.means[gone : count - gone], atol=1e-7)
+    assert len(values) == count
+    assert (moments == 0).all(axis=1).sum() == 2 * gone
+    np.testing.assert_allclose(gaussians_from(values).means[2 * gone :], begun.means[gone : count - gone], atol=1e-7)

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.splats import fitting, raster
-from efficientnerf.backends.numba.splats.pairs import pairs_of
-from efficientnerf.backends.numba.splats.projection import LANES, RECORD, project
+from efficientnerf.backends.numba.splats.fit import grouped, projected, ungrouped
+from efficientnerf.backends.numba.splats.projection import LANES, project
 from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.splat_layout import RECORD, SUMS, Picture
 from efficientnerf.geometry import cameras
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.gaussians import Gaussians
@@ -54,13 +55,13 @@ def test_images_are_those_of_the_plain_sums(degree: int, size: float) -> None:
     assert image.opacity.max() > 0.5
 
 
-def picture_of(seed: int, over_all: bool) -> raster.Picture:
+def picture_of(seed: int, over_all: bool) -> Picture:
     rng = np.random.default_rng(seed)
     mask = (rng.random((HEIGHT, WIDTH)) < 0.8).astype(np.uint8)
-    return raster.Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32))
+    return Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32))
 
 
-def reference_loss(image: Tensor, light: Tensor, picture: raster.Picture) -> Tensor:
+def reference_loss(image: Tensor, light: Tensor, picture: Picture) -> Tensor:
     """Half of the squared error."""
     pixels, mask = torch.tensor(picture.pixels / 255.0), torch.tensor(picture.mask != 0)
     if not picture.over_all:
@@ -76,7 +77,7 @@ def reference_loss(image: Tensor, light: Tensor, picture: raster.Picture) -> Ten
 def step_gradients(values, lens, degree, first, sums, out):  # type: ignore[no-untyped-def]
     """What `fitting.step` goes along: out like values."""
     rows = values.shape[1]
-    total, basis, gradient = np.empty(16 * (raster.SUMS + 1), np.float32), np.empty(16 * 16, np.float32), np.empty(16 * rows, np.float32)
+    total, basis, gradient = np.empty(16 * (SUMS + 1), np.float32), np.empty(16 * 16, np.float32), np.empty(16 * rows, np.float32)
     for group in range(values.shape[0]):
         fitting._gather_sums(group, first, sums, total)
         at = np.int64(group) * rows * LANES
@@ -90,15 +91,14 @@ def step_gradients(values, lens, degree, first, sums, out):  # type: ignore[no-u
 @pytest.mark.parametrize(("degree", "over_all"), [(2, True), (3, False)])
 def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool) -> None:
     gaussians, picture = some(count=53, degree=degree), picture_of(1, over_all)
-    values, lens = values_of(gaussians), lens_of(camera())
+    values, lens = grouped(values_of(gaussians)), lens_of(camera())
     records = np.zeros((16 * len(values), RECORD), np.float32)
-    project(values, lens, degree, records)
-    pairs = pairs_of(records, WIDTH, HEIGHT)
-    sums, errors = np.full((len(pairs.gaussian), raster.SUMS), np.nan, np.float32), np.full(len(pairs.begin) - 1, np.nan)
+    pairs = projected(values, lens, degree, records)
+    sums, errors = np.full((len(pairs.gaussian), SUMS), np.nan, np.float32), np.full(len(pairs.begin) - 1, np.nan)
     raster.fit_tiles(slice(0, len(errors)), records, pairs, picture, sums, errors)
     found = np.empty_like(values)
     step_gradients(values, lens, degree, pairs.first, sums, found)
-    rows = found.transpose(0, 2, 1).reshape(-1, values.shape[1])[: len(gaussians)]
+    rows = ungrouped(found, len(gaussians))
 
     wanted = tensors(gaussians)
     loss = reference_loss(*render_reference(*wanted, camera()), picture)
@@ -124,7 +124,7 @@ def test_a_small_gaussian_lands_where_the_lens_sends_its_points(model: str, extr
     scales = np.array([[0.3, 0.1, 0.02]], np.float32)
     gaussians = replace(one.subset(np.zeros(3, int)), means=means, scales=np.repeat(scales, 3, axis=0))
     records = np.zeros((16, RECORD), np.float32)
-    project(values_of(gaussians), lens_of(lens), 3, records)
+    project(grouped(values_of(gaussians)), lens_of(lens), 3, records)
     np.testing.assert_allclose(records[:3, :2], pixels, atol=2e-3)
     from tests.efficientnerf.splats_reference import covariances
 
@@ -161,10 +161,9 @@ def test_pairs_name_the_blocks_that_a_gaussian_touches_and_few_others() -> None:
     """Needles along diagonals too, whose boxes are nearly empty."""
     gaussians = some(count=200, degree=0)
     scales = gaussians.scales * np.array([8, 1, 0.1], np.float32)
-    values = values_of(Gaussians(gaussians.means, scales, gaussians.rotations, gaussians.opacities, gaussians.harmonics))
+    values = grouped(values_of(Gaussians(gaussians.means, scales, gaussians.rotations, gaussians.opacities, gaussians.harmonics)))
     records = np.zeros((LANES * len(values), RECORD), np.float32)
-    project(values, lens_of(camera()), 0, records)
-    pairs = pairs_of(records, WIDTH, HEIGHT)
+    pairs = projected(values, lens_of(camera()), 0, records)
     y, x = np.mgrid[: 16 * -(-HEIGHT // 16), : 16 * pairs.columns] + 0.5
     named = touched = boxed = 0
     for tile in range(len(pairs.begin) - 1):
@@ -187,8 +186,7 @@ def test_tiles_rendered_in_pieces_are_the_whole_and_ties_keep_their_order() -> N
     gaussians = some(count=40)
     twice = gaussians.subset(np.tile(np.arange(40), 2))
     records = np.zeros((80, RECORD), np.float32)
-    project(values_of(twice), lens_of(camera()), 3, records)
-    pairs = pairs_of(records, WIDTH, HEIGHT)
+    pairs = projected(grouped(values_of(twice)), lens_of(camera()), 3, records)
     depth = records[pairs.gaussian, 11]
     for begin, end in zip(pairs.begin[:-1], pairs.begin[1:], strict=True):
         key = list(zip(depth[begin:end].tolist(), pairs.gaussian[begin:end].tolist(), strict=True))
@@ -204,6 +202,6 @@ def test_tiles_rendered_in_pieces_are_the_whole_and_ties_keep_their_order() -> N
 
 def test_groups_hold_what_was_put_in() -> None:
     gaussians = some(count=21, degree=1)
-    back = gaussians_from(values_of(gaussians), 21)
+    back = gaussians_from(ungrouped(grouped(values_of(gaussians)), 21))
     for name in ("means", "scales", "rotations", "opacities", "harmonics"):
         np.testing.assert_allclose(getattr(back, name), getattr(gaussians, name), rtol=1e-5, atol=1e-6)

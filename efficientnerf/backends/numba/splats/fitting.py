@@ -7,38 +7,16 @@ Gaussian's size. 3DGS carries them along.
 Squares of gradients are averaged over a Gaussian's mean, scales, rotation, opacity, base colour and other harmonics, one number each.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.splats.projection import HARMONICS, LANES, MEAN, OPACITY, ROTATION, SCALE, basis16, colour16, conic16, image16
-from efficientnerf.backends.numba.splats.raster import ERROR, SUMS
+from efficientnerf.backends.numba.splats.projection import LANES, basis16, colour16, conic16, image16
 from efficientnerf.backends.numba.vector.maths import broadcast, maximum, minimum, select, sigmoid, sqrt
 from efficientnerf.backends.numba.vector.memory import load, pointer, store
+from efficientnerf.backends.splat_layout import ERROR, GRADIENTS, HARMONICS, MEAN, OPACITY, PARTS, ROTATION, SCALE, SQUARES, SUMS
 
 GROUPS_A_TASK = 64
-PARTS = 6  # mean, scales, rotation, opacity, base colour, other harmonics
-VISITS, SQUARES, GRADIENTS = 0, 1, 1 + PARTS  # rows of moments: steps taken; running means of squares; running means of gradients
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-
-
-class Rates(NamedTuple):
-    """Of a step."""
-
-    # (PARTS,) float32 learning rates: of means, in standard deviations along the longest axis; of logarithms of scales; of quaternions; of logits; of
-    # colours' base and of their other harmonics
-    rates: np.ndarray
-    # momentum, decay: of the running means of gradients and of their squares
-    momentum: np.float32
-    decay: np.float32
-    epsilon: np.float32  # added to the root of the latter
-    # of_mean, of_square: (V,) float32: 1 / (1 - momentum^n) and 1 / (1 - decay^n) after n steps, the last for all beyond
-    of_mean: np.ndarray
-    of_square: np.ndarray
-    # least, greatest: logarithms of the scales
-    least: np.float32
-    greatest: np.float32
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -156,7 +134,7 @@ def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):
 def step(values, moments, lens, degree, first, sums, h, errors):  # type: ignore[no-untyped-def]
     """A step of all Gaussians that have pairs, in place.
 
-    values   (G, rows, 16) float32 of `projection`
+    values   (G, rows, 16) float32, see `projection`
     moments  (G, GRADIENTS + rows, 16) float32
     first    (N + 1,) and sums (P, SUMS) of the image's pairs; N at most 16 G
     errors   (N,) float32, raised by each Gaussian's share of the error

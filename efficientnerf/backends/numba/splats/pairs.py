@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.splats.projection import CONIC_A, CONIC_B, CONIC_C, DEPTH, HEIGHT, REACH, WIDTH, X, Y
+from efficientnerf.backends.splat_layout import CONIC_A, CONIC_B, CONIC_C, DEPTH, HEIGHT, REACH, TILE, WIDTH, X, Y
 
-TILE, BLOCK = 16, 4
+BLOCK = 4
 GAUSSIANS_A_TASK = 1024
 DIGITS, DIGIT = 3, 11  # of the depths' bits, that they are sorted by
 

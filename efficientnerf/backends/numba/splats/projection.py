@@ -4,10 +4,9 @@ A mean goes through the camera, lens and all; the covariance through the derivat
 knows pinholes alone, the derivative here includes the lens: distorted pictures are rendered as they are. Beside the picture it is taken at the border of what
 `lens_of` allows.
 
-Values lie in groups of sixteen Gaussians: (G, rows, 16) float32, rows as named below, 3 K of them harmonics, coefficient by coefficient.
+Values lie in groups of sixteen Gaussians: (G, rows, 16) float32, rows as `efficientnerf.backends.splat_layout` names them, 3 K of them
+harmonics, coefficient by coefficient.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,30 +14,32 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.view_colours import sh_basis
 from efficientnerf.backends.numba.vector.maths import arctangent, broadcast, exp, maximum, minimum, select, sigmoid, sqrt
 from efficientnerf.backends.numba.vector.memory import load, pointer, store
+from efficientnerf.backends.splat_layout import (
+    ALPHA,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    DEPTH,
+    HARMONICS,
+    HEIGHT,
+    LEAST_ALPHA,
+    LOW_PASS,
+    MOST_LOG_SCALE,
+    OPACITY,
+    REACH,
+    REACH_255,
+    RECORD,
+    RED,
+    ROTATION,
+    SCALE,
+    WIDTH,
+    X,
+    Y,
+)  # fmt: skip
 
 LANES = 16  # Gaussians of a group
-MEAN, SCALE, ROTATION, OPACITY, HARMONICS = 0, 3, 6, 10, 11  # rows of values: logarithms of scales, logit of the opacity
-X, Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, WIDTH, HEIGHT, DEPTH, REACH = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 12  # of a projected Gaussian
-RECORD = 16  # numbers of one
-LOW_PASS = np.float32(0.3)
-LEAST_ALPHA, MOST_ALPHA = np.float32(1 / 255), np.float32(0.99)
-MOST_LOG_SCALE = np.float32(40)
 GROUPS_A_TASK = 64
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-
-
-class Lens(NamedTuple):
-    """A camera as kernels take it; width and height are those of its picture."""
-
-    turn: np.ndarray  # (9,) float32, rows of the rotation from the world to the camera
-    centre: np.ndarray  # (3,) float32
-    # (16,) float32: fx fy cx cy; k1 k2 k3 k4 over k4 k5 k6 (of a fisheye k1..k4 over nothing); p1 p2; squared radius at which the lens folds back, on the
-    # undistorted plane; nearest depth; 0
-    numbers: np.ndarray
-    limits: np.ndarray  # (4,) float32: least and greatest u, least and greatest v on the undistorted plane at which derivatives are taken
-    fisheye: bool  # whether the undistorted plane is that of angles
-    width: int
-    height: int
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -163,8 +164,7 @@ def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore
     x, y, depth, seen, _wx, _wy, nx, ny, scales, _turned = image16(p, at, lens)
     _ax, _ay, covariance, conic = conic16(nx, ny, scales)
     opacity = sigmoid(load(p, at + 16 * OPACITY, LANES))
-    # ln o <= 8 (o^(1/8) - 1): beyond this many squared standard deviations alpha is below LEAST_ALPHA.
-    reach = np.float32(2 * 5.5412637) + np.float32(16) * (sqrt(sqrt(sqrt(opacity))) - _ONE)
+    reach = REACH_255 + np.float32(16) * (sqrt(sqrt(sqrt(opacity))) - _ONE)
     reach = maximum(reach, _NONE)
     wide, high = sqrt(reach * covariance[0]), sqrt(reach * covariance[2])
     seen = seen & (opacity >= LEAST_ALPHA) & (x + wide > _NONE) & (y + high > _NONE)

@@ -10,29 +10,31 @@ to the last. The sums of a Gaussian over a tile's pixels are its pair's own: no 
 P pairs, N Gaussians, H x W pixels.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.splats.pairs import BLOCK, TILE, Pairs
-from efficientnerf.backends.numba.splats.projection import ALPHA, CONIC_A, CONIC_B, CONIC_C, LANES, LEAST_ALPHA, MOST_ALPHA, RECORD, RED, X, Y
+from efficientnerf.backends.numba.splats.pairs import BLOCK, Pairs
+from efficientnerf.backends.numba.splats.projection import LANES
 from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each
 from efficientnerf.backends.numba.vector.memory import fetch_add, load, pointer, store
+from efficientnerf.backends.splat_layout import (
+    ALPHA,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    LEAST_ALPHA,
+    LEAST_TRANSMITTANCE,
+    MOST_ALPHA,
+    RECORD,
+    RED,
+    SUMS,
+    TILE,
+    Picture,
+    X,
+    Y,
+)  # fmt: skip
 
-SUMS = 16  # numbers of a pair
-ERROR = 9  # of them: the squared error where the Gaussian shows, times its weight
-LEAST_TRANSMITTANCE = np.float32(1e-4)
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-
-
-class Picture(NamedTuple):
-    """What an image is compared with: pixels (H, W, 4) uint8, straight alpha, and mask (H, W) uint8, 0 where a pixel does not count."""
-
-    pixels: np.ndarray
-    mask: np.ndarray
-    over_all: bool  # whether it is compared over all backgrounds at once, as a picture with alpha; else over `background` (3,) float32, and alpha is not read
-    background: np.ndarray
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
