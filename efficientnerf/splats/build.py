@@ -34,13 +34,12 @@ class NothingToShow(ValueError):
 
 
 def gaussians_of_asset(
-    tree: NerfTree, views: Sequence[View], budget: Budget, progress: Progress | None = None, time_used: Callable[[], float] | None = None,
-    device: str = "cpu",
-) -> Gaussians:  # fmt: skip
-    """Gaussians that show what the tree shows.
+    tree: NerfTree, views: Sequence[View], budget: Budget, progress: Progress | None = None, time_used: Callable[[], float] | None = None
+) -> Gaussians:
+    """Gaussians that show what the tree shows, fitted on the tree's device.
 
-    views              what they are fitted to, and whose cameras say which voxels show
-    time_used, device  see `refitted`
+    views      what they are fitted to, and whose cameras say which voxels show
+    time_used  see `refitted`
 
     Raises NothingToShow, and ValueError without views.
     """
@@ -62,7 +61,7 @@ def gaussians_of_asset(
     report(1, "fitting Gaussians")
     fitted = refitted(
         gaussians, views, budget.steps, most=budget.count, background=tree.background, seed=budget.seed,
-        reached=lambda step: report(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used, device=device,
+        reached=lambda step: report(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used, device=tree.device,
     )  # fmt: skip
     if not len(fitted):
         raise NothingToShow("no Gaussian is left that shows in any picture")

@@ -88,7 +88,7 @@ def refitted(
             fit = begin(*_divided(fit.state(), most, relocated), gaussians.degree, device)
         whole = views[order.pop()]
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
-        fit.step(lens_of(view.camera, whole.camera), _picture(view, background), _rates(max(number / max(steps - 1, 1), used), harmonics))
+        fit.step(lens_of(view.camera, whole.camera), _picture(view, background), rates_of(max(number / max(steps - 1, 1), used), harmonics))
         if reached is not None:
             reached(number + 1)
     fitted = gaussians_from(fit.state().rows)
@@ -154,7 +154,7 @@ def harmonics_rate(views: Sequence[View]) -> float:
     return HARMONICS * min(max(HARMONICS_PER_VIEW * len(views), LEAST_HARMONICS), MOST_HARMONICS)
 
 
-def _rates(done: float, harmonics: float) -> Rates:
+def rates_of(done: float, harmonics: float) -> Rates:
     """The rates when so much, 0 to 1, of the steps is done."""
     fall = LAST_RATE**done
     rates = np.asarray([MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, harmonics], np.float32) * np.float32(fall)

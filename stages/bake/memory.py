@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from functools import partial
 
-import torch
-
 from efficientnerf.asset.file.serialisation import bytes_per_voxel
 from efficientnerf.asset.refinement.error_map import MAX_CELLS
 from efficientnerf.asset.refinement.fit import PATCH_SIDE
@@ -51,11 +49,6 @@ def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick
     float32, visits and stamps, sums of gradients in 64 bits; where there is a total variation (`smooth`) the six voxels next to each, and densities before a
     step; of bricks their voxels with a border; of the grid's cells three numbers while it is sent."""
     return (28 + 36 * harmonics + 28 * smooth) * voxels + 4 * (brick + 2) ** 3 * bricks + 12 * cells
-
-
-def free_on_device(device: str) -> int:
-    """Bytes available on a CUDA device: free ones, and those that this process has reserved but not allocated."""
-    return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
 def needed(

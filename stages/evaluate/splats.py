@@ -34,12 +34,13 @@ class EvaluatedSplats:
 
 
 def load_splats(outputs: SplatsOutputs, tree: NerfTree) -> EvaluatedSplats | None:
-    """The Gaussians of a run, from the file that others read; None where it made none of all that the asset shows. Raises CorruptArtifact."""
+    """The Gaussians of a run, from the file that others read; None where it made none of all that the asset shows. They are drawn on the tree's
+    device. Raises CorruptArtifact."""
     if not outputs.ply.is_file() or read_report(outputs.report, RegionReport).region != "all":
         return None
     gaussians = moved(read_splats(outputs.ply), source_frame(tree.metadata).world_from_capture)
     facts = {"gaussians": len(gaussians), "ply_bytes": outputs.ply.stat().st_size}
-    return EvaluatedSplats(lambda camera, background: render(gaussians, camera, background).colour, facts)
+    return EvaluatedSplats(lambda camera, background: render(gaussians, camera, background, tree.device).colour, facts)
 
 
 def splats_image(splats: EvaluatedSplats, asset: EvaluatedAsset, scene: Scene, view: View) -> np.ndarray:

@@ -18,6 +18,8 @@ from stages.splats.settings import SplatsSettings
 # Bytes. Of a parameter: value, gradient, two moments, and one more while Gaussians are merged and written; of a stored voxel while they are merged; of a
 # pixel of a picture: its colours and mask; of a pixel of the one that is drawn: colours, transmittance, gradients and the Gaussians that cover its tile.
 PARAMETER, VOXEL, PIXEL, DRAWN = 20, 100, 4, 400
+# On a device: of a parameter, value and two moments, twice while Gaussians are divided; of a Gaussian its records and sums, and 16 pairs while they are sorted.
+DEVICE_PARAMETER, DEVICE_GAUSSIAN = 16, 2400
 WRITTEN_FLOAT, SPZ, SHEET = 4, 64, MIB // 4  # bytes of a parameter in PLY; of a Gaussian in SPZ; of a picture of them
 
 
@@ -31,7 +33,12 @@ def parameters_of(settings: SplatsSettings) -> int:
     return 11 + 3 * (settings.sh_degree + 1) ** 2
 
 
-def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None) -> Need:
+def needed_on_device(settings: SplatsSettings) -> int:
+    """Bytes that the Gaussians take on a device where they are fitted there, about."""
+    return (DEVICE_PARAMETER * parameters_of(settings) + DEVICE_GAUSSIAN) * settings.count
+
+
+def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None, device: str = "cpu") -> Need:
     """Memory to make Gaussians of a tree and to fit them to pictures; `captured` as for `pixels_of`."""
     pixels = pixels_of(tree, settings, captured)
     return Need({
@@ -39,7 +46,7 @@ def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path]
         "merging": VOXEL * len(tree.density_values),
         "pictures": PIXEL * sum(pixels) + DRAWN * max(pixels, default=0),
         "the asset": tree_bytes(tree),
-        "libraries": libraries(),
+        "libraries": libraries(device),
     })  # fmt: skip
 
 
@@ -56,9 +63,9 @@ def pixels_of(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Pa
 def memory_needed(known: Known) -> Need:
     """`needed` for all of the asset."""
     if known.settings["splats"].make == "off":
-        return Need({"libraries": libraries()})
+        return Need({"libraries": libraries(known.device)})
     inputs = known.inputs(SplatsInputs)
-    return needed(asset_of(known), known.settings["splats"], (inputs.poses.folder, inputs.train.folder))
+    return needed(asset_of(known), known.settings["splats"], (inputs.poses.folder, inputs.train.folder), known.device)
 
 
 def space_needed(known: Known) -> int:

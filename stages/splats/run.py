@@ -31,8 +31,9 @@ from stages.formats.exporters.writing import source_frame
 from stages.framing.restriction import restricted
 from stages.io.png import write_png
 from stages.io.refined_cameras import load_scene
+from stages.memory.device import free_on_device
 from stages.memory.need import refuse_what_does_not_fit
-from stages.splats.memory import most_gaussians, needed
+from stages.splats.memory import most_gaussians, needed, needed_on_device
 from stages.splats.pictures import photographs, render_cameras, renders
 from stages.splats.settings import SplatsSettings
 
@@ -44,7 +45,7 @@ PREVIEW = (480, 360)  # pixels, of each of the two pictures
 def gaussians_of(
     tree: NerfTree, settings: SplatsSettings, progress: Callable[[int, int, str], None], captured: tuple[Path, Path] | None = None
 ) -> Gaussians:
-    """Gaussians of what a tree shows, in the training frame; `progress` takes (done, total, text).
+    """Gaussians of what a tree shows, in the training frame, made on the tree's device; `progress` takes (done, total, text).
 
     captured  folders of the stages poses and train, whose photographs they are fitted to; None: the tree's own renders
 
@@ -75,7 +76,7 @@ def preview(tree: NerfTree, gaussians: Gaussians) -> np.ndarray:
     """(H, W, 3) uint8: the asset and its Gaussians side by side, from the first camera of a turntable, on white."""
     camera = turntable_cameras(tree, frames=1, width=PREVIEW[0], height=PREVIEW[1])[0]
     white = None if tree.environment is not None else (1.0, 1.0, 1.0)
-    own, theirs = render(tree, camera, background=white, normals=False), rendering.render(gaussians, camera, white)
+    own, theirs = render(tree, camera, background=white, normals=False), rendering.render(gaussians, camera, white, tree.device)
     return to_uint8(np.clip(np.concatenate([own.colour, theirs.colour], axis=1), 0, 1))
 
 
@@ -95,13 +96,24 @@ def run(job: Job) -> None:
         job.warn(f"no Gaussians are made; the run continues: {error}")
 
 
+def _on_device(job: Job, tree: NerfTree) -> NerfTree:
+    """The tree on the run's device, where Gaussians are then fitted; on the host where the device's memory is too small."""
+    need = needed_on_device(job.settings)
+    if job.device == "cpu" or need <= (free := free_on_device(job.device)):
+        return tree.to(job.device)
+    job.warn(f"{job.settings.count:,} Gaussians need about {need / 2**30:.1f} GiB on the device; {free / 2**30:.1f} GiB are free."
+             " They are fitted on the CPU, which takes longer. Lower splats.count to use the device.")  # fmt: skip
+    return tree
+
+
 def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     """Raises UsageError where memory is too small, StageFailed where nothing shows."""
     started = time.monotonic()
     tree = restricted(load(inputs_of(SplatsInputs, job.inputs).bake.asset), settings.region)
     captured = job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage]
     remedy = f"Lower splats.count ({settings.count}), poses.max_image_size or bake.max_mib."
-    refuse_what_does_not_fit(job, needed(tree, settings, captured), remedy)
+    refuse_what_does_not_fit(job, needed(tree, settings, captured, job.device), remedy)
+    tree = _on_device(job, tree)
     gaussians = gaussians_of(tree, settings, job.reached, captured)
     job.safe_point()
     frame = source_frame(tree.metadata)

@@ -48,4 +48,6 @@ class SplatsSettings:
     seed: Seed = setting(0, "Seed of the order of the images.", advanced=True)
 
 
-STAGE = Stage(name="splats", version=10, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"))
+STAGE = Stage(
+    name="splats", version=10, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"), uses_device=True,
+)  # fmt: skip

@@ -128,8 +128,23 @@ def fit() -> None:
             tree_steps.step(g, values, sums, Moments(*squares, visits), stamp, rule, neighbours, number=7, rays=8)
 
 
+def splats() -> None:
+    from efficientnerf.backends.splat_layout import GRADIENTS
+    from efficientnerf.backends.triton.splats import fit as cuda_splats
+    from efficientnerf.splats.refit import rates_of
+    from efficientnerf.splats.rendering import lens_of, values_of
+    from tests.efficientnerf.splats_reference import LENSES, camera, picture_of, some_gaussians
+
+    for degree, over_all, (model, extra) in ((2, True, LENSES[0]), (0, False, LENSES[0]), (3, True, LENSES[2])):
+        rows, lens = values_of(some_gaussians(8, degree)), lens_of(camera(model, extra))
+        cuda_splats.splat_image(rows, degree, lens, "cpu")
+        fit = cuda_splats.SplatFit(rows, np.zeros((8, GRADIENTS + rows.shape[1]), np.float32), degree, "cpu")
+        fit.step(lens, picture_of(0, over_all), rates_of(0.0, 0.1))
+
+
 if __name__ == "__main__":
     JITFunction.run = build
+    splats()
     fit()
     training_step()
     images()

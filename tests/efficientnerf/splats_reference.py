@@ -1,13 +1,60 @@
-"""The rasteriser as plain torch, one Gaussian after the other over all pixels: the kernels' reference. Pinhole cameras."""
+"""The rasteriser as plain torch, one Gaussian after the other over all pixels: the kernels' reference, of pinhole cameras; and what it is given."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.backends.splat_layout import Picture
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.harmonics import basis
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import NEAR
+from tests.efficientnerf.balls import pose
+
+WIDTH, HEIGHT = 37, 27  # neither a multiple of a tile or block
+LENSES = [
+    ("OPENCV", (-0.2, 0.05, 0.01, -0.02)), ("FULL_OPENCV", (-0.2, 0.05, 0.01, -0.02, 0.02, 0.05, 0.01, 0.0)), ("OPENCV_FISHEYE", (-0.05, 0.02, 0.01, -0.01)),
+]  # fmt: skip
+
+
+def some_gaussians(count: int = 60, degree: int = 3, seed: int = 0, size: float = 0.2) -> Gaussians:
+    """Around the origin, some behind the camera, some thin, some opaque."""
+    rng = np.random.default_rng(seed)
+    rotations = rng.normal(size=(count, 4))
+    rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
+    means = rng.normal(size=(count, 3)) * 0.5
+    means[::17] *= 30
+    harmonics = rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.4
+    parts = means, size * np.exp(rng.normal(size=(count, 3)) - 1), rotations, rng.uniform(0.02, 0.999, count), harmonics
+    return Gaussians(*(part.astype(np.float32) for part in parts))
+
+
+def camera(model: str = "PINHOLE", extra: tuple[float, ...] = ()) -> Camera:
+    return Camera("view", WIDTH, HEIGHT, model, (33.0, 35.0, 18.0, 13.0, *extra), pose(0.7, 0.4))
+
+
+def tensors(gaussians: Gaussians) -> list[Tensor]:
+    logits = np.log(gaussians.opacities.astype(np.float64) / (1 - gaussians.opacities))
+    parts = gaussians.means, np.log(gaussians.scales.astype(np.float64)), gaussians.rotations, logits, gaussians.harmonics
+    return [torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in parts]
+
+
+def picture_of(seed: int, over_all: bool) -> Picture:
+    rng = np.random.default_rng(seed)
+    mask = (rng.random((HEIGHT, WIDTH)) < 0.8).astype(np.uint8)
+    return Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32))
+
+
+def reference_loss(image: Tensor, light: Tensor, picture: Picture) -> Tensor:
+    """Half of the squared error."""
+    pixels, mask = torch.tensor(picture.pixels / 255.0), torch.tensor(picture.mask != 0)
+    if not picture.over_all:
+        off = image + light[..., None] * torch.tensor(picture.background, dtype=image.dtype) - pixels[..., :3]
+        return 0.5 * (off.square().sum(-1) * mask).sum()
+    alpha = pixels[..., 3:]
+    more = light[..., None] - (1 - alpha)
+    off = image - pixels[..., :3] * alpha + 0.5 * more
+    return 0.5 * ((off.square() + more.square() / 12).sum(-1) * mask).sum()
 
 
 def rotations_of(quaternions: Tensor) -> Tensor:

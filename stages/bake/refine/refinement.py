@@ -29,7 +29,7 @@ from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs
 from stages.bake import pruning
 from stages.bake.holes import find_holes
-from stages.bake.memory import free_on_device, needed_on_device
+from stages.bake.memory import needed_on_device
 from stages.bake.plan import Bake, SceneBake, coarse_cells
 from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint
@@ -39,6 +39,7 @@ from stages.bake.refine.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WE
 from stages.bake.voxels import Voxels
 from stages.cores import count_cores
 from stages.io.scene import Scene
+from stages.memory.device import free_on_device
 from stages.train.budget import Budget
 from stages.train.log import draw_curve, psnr_of
 from stages.train.previews import Previews

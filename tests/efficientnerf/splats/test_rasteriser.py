@@ -4,73 +4,38 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.splats import fitting, raster
 from efficientnerf.backends.numba.splats.fit import grouped, projected, ungrouped
 from efficientnerf.backends.numba.splats.projection import LANES, project
 from efficientnerf.backends.numba.vector.memory import pointer
-from efficientnerf.backends.splat_layout import RECORD, SUMS, Picture
+from efficientnerf.backends.splat_layout import RECORD, SUMS
 from efficientnerf.geometry import cameras
-from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.rendering import gaussians_from, lens_of, render, values_of
-from tests.efficientnerf.balls import pose
-from tests.efficientnerf.splats_reference import render_reference
-
-WIDTH, HEIGHT = 37, 27  # neither a multiple of a tile or block
-
-
-def some(count: int = 60, degree: int = 3, seed: int = 0, size: float = 0.2) -> Gaussians:
-    """Around the origin, some behind the camera, some thin, some opaque."""
-    rng = np.random.default_rng(seed)
-    rotations = rng.normal(size=(count, 4))
-    rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
-    means = rng.normal(size=(count, 3)) * 0.5
-    means[::17] *= 30
-    harmonics = rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.4
-    parts = means, size * np.exp(rng.normal(size=(count, 3)) - 1), rotations, rng.uniform(0.02, 0.999, count), harmonics
-    return Gaussians(*(part.astype(np.float32) for part in parts))
-
-
-def camera(model: str = "PINHOLE", extra: tuple[float, ...] = ()) -> Camera:
-    return Camera("view", WIDTH, HEIGHT, model, (33.0, 35.0, 18.0, 13.0, *extra), pose(0.7, 0.4))
-
-
-def tensors(gaussians: Gaussians) -> list[Tensor]:
-    logits = np.log(gaussians.opacities.astype(np.float64) / (1 - gaussians.opacities))
-    parts = gaussians.means, np.log(gaussians.scales.astype(np.float64)), gaussians.rotations, logits, gaussians.harmonics
-    return [torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in parts]
+from tests.efficientnerf.splats_reference import (
+    HEIGHT,
+    LENSES,
+    WIDTH,
+    camera,
+    covariances,
+    picture_of,
+    reference_loss,
+    render_reference,
+    some_gaussians,
+    tensors,
+)
 
 
 @pytest.mark.parametrize(("degree", "size"), [(0, 0.05), (1, 0.2), (2, 1.0), (3, 0.2)])
 def test_images_are_those_of_the_plain_sums(degree: int, size: float) -> None:
-    gaussians = some(degree=degree, size=size)
+    gaussians = some_gaussians(degree=degree, size=size)
     image = render(gaussians, camera())
     colour, light = render_reference(*tensors(gaussians), camera())
     np.testing.assert_allclose(image.colour, colour.detach(), atol=2e-4)
     np.testing.assert_allclose(image.opacity, 1 - light.detach(), atol=2e-4)
     assert image.opacity.max() > 0.5
-
-
-def picture_of(seed: int, over_all: bool) -> Picture:
-    rng = np.random.default_rng(seed)
-    mask = (rng.random((HEIGHT, WIDTH)) < 0.8).astype(np.uint8)
-    return Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32))
-
-
-def reference_loss(image: Tensor, light: Tensor, picture: Picture) -> Tensor:
-    """Half of the squared error."""
-    pixels, mask = torch.tensor(picture.pixels / 255.0), torch.tensor(picture.mask != 0)
-    if not picture.over_all:
-        off = image + light[..., None] * torch.tensor(picture.background, dtype=image.dtype) - pixels[..., :3]
-        return 0.5 * (off.square().sum(-1) * mask).sum()
-    alpha = pixels[..., 3:]
-    more = light[..., None] - (1 - alpha)
-    off = image - pixels[..., :3] * alpha + 0.5 * more
-    return 0.5 * ((off.square() + more.square() / 12).sum(-1) * mask).sum()
 
 
 @numba.njit(error_model="numpy")
@@ -90,7 +55,7 @@ def step_gradients(values, lens, degree, first, sums, out):  # type: ignore[no-u
 
 @pytest.mark.parametrize(("degree", "over_all"), [(2, True), (3, False)])
 def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool) -> None:
-    gaussians, picture = some(count=53, degree=degree), picture_of(1, over_all)
+    gaussians, picture = some_gaussians(count=53, degree=degree), picture_of(1, over_all)
     values, lens = grouped(values_of(gaussians)), lens_of(camera())
     records = np.zeros((16 * len(values), RECORD), np.float32)
     pairs = projected(values, lens, degree, records)
@@ -109,15 +74,10 @@ def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool) -> N
         np.testing.assert_allclose(part, gradient, rtol=2e-3, atol=2e-4 * np.abs(gradient).max(), err_msg=name)
 
 
-LENSES = [
-    ("OPENCV", (-0.2, 0.05, 0.01, -0.02)), ("FULL_OPENCV", (-0.2, 0.05, 0.01, -0.02, 0.02, 0.05, 0.01, 0.0)), ("OPENCV_FISHEYE", (-0.05, 0.02, 0.01, -0.01)),
-]  # fmt: skip
-
-
 @pytest.mark.parametrize(("model", "extra"), LENSES)
 def test_a_small_gaussian_lands_where_the_lens_sends_its_points(model: str, extra: tuple[float, ...]) -> None:
     lens, rng = camera(model, extra), np.random.default_rng(0)
-    one = some(count=1)
+    one = some_gaussians(count=1)
     pixels = np.array([[9.0, 7.0], [30.0, 20.0], [18.3, 13.1]])
     origins, directions = cameras.rays(lens, pixels)
     means = (origins + 3 * directions).astype(np.float32)
@@ -126,8 +86,6 @@ def test_a_small_gaussian_lands_where_the_lens_sends_its_points(model: str, extr
     records = np.zeros((16, RECORD), np.float32)
     project(grouped(values_of(gaussians)), lens_of(lens), 3, records)
     np.testing.assert_allclose(records[:3, :2], pixels, atol=2e-3)
-    from tests.efficientnerf.splats_reference import covariances
-
     for n in range(3):
         points = rng.multivariate_normal(np.zeros(3), covariances(gaussians)[n], 4000) * 1e-3 + means[n]
         seen, _ = cameras.project(lens, points)
@@ -138,7 +96,7 @@ def test_a_small_gaussian_lands_where_the_lens_sends_its_points(model: str, extr
 def test_what_lies_behind_the_camera_or_beside_the_picture_is_not_rendered() -> None:
     view = camera()
     there = np.stack([view.centre - view.forward, view.centre + 30 * view.up + view.forward, view.centre]).astype(np.float32)
-    gaussians = replace(some(count=3), means=there, scales=np.full((3, 3), 0.1, np.float32))
+    gaussians = replace(some_gaussians(count=3), means=there, scales=np.full((3, 3), 0.1, np.float32))
     assert render(gaussians, view).opacity.max() == 0
 
 
@@ -147,7 +105,7 @@ def test_what_lies_behind_the_camera_or_beside_the_picture_is_not_rendered() -> 
     [(100.0, 1e-38, "PINHOLE"), (1e10, 1.0, "OPENCV_FISHEYE"), (1e30, 3e38, "PINHOLE"), (3e38, 1e10, "OPENCV_FISHEYE")],
 )
 def test_whatever_a_file_may_hold_is_rendered_without_harm(far: float, wide: float, model: str) -> None:
-    view, gaussians = camera(model, (0.0,) * 4 if model == "OPENCV_FISHEYE" else ()), some(count=20)
+    view, gaussians = camera(model, (0.0,) * 4 if model == "OPENCV_FISHEYE" else ()), some_gaussians(count=20)
     places = np.concatenate([view.centre + view.forward * [[0.06], [1], [50]], np.clip(np.random.default_rng(0).normal(size=(17, 3)) * far, -3e38, 3e38)])
     scales = np.tile([wide, 1e-38, 3e38], (20, 1))
     gaussians = replace(gaussians, means=places.astype(np.float32), scales=scales.astype(np.float32), harmonics=gaussians.harmonics * np.float32(1e3))
@@ -159,7 +117,7 @@ def test_whatever_a_file_may_hold_is_rendered_without_harm(far: float, wide: flo
 
 def test_pairs_name_the_blocks_that_a_gaussian_touches_and_few_others() -> None:
     """Needles along diagonals too, whose boxes are nearly empty."""
-    gaussians = some(count=200, degree=0)
+    gaussians = some_gaussians(count=200, degree=0)
     scales = gaussians.scales * np.array([8, 1, 0.1], np.float32)
     values = grouped(values_of(Gaussians(gaussians.means, scales, gaussians.rotations, gaussians.opacities, gaussians.harmonics)))
     records = np.zeros((LANES * len(values), RECORD), np.float32)
@@ -183,7 +141,7 @@ def test_pairs_name_the_blocks_that_a_gaussian_touches_and_few_others() -> None:
 
 
 def test_tiles_rendered_in_pieces_are_the_whole_and_ties_keep_their_order() -> None:
-    gaussians = some(count=40)
+    gaussians = some_gaussians(count=40)
     twice = gaussians.subset(np.tile(np.arange(40), 2))
     records = np.zeros((80, RECORD), np.float32)
     pairs = projected(grouped(values_of(twice)), lens_of(camera()), 3, records)
@@ -201,7 +159,7 @@ def test_tiles_rendered_in_pieces_are_the_whole_and_ties_keep_their_order() -> N
 
 
 def test_groups_hold_what_was_put_in() -> None:
-    gaussians = some(count=21, degree=1)
+    gaussians = some_gaussians(count=21, degree=1)
     back = gaussians_from(ungrouped(grouped(values_of(gaussians)), 21))
     for name in ("means", "scales", "rotations", "opacities", "harmonics"):
         np.testing.assert_allclose(getattr(back, name), getattr(gaussians, name), rtol=1e-5, atol=1e-6)
