@@ -97,7 +97,8 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
     import gpu_kernels
 
     if part == "kernels":
-        return {"copy_gb_per_second": round(gpu_kernels.copy_rate("cuda", 2048, 10)), **gpu_kernels.kernel_rates("cuda", 2**16, 19, 20)}
+        splats = {"splats_ms": gpu_kernels.splat_rates("cuda", 200_000, 512, 10)}
+        return {"copy_gb_per_second": round(gpu_kernels.copy_rate("cuda", 2048, 10)), **gpu_kernels.kernel_rates("cuda", 2**16, 19, 20), **splats}
     if part == "renders":
         from efficientnerf.asset import format
 
