@@ -105,4 +105,4 @@ def test_a_fit_on_a_device_ends_as_on_the_cpu() -> None:
     assert error(ends[0], views) < 0.5 * error(gaussians, views)
     assert error(ends[1], views) == pytest.approx(error(ends[0], views), rel=0.05)
     for one, two in zip(render(ends[1], cameras[0], None, "cuda"), render(ends[1], cameras[0]), strict=True):
-        np.testing.assert_allclose(one, two, atol=2e-3)
+        np.testing.assert_allclose(one, two, atol=6e-3)  # where one of them leaves out an alpha of 1/255

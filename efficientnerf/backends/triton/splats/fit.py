@@ -65,19 +65,14 @@ class SplatFit:
         self.values, self.moments, self._degree = columns_of(rows, device), columns_of(moments, device), degree
         self.errors = torch.zeros(len(rows), device=device)
 
-    def gradient_sums(self, lens: layout.Lens, picture: Picture) -> tuple[Tensor, Tensor]:
-        """What gradients follow from, (N, SUMS), and how many tiles each Gaussian is in, (N,)."""
+    def step(self, lens: layout.Lens, picture: Picture, rates: Rates) -> None:
+        """A step of all Gaussians that are in the image."""
         records, tiles, pairs = projected(self.values, lens, self._degree)
-        pixels, mask = (to_device(torch.from_numpy(part), self.values.device) for part in (picture.pixels, picture.mask))
+        pixels, mask = (to_device(torch.tensor(part), self.values.device) for part in (picture.pixels, picture.mask))
         sums = torch.zeros(len(records), layout.SUMS, device=self.values.device)
         raster.fit_tiles[(len(pairs.begin) - 1, raster.BLOCKS)](
             records, pairs, Target(pixels, mask, tuple(picture.background.tolist())), sums, lens.width, lens.height, OVER_ALL=picture.over_all, num_warps=1
         )
-        return sums, tiles
-
-    def step(self, lens: layout.Lens, picture: Picture, rates: Rates) -> None:
-        """A step of all Gaussians that are in the image."""
-        sums, tiles = self.gradient_sums(lens, picture)
         numbers = rates.momentum, rates.decay, rates.epsilon, rates.least, rates.greatest
         step[(blocks(len(tiles)),)](
             self.values, self.moments, self.errors, sums, tiles, len(tiles), lens_of(lens), Rule(tuple(rates.rates.tolist()), *map(float, numbers)),

@@ -196,12 +196,17 @@ def conic_of(p):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def view_of(values, n, count, live, lens):  # type: ignore[no-untyped-def]
-    """Unit directions (Vec3) that harmonics are seen along."""
+def colour_of(values, n, count, live, lens, K: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Unit directions that harmonics are seen along, and colours, not clipped (Vec3)."""
     mean = load_rows(values, MEAN, n, count, live)
     x, y, z = mean.x - lens.centre[0], mean.y - lens.centre[1], mean.z - lens.centre[2]
     length = tl.sqrt(tl.maximum(x * x + y * y + z * z, 1e-30))
-    return Vec3(x / length, y / length, z / length)
+    view = Vec3(x / length, y / length, z / length)
+    red, green, blue = tl.zeros_like(x) + 0.5, tl.zeros_like(x) + 0.5, tl.zeros_like(x) + 0.5
+    for k in tl.static_range(K):
+        basis, c = harmonic(view, k), load_rows(values, HARMONICS + 3 * k, n, count, live)
+        red, green, blue = red + basis * c.x, green + basis * c.y, blue + basis * c.z
+    return view, Vec3(red, green, blue)
 
 
 @triton.jit
@@ -228,11 +233,7 @@ def project(values, records, boxes, count, lens, FISHEYE: tl.constexpr, K: tl.co
     tl.store(boxes + count + n, top, live)
     tl.store(boxes + 2 * count + n, columns, live)
     tl.store(boxes + 3 * count + n, tl.where(seen, columns * rows, 0), live)
-    view = view_of(values, n, count, live, lens)
-    red, green, blue = 0.5 + tl.zeros_like(reach), 0.5 + tl.zeros_like(reach), 0.5 + tl.zeros_like(reach)
-    for k in tl.static_range(K):
-        basis, c = harmonic(view, k), load_rows(values, HARMONICS + 3 * k, n, count, live)
-        red, green, blue = red + basis * c.x, green + basis * c.y, blue + basis * c.z
+    _, colour = colour_of(values, n, count, live, lens, K)
     at = records + n * RECORD
     tl.store(at + X, p.x, live)
     tl.store(at + Y, p.y, live)
@@ -240,7 +241,7 @@ def project(values, records, boxes, count, lens, FISHEYE: tl.constexpr, K: tl.co
     tl.store(at + CONIC_B, conic.b, live)
     tl.store(at + CONIC_C, conic.c, live)
     tl.store(at + ALPHA, opacity, live)
-    tl.store(at + RED, tl.maximum(red, 0.0), live)
-    tl.store(at + RED + 1, tl.maximum(green, 0.0), live)
-    tl.store(at + RED + 2, tl.maximum(blue, 0.0), live)
+    tl.store(at + RED, tl.maximum(colour.x, 0.0), live)
+    tl.store(at + RED + 1, tl.maximum(colour.y, 0.0), live)
+    tl.store(at + RED + 2, tl.maximum(colour.z, 0.0), live)
     tl.store(at + DEPTH, p.depth, live)

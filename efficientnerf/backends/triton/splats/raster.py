@@ -146,16 +146,16 @@ def _pull(c, by, error, sums, v):  # type: ignore[no-untyped-def]
     """Add the sums of a chunk to its Gaussians'; v: derivatives by -q / 2."""
     weight, to, vx, vy = tl.where(c.counts, c.before * c.alpha, 0.0), sums + c.gaussian * SUMS, v * c.dx, v * c.dy
     met = tl.max(c.counts.to(tl.int32), 1) > 0
-    tl.atomic_add(to, tl.sum(v, 1), met)
-    tl.atomic_add(to + 1, tl.sum(vx, 1), met)
-    tl.atomic_add(to + 2, tl.sum(vy, 1), met)
-    tl.atomic_add(to + 3, tl.sum(vx * c.dx, 1), met)
-    tl.atomic_add(to + 4, tl.sum(vx * c.dy, 1), met)
-    tl.atomic_add(to + 5, tl.sum(vy * c.dy, 1), met)
-    tl.atomic_add(to + 6, tl.sum(weight * by.x[None, :], 1), met)
-    tl.atomic_add(to + 7, tl.sum(weight * by.y[None, :], 1), met)
-    tl.atomic_add(to + 8, tl.sum(weight * by.z[None, :], 1), met)
-    tl.atomic_add(to + ERROR, tl.sum(weight * error[None, :], 1), met)
+    tl.atomic_add(to, tl.sum(v, 1), met, "relaxed")
+    tl.atomic_add(to + 1, tl.sum(vx, 1), met, "relaxed")
+    tl.atomic_add(to + 2, tl.sum(vy, 1), met, "relaxed")
+    tl.atomic_add(to + 3, tl.sum(vx * c.dx, 1), met, "relaxed")
+    tl.atomic_add(to + 4, tl.sum(vx * c.dy, 1), met, "relaxed")
+    tl.atomic_add(to + 5, tl.sum(vy * c.dy, 1), met, "relaxed")
+    tl.atomic_add(to + 6, tl.sum(weight * by.x[None, :], 1), met, "relaxed")
+    tl.atomic_add(to + 7, tl.sum(weight * by.y[None, :], 1), met, "relaxed")
+    tl.atomic_add(to + 8, tl.sum(weight * by.z[None, :], 1), met, "relaxed")
+    tl.atomic_add(to + ERROR, tl.sum(weight * error[None, :], 1), met, "relaxed")
 
 
 @triton.jit

@@ -10,7 +10,7 @@ import triton.language as tl
 
 from efficientnerf.backends import splat_layout as layout
 from efficientnerf.backends.triton.harmonics import harmonic
-from efficientnerf.backends.triton.splats.projection import HARMONICS, MEAN, OPACITY, ROTATION, SCALE, conic_of, image_of, view_of
+from efficientnerf.backends.triton.splats.projection import HARMONICS, MEAN, OPACITY, ROTATION, SCALE, colour_of, conic_of, image_of
 from efficientnerf.backends.triton.splats.raster import ERROR, SUMS
 from efficientnerf.backends.triton.vectors import Vec3, sigmoid
 
@@ -102,7 +102,7 @@ def _turn(walk, p, dx, dy):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _colour(walk, view, g, K: tl.constexpr):  # type: ignore[no-untyped-def]
-    """The step of the harmonics, with gradients g (Vec3) by the colours."""
+    """The step of the harmonics, with gradients g (Vec3) by the colours, none by one that is clipped."""
     base = harmonic(view, 0)
     _descend_three(walk, HARMONICS, 4, Vec3(base * g.x, base * g.y, base * g.z), walk.rule.rates[4])
     if K > 1:
@@ -116,20 +116,6 @@ def _colour(walk, view, g, K: tl.constexpr):  # type: ignore[no-untyped-def]
             _descend(walk, HARMONICS + 3 * k, basis * g.x, scale)
             _descend(walk, HARMONICS + 3 * k + 1, basis * g.y, scale)
             _descend(walk, HARMONICS + 3 * k + 2, basis * g.z, scale)
-
-
-@triton.jit
-def _shown(values, n, count, live, lens, sums, K: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Directions of views, and gradients by the colours: none by a channel that is clipped."""
-    view = view_of(values, n, count, live, lens)
-    red, green, blue = 0.5 + tl.zeros_like(view.x), 0.5 + tl.zeros_like(view.x), 0.5 + tl.zeros_like(view.x)
-    for k in tl.static_range(K):
-        basis, at = harmonic(view, k), values + count * (HARMONICS + 3 * k) + n
-        red += basis * tl.load(at, live, other=0.0)
-        green += basis * tl.load(at + count, live, other=0.0)
-        blue += basis * tl.load(at + 2 * count, live, other=0.0)
-    by_red, by_green, by_blue = tl.load(sums + 6, live, other=0.0), tl.load(sums + 7, live, other=0.0), tl.load(sums + 8, live, other=0.0)
-    return view, Vec3(tl.where(red > 0, by_red, 0.0), tl.where(green > 0, by_green, 0.0), tl.where(blue > 0, by_blue, 0.0))
 
 
 @triton.jit
@@ -147,7 +133,7 @@ def step(values, moments, errors, sums, tiles, count, lens, rule, FISHEYE: tl.co
     tl.store(errors + n, tl.load(errors + n, moves, other=0.0) + tl.load(at + ERROR, moves, other=0.0), moves)
     p = image_of(values, n, count, moves, lens, FISHEYE)
     conic = conic_of(p)
-    view, by_colour = _shown(values, n, count, moves, lens, at, K)
+    view, colour = colour_of(values, n, count, moves, lens, K)
     opacity = tl.load(values + count * OPACITY + n, moves, other=0.0)
     px, py = conic.a * vx + conic.b * vy, conic.b * vx + conic.c * vy
     by_mean = Vec3(px * p.by_x.x + py * p.by_y.x, px * p.by_x.y + py * p.by_y.y, px * p.by_x.z + py * p.by_y.z)
@@ -162,4 +148,5 @@ def step(values, moments, errors, sums, tiles, count, lens, rule, FISHEYE: tl.co
     _turn(walk, p, dx, dy)
     by_logit = v * (1 - sigmoid(opacity))
     _descend(walk, OPACITY, by_logit, _scale(walk, 3, by_logit * by_logit, rule.rates[3]))
-    _colour(walk, view, by_colour, K)
+    red, green, blue = tl.load(at + 6, moves, other=0.0), tl.load(at + 7, moves, other=0.0), tl.load(at + 8, moves, other=0.0)
+    _colour(walk, view, Vec3(tl.where(colour.x > 0, red, 0.0), tl.where(colour.y > 0, green, 0.0), tl.where(colour.z > 0, blue, 0.0)), K)
