@@ -65,6 +65,16 @@ def made(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> S
     return SplatsOutputs(folder / "out")
 
 
+def test_a_device_without_the_memory_leaves_the_fit_to_the_cpu(
+    made: SplatsOutputs, inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(splats, "free_on_device", lambda device: 2**20)
+    said: list[dict[str, object]] = []
+    splats.run(Job(settings=QUICK, inputs=inputs, out=tmp_path / "out", work=tmp_path / "work", device="cuda", report=said.append))
+    assert "800 Gaussians need about 0.0 GiB on the device; 0.0 GiB are free" in str(said)
+    assert SplatsOutputs(tmp_path / "out").ply.read_bytes() == made.ply.read_bytes()
+
+
 def test_the_files_hold_the_ball_in_the_capture_s_frame(made: SplatsOutputs, inputs: dict[str, Path]) -> None:
     tree = load(inputs["bake"] / "asset.nerftree")
     found, frame = read_splats(made.ply), source_frame(tree.metadata)
