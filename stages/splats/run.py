@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.asset.format import load
@@ -114,7 +115,12 @@ def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     remedy = f"Lower splats.count ({settings.count}), poses.max_image_size or bake.max_mib."
     refuse_what_does_not_fit(job, needed(tree, settings, captured, job.device), remedy)
     tree = _on_device(job, tree)
-    gaussians = gaussians_of(tree, settings, job.reached, captured)
+    try:
+        gaussians = gaussians_of(tree, settings, job.reached, captured)
+    except torch.OutOfMemoryError:
+        job.warn(f"the device has no memory left for {settings.count:,} Gaussians. They are fitted on the CPU, which takes longer. Lower splats.count.")
+        tree = tree.to("cpu")
+        gaussians = gaussians_of(tree, settings, job.reached, captured)
     job.safe_point()
     frame = source_frame(tree.metadata)
     written = in_capture(gaussians, frame)

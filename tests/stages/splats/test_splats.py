@@ -3,9 +3,11 @@
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from efficientnerf.asset.captured import captured_metadata
 from efficientnerf.asset.format import load, save
@@ -72,6 +74,24 @@ def test_a_device_without_the_memory_leaves_the_fit_to_the_cpu(
     said: list[dict[str, object]] = []
     splats.run(Job(settings=QUICK, inputs=inputs, out=tmp_path / "out", work=tmp_path / "work", device="cuda", report=said.append))
     assert "800 Gaussians need about 0.0 GiB on the device; 0.0 GiB are free" in str(said)
+    assert SplatsOutputs(tmp_path / "out").ply.read_bytes() == made.ply.read_bytes()
+
+
+def test_a_device_that_runs_out_of_memory_leaves_it_to_the_cpu_too(
+    made: SplatsOutputs, inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit, tries = splats.gaussians_of, []
+
+    def full_at_first(*given: Any) -> Any:
+        tries.append(given)
+        if len(tries) == 1:
+            raise torch.OutOfMemoryError
+        return fit(*given)
+
+    monkeypatch.setattr(splats, "gaussians_of", full_at_first)
+    said: list[dict[str, object]] = []
+    splats.run(Job(settings=QUICK, inputs=inputs, out=tmp_path / "out", work=tmp_path / "work", report=said.append))
+    assert "the device has no memory left for 800 Gaussians" in str(said)
     assert SplatsOutputs(tmp_path / "out").ply.read_bytes() == made.ply.read_bytes()
 
 
