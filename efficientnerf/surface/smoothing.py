@@ -68,12 +68,12 @@ def rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
 
 def smoothed_face_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float) -> tuple[np.ndarray, np.ndarray]:
     """(F, 3) unit normals of faces after `rounds` of bilateral smoothing (`smooth_normals`), and twice their areas (F,)."""
-    vectors, beside = face_vectors(vertices, faces), face_neighbours(faces, len(vertices))
+    vectors, neighbours = face_vectors(vertices, faces), face_neighbours(faces, len(vertices))
     area = np.linalg.norm(vectors, axis=1)
     normals = vectors / np.maximum(area, 1e-300)[:, None]
     other = np.empty_like(normals)
     for _ in range(rounds):
-        smooth_face_normals(normals, area, beside, sharpness, other)
+        smooth_face_normals(normals, area, neighbours, sharpness, other)
         normals, other = other, normals
     return normals, area
 

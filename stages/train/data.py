@@ -106,7 +106,7 @@ def begin_sky(m: Model, pixels: Pixels) -> bool:
 
     Before a sky of another colour a plain backdrop is first learned as fog round each camera, which hides the subject and costs nothing: it stays.
     """
-    if m.background is not None or m.space.reaches_infinity:
+    if m.background is not None or m.space.reaches_infinity or pixels.images.shape[1] == 4:  # behind an object with alpha anything may lie
         return False
     colours, shares = pixels.border_colours(ALIKE)
     plain = shares >= PLAIN

@@ -22,12 +22,12 @@ CHILD = "tests.pipeline.diamond"
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="children are POSIX's")
 
 
-def beside(jobs: int = 2, cores: int = 4, need: Callable[[Any], int | None] = lambda stage: 1) -> SideBySide:
+def side_by_side(jobs: int = 2, cores: int = 4, need: Callable[[Any], int | None] = lambda stage: 1) -> SideBySide:
     return SideBySide(CHILD, jobs, cores, need)
 
 
 def done(run: Any, jobs: int = 2, **how: Any) -> list[Outcome]:
-    with beside(jobs) as together:
+    with side_by_side(jobs) as together:
         return run_stages(run, STAGES, side_by_side=together, **how)
 
 
@@ -55,7 +55,7 @@ def test_a_stage_begins_once_those_that_it_needs_have_ended_while_others_run(tmp
     place.mkdir()
     run = make_run(tmp_path / "run", place=place, meets={"right": ("after_left",)})
     stages = [stage for stage in STAGES if stage.name in ("top", "left", "right")] + [AFTER_LEFT]
-    with beside(2) as together:
+    with side_by_side(2) as together:
         outcomes = run_stages(run, stages, side_by_side=together)
     assert actions(outcomes) == {"top": "ran", "left": "ran", "right": "ran", "after_left": "ran"}
     assert (place / "after_left").read_text().split()[1] == "2", "4 cores for the two that run"
@@ -120,7 +120,7 @@ def test_a_signal_stops_all_of_them_and_the_run_goes_on_later(tmp_path: Path) ->
 def test_they_run_one_after_another_where_the_memory_is_too_little(tmp_path: Path, need: int | None, together: bool) -> None:
     (tmp_path / "place").mkdir()
     run = make_run(tmp_path / "run", place=tmp_path / "place")
-    with beside(2, need=lambda stage: need) as sides:
+    with side_by_side(2, need=lambda stage: need) as sides:
         run_stages(run, STAGES, side_by_side=sides, memory=Limit(100, "this machine"))
     ours = {(tmp_path / "place" / name).read_text().split()[0] == str(os.getpid()) for name in MIDDLE}
     assert ours == {not together}

@@ -50,7 +50,7 @@ def test_the_sky_begins_with_the_colour_of_the_borders(backdrop: float) -> None:
     assert np.abs(m.sky(directions).detach().numpy() - backdrop).max() < 0.01
 
 
-@pytest.mark.parametrize("why", ["texture", "a gradient", "other colours in a fifth of them", "masks there", "a constant background"])
+@pytest.mark.parametrize("why", ["texture", "a gradient", "other colours in a fifth of them", "masks there", "a constant background", "alpha"])
 def test_it_begins_grey_elsewhere(why: str) -> None:
     images, masks, m = photographs(), None, model()
     for number, image in enumerate(images):
@@ -60,6 +60,8 @@ def test_it_begins_grey_elsewhere(why: str) -> None:
             image[:] = np.linspace(60, 200, 48).astype(np.uint8)[:, None, None]
         elif why.startswith("other") and number % 5 == 0:
             image[:] = 160
+    if why == "alpha":
+        images = [np.dstack([image, np.full(image.shape[:2], 255, np.uint8)]) for image in images]
     if why == "masks there":
         inside = np.zeros((48, 48), bool)
         inside[8:-8, 8:-8] = True

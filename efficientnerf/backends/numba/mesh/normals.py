@@ -6,18 +6,18 @@ from efficientnerf.backends.numba.runtime import numba
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def smooth_face_normals(normals, areas, beside, sharpness, out):  # type: ignore[no-untyped-def]
+def smooth_face_normals(normals, areas, neighbours, sharpness, out):  # type: ignore[no-untyped-def]
     """Of each face the mean of its own normal and those next to it, by area and exp(-difference^2 / (2 sharpness^2)).
 
     normals  (F, 3) float64 unit
     areas    (F,) float64
-    beside   (F, 3) int64 the face across each edge, -1: none
+    neighbours   (F, 3) int64 the face across each edge, -1: none
     out      (F, 3) float64 unit
     """
     for face in numba.prange(len(normals)):
         x, y, z = areas[face] * normals[face, 0], areas[face] * normals[face, 1], areas[face] * normals[face, 2]
         for side in range(3):
-            other = beside[face, side]
+            other = neighbours[face, side]
             if other < 0:
                 continue
             apart = 0.0
