@@ -107,7 +107,7 @@ def waits_of(state: RefinementState, targets: Targets, device: str, options: dic
             pass
         if device == "cuda":
             torch.cuda.set_sync_debug_mode("default")
-    return dict(Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)))
+    return dict(Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "called a synchronizing" in str(w.message)))
 
 
 def test_view_psnr(m: Model, trees: list[NerfTree], camera: Camera, device: str) -> dict[str, float]:

@@ -220,7 +220,7 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
         left_out = sum(next(running).left_out for _ in range(32))
         if device == "cuda":
             torch.cuda.set_sync_debug_mode("default")
-    waits.update(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message))
+    waits.update(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "called a synchronizing" in str(w.message))
     timed = steps - steps // 2 - 1
     assert done is not None
     return {

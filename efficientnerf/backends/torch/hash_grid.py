@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.backends.transfer import constant
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 PRIME_Y, PRIME_Z = 2654435761, 805459861  # section 3
@@ -49,9 +50,7 @@ def relu_network(features: Tensor, weights: Sequence[Tensor], offset: float, pre
     for weight in weights[:-1]:
         x = torch.relu(x @ weight.to(precision).t())
     raw = (x @ weights[-1].to(precision).t()).to(features.dtype)
-    shift = torch.zeros(raw.shape[1], dtype=raw.dtype, device=raw.device)
-    shift[0] = offset
-    return raw + shift
+    return raw + constant(offset * np.eye(1, raw.shape[1])[0], raw)
 
 
 def hash_network(

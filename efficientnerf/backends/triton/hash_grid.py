@@ -57,7 +57,7 @@ def _corner(low, fraction, resolution, dense, mask, CORNER: tl.constexpr):  # ty
     return entry, weight
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["samples"])
 def _encode(points, table, levels, out, samples, mask, L: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """One program: a block of samples at one level. An entry's two features are one load of eight bytes."""
     level = tl.program_id(1)
@@ -72,7 +72,7 @@ def _encode(points, table, levels, out, samples, mask, L: tl.constexpr, BLOCK: t
     tl.store(out + (n[:, None] * (2 * L) + level * 2 + feature[None, :]), total, live[:, None])
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["samples"])
 def _encode_backward(points, grad, levels, table_grad, samples, mask, L: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     level = tl.program_id(1)
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)

@@ -2,6 +2,9 @@
 
 None of their functions waits for the device unless it says so. With TRITON_INTERPRET=1, set before the first import, Triton's interpreter runs all of
 them on CPU tensors.
+
+Numbers that change from launch to launch are in no kernel's constants, and named in its `do_not_specialize`: else Triton compiles a kernel anew for a number
+that is one, or a multiple of sixteen, and training waits seconds for it.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def _store(buffers, at, t, size, length, point, live):  # type: ignore[no-untype
     store_vec3(buffers.point, at, point, live)
 
 
-@triton.jit(do_not_specialize=["unpruned"])
+@triton.jit(do_not_specialize=["rays", "unpruned"])
 def _march(  # type: ignore[no-untyped-def]
     bundle, box, voxels, first, tallies, out, rays, max_intervals, step, threshold, unpruned, side,
     CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
@@ -184,11 +184,11 @@ def valid_samples(
 
 
 @triton.jit
-def _ray_of(first, n, rays, BITS: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Which ray owns packed sample n: the last one that begins at or before it."""
+def _ray_of(first, n, rays, bits):  # type: ignore[no-untyped-def]
+    """Which ray owns packed sample n: the last one that begins at or before it; `rays` has so many bits."""
     low = n * 0
     high = low + rays - 1
-    for _ in tl.static_range(BITS):
+    for _ in range(bits):
         middle = (low + high + 1) // 2
         left = tl.load(first + middle) <= n
         low = tl.where(left, middle, low)
@@ -196,14 +196,14 @@ def _ray_of(first, n, rays, BITS: tl.constexpr):  # type: ignore[no-untyped-def]
     return low
 
 
-@triton.jit
-def _pivots(weight, first, out, rays, samples, threshold, max_pivots, BITS: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+@triton.jit(do_not_specialize=["rays", "samples", "bits"])
+def _pivots(weight, first, out, rays, samples, threshold, max_pivots, bits, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """Each lane counts the heavier samples of its ray; among equals the nearer counts as heavier."""
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < samples
     w = tl.load(weight + n, live, other=0.0)
     chosen = live & (w > threshold) & (n < tl.load(first + rays))
-    ray = _ray_of(first, n, rays, BITS)
+    ray = _ray_of(first, n, rays, bits)
     other = tl.load(first + ray, chosen, other=0)
     end = tl.load(first + ray + 1, chosen, other=0)
     rank = tl.zeros((BLOCK,), tl.int32)
@@ -223,29 +223,28 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: i
     if rays and samples:
         block = LANES if INTERPRETED else 32
         _pivots[(blocks(samples, block),)](
-            weight, first, out.view(torch.int8), rays, samples, float(threshold), max_pivots,
-            BITS=rays.bit_length(), BLOCK=block, num_warps=1 if block == 32 else 4,
+            weight, first, out.view(torch.int8), rays, samples, float(threshold), max_pivots, rays.bit_length(),
+            BLOCK=block, num_warps=1 if block == 32 else 4,
         )  # fmt: skip
     return out
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rays", "samples", "capacity", "per_pivot", "bits"])
 def _pivotal(  # type: ignore[no-untyped-def]
-    bundle, box, first, coarse, pivotal, before, fine, rays, samples, capacity,
-    CONTRACTED: tl.constexpr, PER_PIVOT: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+    bundle, box, first, coarse, pivotal, before, fine, rays, samples, capacity, per_pivot, bits, CONTRACTED: tl.constexpr, BLOCK: tl.constexpr
+):
     """Divides the pivotal ones of the samples `coarse`, SampleColumns, into `fine`; before: pivotal samples before each."""
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < samples
     live = live & (tl.load(pivotal + n, live, other=0) != 0)
-    ray = _ray_of(first, n, rays, BITS)
+    ray = _ray_of(first, n, rays, bits)
     u, v = _unit_rays(bundle, ray, live, box)
     shift = tl.load(bundle.offset + ray, live, other=0.0)
-    size = tl.load(coarse.extent + n, live, other=0.0) / PER_PIVOT
-    part = tl.load(coarse.length + n, live, other=0.0) / PER_PIVOT
+    size = tl.load(coarse.extent + n, live, other=0.0) / per_pivot
+    part = tl.load(coarse.length + n, live, other=0.0) / per_pivot
     begin = tl.load(coarse.start + n, live, other=0.0)
-    at = tl.load(before + n, live, other=0) * PER_PIVOT
-    for slot in tl.static_range(PER_PIVOT):
+    at = tl.load(before + n, live, other=0) * per_pivot
+    for slot in range(per_pivot):
         put = live & (at + slot < capacity)
         t = begin + slot * size
         g = _grid(along(u, v, t + shift * size), CONTRACTED)
@@ -271,7 +270,6 @@ def pivotal_samples(
     if rays and samples and total:
         _pivotal[(blocks(samples),)](
             RayBundle(origins, directions, offset, offset, offset), _box(space), coarse.first, SampleColumns(*coarse[1:5]), pivotal.view(torch.int8), before,
-            SampleColumns(start, extent, length, point), rays, samples, total,
-            CONTRACTED=space.contracted, PER_PIVOT=per_pivot, BITS=rays.bit_length(), BLOCK=LANES,
+            SampleColumns(start, extent, length, point), rays, samples, total, per_pivot, rays.bit_length(), CONTRACTED=space.contracted, BLOCK=LANES,
         )  # fmt: skip
     return Samples(first, start, extent, length, point, coarse.tried, complete)

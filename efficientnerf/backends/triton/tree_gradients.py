@@ -163,7 +163,7 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
     return Forward(after, add_scaled(state.colour, weight, rgb))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _forward(  # type: ignore[no-untyped-def]
     rays, cascades, voxels, colour, transmittance, count,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
@@ -206,7 +206,7 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
     return Backward(after, behind)
 
 
-@triton.jit(do_not_specialize=["number"])
+@triton.jit(do_not_specialize=["count", "number"])
 def _backward(  # type: ignore[no-untyped-def]
     rays, cascades, voxels, outputs, gradients, sums, stamp, count, number, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
@@ -239,7 +239,7 @@ def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
     return Absorption(after)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _max_contributions(  # type: ignore[no-untyped-def]
     rays, cascades, index, density, transmittance, maximum, count, voxel,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr,

@@ -133,7 +133,7 @@ def _surface_normal(cascades, density, p, live, CASCADES: tl.constexpr, BRICK: t
     return facing
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "width", "height"])
 def render(  # type: ignore[no-untyped-def]
     rays, cascades, voxels, out, count, width, height, camera, background,
     PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr,

@@ -67,12 +67,11 @@ def _step(  # type: ignore[no-untyped-def]
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     met = tl.load(stamp + v, v < voxels, other=-1) == number
     if tl.max(met.to(tl.int32), 0) > 0:
-        visited = tl.minimum(tl.load(moments.visits + v, met, other=0) + 1, h.max_visits)
-        tl.store(moments.visits + v, visited, met)
-        correction = 1 / (1 - tl.exp(visited.to(tl.float32) * h.log_decay))
         side = h.voxel
         if CASCADES > 1:
             side = h.voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
+        visited = tl.minimum(tl.load(moments.visits + v, met, other=0) + 1, h.max_visits)
+        correction = 1 / (1 - tl.exp(visited.to(tl.float32) * h.log_decay))
         # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
         depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, h.min_thickness)
         g = tl.load(sums[0] + v, met, other=0).to(tl.float32) * unit * depth
@@ -80,18 +79,22 @@ def _step(  # type: ignore[no-untyped-def]
         change = h.density_rate * g / (tl.sqrt(square * correction) + h.epsilon)
         if SMOOTH:
             change += _total_variation(v, met, depth, side, h.total_variation, neighbours.density, neighbours.beside, h.min_thickness)
-        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), h.min_thickness), h.max_thickness) / side, met)
-        tl.store(moments.square_density + v, square, met)
-        tl.store(sums[0] + v, tl.zeros_like(v), met)
         column = tl.arange(0, ROW)
         at = v[:, None] * WIDTH + column[None, :]
         there = met[:, None] & (column < WIDTH)[None, :]
         by_sh = tl.load(sums[1] + at, there, other=0).to(tl.float32) * unit
-        square = h.decay * tl.load(moments.square_sh + v, met, other=0.0) + (1 - h.decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
-        tl.store(moments.square_sh + v, square, met)
-        scale = h.sh_rate / (tl.sqrt(square * correction) + h.epsilon)
+        square_sh = h.decay * tl.load(moments.square_sh + v, met, other=0.0) + (1 - h.decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
+        scale = h.sh_rate / (tl.sqrt(square_sh * correction) + h.epsilon)
         share = tl.where(column < 3, 1.0, h.view_share)
-        tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * share[None, :] * by_sh, there)
+        moved = tl.load(sh + at, there, other=0.0) - scale[:, None] * share[None, :] * by_sh
+        # The compiler may load a value once for each layout that it is used in, in other warps: none may store before all have loaded.
+        tl.debug_barrier()
+        tl.store(moments.visits + v, visited, met)
+        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), h.min_thickness), h.max_thickness) / side, met)
+        tl.store(moments.square_density + v, square, met)
+        tl.store(sums[0] + v, tl.zeros_like(v), met)
+        tl.store(moments.square_sh + v, square_sh, met)
+        tl.store(sh + at, moved, there)
         tl.store(sums[1] + at, tl.zeros_like(at), there)
 
 

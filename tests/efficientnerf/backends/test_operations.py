@@ -297,6 +297,9 @@ def random_cells_case(valid: int) -> Case:
         cells = draw(values, threshold, count, 7).cpu().long()
         flat = values.view(-1).cpu()
         assert cells.tolist() != draw(values, threshold, count, 8).tolist()
+        if not valid:  # a device, whose host does not know their number, draws the second half among all
+            assert ((cells >= 0) & (cells < side**3)).all()
+            cells = cells[:half]
         rank = torch.cumsum(flat > threshold, dim=0)[cells[half:]] - 1  # among the valid
         return [outside(cells[:half], side**3), flat[cells[half:]] > threshold, outside(rank, valid)]
 

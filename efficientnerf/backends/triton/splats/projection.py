@@ -216,7 +216,7 @@ def _range(centre, reach, cells):  # type: ignore[no-untyped-def]
     return first, tl.maximum(tl.minimum((centre + reach) / TILE, cells - 1.0).to(tl.int32) + 1 - first, 0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def project(values, records, boxes, count, lens, FISHEYE: tl.constexpr, K: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """Records (N, RECORD) float32, and boxes (4, N) int32: column and row of the first tile, columns, and tiles in all, 0 of what is not in the image."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -114,7 +114,7 @@ def _blend(records, pairs, block):  # type: ignore[no-untyped-def]
     return Vec3(red, green, blue), light, base
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["width", "height"])
 def render_tiles(records, pairs, colour, transmittance, width, height):  # type: ignore[no-untyped-def]
     """Colour (H, W, 3) and transmittance (H, W)."""
     block = _block(pairs, width, height)
@@ -158,7 +158,7 @@ def _pull(c, by, error, sums, v):  # type: ignore[no-untyped-def]
     tl.atomic_add(to + ERROR, tl.sum(weight * error[None, :], 1), met, "relaxed")
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["width", "height"])
 def fit_tiles(records, pairs, picture, sums, width, height, OVER_ALL: tl.constexpr):  # type: ignore[no-untyped-def]
     """Sums of half of the squared error's derivatives added to `sums` (N, SUMS)."""
     block = _block(pairs, width, height)

@@ -118,7 +118,7 @@ def _colour(walk, view, g, K: tl.constexpr):  # type: ignore[no-untyped-def]
             _descend(walk, HARMONICS + 3 * k + 2, basis * g.z, scale)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def step(values, moments, errors, sums, tiles, count, lens, rule, FISHEYE: tl.constexpr, K: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """A step of the Gaussians that are in tiles, and their part in the error added to `errors` (N,); sums (N, SUMS) are of `raster.fit_tiles`."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
