@@ -80,7 +80,7 @@ def pretrain(network: SourceViewNetwork, scenes: Sequence[PosedImages], steps: i
         network.observe(*scene.sources(target, SOURCES, elsewhere.tolist()))
         loss, fine = _loss(m if number % 2 else uniform, scene, target, rng)
         loss.backward()
-        adam.step(number, learning_rate * min(1, number / RAMP) * FINAL ** ((number - 1) / steps))
+        adam.step(adam.step_size(number, learning_rate * min(1, number / RAMP) * FINAL ** ((number - 1) / steps)))
         yield fine
 
 

@@ -183,6 +183,7 @@ def _strategy(s: TrainSettings, intervals: Intervals) -> Strategy:
 def render_rays(
     m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, behind: Tensor, *,
     prune: bool = True, rng: np.random.Generator | None = None, capacity: SampleCapacity | None = None, samples_per_pivot: int = 0,
+    explored: Tensor | None = None,
 ) -> RayOutputs:  # fmt: skip
     """Both stages along a bundle of rays, at the samples of the model's strategy.
 
@@ -190,10 +191,10 @@ def render_rays(
     near, far, offset    (R,) distances, and the offset of the samples in their intervals
     behind               (R, 3) colour beyond all samples
     samples_per_pivot    N_s of this bundle; 0: as the settings say
-    prune, rng, capacity  see `efficientnerf.sampling.strategies.SamplingRequest`
+    prune, rng, capacity, explored  see `efficientnerf.sampling.strategies.SamplingRequest`
     """
     rays = m.space.rays(origins, directions, near, far)
-    request = SamplingRequest(rays, offset, samples_per_pivot or m.settings.samples_per_pivot, prune, rng, capacity)
+    request = SamplingRequest(rays, offset, samples_per_pivot or m.settings.samples_per_pivot, prune, rng, capacity, explored)
     stage = m.strategy.coarse(request)
     if stage is None:
         pivotal, fine = m.strategy.fine(request, None, None)

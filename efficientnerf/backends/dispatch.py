@@ -200,10 +200,10 @@ def points_in_cells(cell: Tensor, side: int, seed: int) -> Tensor:
 
 
 def adam(
-    value: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, beta1: float, beta2: float, correction1: float, correction2: float,
-    epsilon: float, *, skip_zeros: bool,
+    value: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float | Tensor, beta1: float, beta2: float, correction1: float | Tensor,
+    correction2: float | Tensor, epsilon: float, *, skip_zeros: bool,
 ) -> None:  # fmt: skip
-    """See `efficientnerf.backends.torch.adam.adam`; numba also clears the gradient."""
+    """See `efficientnerf.backends.torch.adam.adam`; numba also clears the gradient. Tensors of one value in place of floats are for Triton alone."""
     step = implementation("adam", backend_of(value, grad))
     step(value, grad, first, second, rate, beta1, beta2, correction1, correction2, epsilon, skip_zeros=skip_zeros)
 

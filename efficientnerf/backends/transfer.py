@@ -15,6 +15,14 @@ def to_device(values: Tensor, device: torch.device) -> Tensor:
     return values.pin_memory().to(device, non_blocking=True)
 
 
+def sent(values: Any, device: torch.device) -> Any:
+    """Arrays of the host as tensors on `device`, and tuples of them, of the same type; tensors and None stay."""
+    if isinstance(values, tuple):
+        parts = [sent(each, device) for each in values]
+        return type(values)(*parts) if hasattr(values, "_fields") else tuple(parts)
+    return to_device(torch.from_numpy(values), device) if isinstance(values, np.ndarray) else values
+
+
 def is_on_device(values: Tensor) -> bool:
     """Whether reading one of these values on the host waits for a device."""
     return values.is_cuda

@@ -35,6 +35,7 @@ class SamplingRequest(NamedTuple):
     prune: bool = True  # whether the density voxels are used (not in the warm-up)
     rng: np.random.Generator | None = None  # in training: for jitter, exploration and rays that are not pruned; None: nothing is random
     capacity: SampleCapacity | None = None  # on CUDA: samples are padded to this many, and their number is not waited for; None: no padding
+    explored: Tensor | None = None  # (capacity.coarse,) bool, see `Efficient.explored`
 
 
 class CoarseStage(NamedTuple):
@@ -108,6 +109,10 @@ class Efficient:
     exploration_fraction: float
     unpruned_fraction: float  # in training: of the rays, these are sampled in invalid voxels too
 
+    def explored(self, capacity: SampleCapacity | None, rng: np.random.Generator, device: torch.device) -> Tensor | None:
+        """Which coarse samples are explored, drawn before the step where their number is known; else None, and they are drawn in it."""
+        return None if capacity is None or self.exploration_fraction == 0 else _random_mask(capacity.coarse, self.exploration_fraction, rng, device)
+
     def coarse(self, request: SamplingRequest) -> CoarseStage:
         return CoarseStage(self.intervals.valid(request, self.unpruned_fraction))
 
@@ -115,7 +120,9 @@ class Efficient:
         assert coarse is not None
         assert weight is not None
         pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
-        if request.rng is not None and self.exploration_fraction > 0:
+        if request.explored is not None:
+            pivotal = pivotal | request.explored
+        elif request.rng is not None and self.exploration_fraction > 0:
             pivotal = pivotal | _random_mask(len(pivotal), self.exploration_fraction, request.rng, pivotal.device)
         capacity = None if request.capacity is None else request.capacity.fine
         bundle = (request.rays.origins, request.rays.directions, request.offset)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from efficientnerf.backends import dispatch
 from efficientnerf.backends.layout import PixelTables
-from efficientnerf.backends.transfer import to_device
+from efficientnerf.backends.transfer import sent, to_device
 from efficientnerf.training.pixels import Pixels
 
 MEMORY_FRACTION = 0.5  # of the device's free memory: photographs that would take more stay on the host
@@ -51,8 +51,17 @@ class DevicePixels:
         origins, directions, _, _, colours = self.bundle(index)
         return origins, directions, colours
 
+    def colours_to_send(self, index: np.ndarray) -> np.ndarray | None:
+        """(R, 3 or 4) uint8 of pixels whose images stay on the host; None where they are here."""
+        return np.ascontiguousarray(self.pixels.images[index]) if self.images is None else None
+
     def bundle(self, index: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """`Pixels.bundle` on the device."""
-        at = self.to_device(index)
-        colour = self.to_device(self.pixels.images[index]) if self.images is None else self.images[at]
+        return self.bundle_at(self.to_device(index), sent(self.colours_to_send(index), self.device))
+
+    def bundle_at(self, at: Tensor, colour: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The same of indices on the device, and `colours_to_send` there."""
+        if colour is None:
+            assert self.images is not None
+            colour = self.images[at]
         return *dispatch.pixel_rays(self.tables, self.pixels.stride, at), colour.float() / 255

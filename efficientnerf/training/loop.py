@@ -7,7 +7,7 @@ On a CPU the same seed gives the same bytes with the same number of threads of t
 depend on the number; matrix products of the paper's networks (oneDNN, MKL) may sum in another order with another one. Either are in bfloat16 only where the
 processor supports it, so that another machine's result differs, at the same quality.
 
-R rays, A rays to sparse points, C views.
+A step itself is in `efficientnerf.training.step`. R rays, A rays to sparse points, C views.
 """
 
 import math
@@ -20,19 +20,22 @@ from torch import Tensor
 
 from efficientnerf import model as models
 from efficientnerf.backends import dispatch
+from efficientnerf.backends.transfer import sent
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.model import Model, RayOutputs, render_rays
-from efficientnerf.sampling.samples import complete_rays
-from efficientnerf.training.batch import ray_batch, ray_count
+from efficientnerf.model import Model, RayOutputs
+from efficientnerf.sampling.strategies import Efficient
+from efficientnerf.training.batch import ray_count
 from efficientnerf.training.device_pixels import DevicePixels
-from efficientnerf.training.exposure.model import Exposure, exposure_loss, is_learned, places
-from efficientnerf.training.losses import colour_losses, distortion_loss, scale_gradients_by_distance
-from efficientnerf.training.occupancy_update import update_occupancy
+from efficientnerf.training.exposure.model import Exposure, is_learned
+from efficientnerf.training.losses import distortion_weight
+from efficientnerf.training.occupancy_update import update_in_turn
 from efficientnerf.training.optimiser import Adam, ParameterGroup, parameter_groups
 from efficientnerf.training.pixels import Pixels
-from efficientnerf.training.readback import AsyncReadback, StepCounts
+from efficientnerf.training.readback import AsyncReadback, StepCounts, counts_of
 from efficientnerf.training.schedule import Schedule, schedule_of
-from efficientnerf.training.sparse_depth import RAYS_PER_RAY, SparseDepthRays, aimed_rays, sparse_depth_loss, sparse_depth_weight
+from efficientnerf.training.sparse_depth import SparseDepthRays, sparse_depth_weight
+from efficientnerf.training.step import Learner, StepInputs, StepNumbers, StepPlan, drawn_step, explored_of, step_on_rays
+from efficientnerf.training.step_graphs import StepGraphs
 from efficientnerf.training.view_checks.checks import ViewChecks, follow_checks
 
 MAX_STEPS = 2**40  # of a run: beyond any practical one
@@ -141,6 +144,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
     if t.checks is not None and t.checks.changed:
         follow_checks(t.checks, pixels)
     source = DevicePixels(pixels, m.device) if m.device.type == "cuda" else pixels
+    learner, graphs = Learner(m, t.adam, source, t.exposure), StepGraphs(m.device, t.adam.parameters)
     samples_per_pivot = 0
     while t.step < t.schedule.iterations:
         number = t.step + 1
@@ -150,45 +154,47 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         if readback is not None and (number == settings.occupancy_warmup_steps + 1 or samples_per_pivot != before):
             readback.restart()  # rays will have other numbers of samples from now on
 
-        count = ray_count(settings, t.samples_per_ray)
-        batch = ray_batch(m, source, count, rng, crop=number <= settings.precrop_steps)
         weight = sparse_depth_weight(settings.sparse_depth_loss_weight, fraction) if m.space.unbounded else 0.0
-        aimed = aimed_rays(m, sparse_depth, max(1, count // RAYS_PER_RAY), rng) if sparse_depth is not None and weight > 0 else None
-        bundle = batch[:6] if aimed is None else tuple(torch.cat(pair) for pair in zip(batch[:6], aimed.bundle, strict=True))
-        rays = len(bundle[0])
-        # Aimed rays begin closer to the camera, and end farther away.
-        capacity = None if readback is None else readback.capacity(count + 2 * (rays - count))
-        outputs = render_rays(m, *bundle, prune=prune, rng=rng, capacity=capacity, samples_per_pivot=samples_per_pivot)
-
-        fitting = complete_rays(outputs.coarse, outputs.fine)
-        complete = None if fitting is None else fitting[:count]
-        exposure = t.exposure if t.exposure is None or is_learned(fraction) else t.exposure.detached
-        at = None if exposure is None else places(pixels, batch.pixel, m.device)
-        fine_loss, coarse_loss = colour_losses(outputs, batch.colour, complete, at, exposure)
-        loss = fine_loss if coarse_loss is None else fine_loss + coarse_loss  # weighted equally, as in the authors' release
-        if exposure is not None:
-            loss = loss + exposure_loss(exposure)
-        if m.space.unbounded:
-            loss = loss + distortion_loss(m, outputs.distortion[:count], fraction, complete)
-        if m.space.scales_near_gradients:
-            scale_gradients_by_distance(m, batch.origins, outputs)
-        if aimed is not None:
-            loss = loss + weight * sparse_depth_loss(outputs, aimed.distance, aimed.on_support, samples_per_pivot, fitting)
-        loss.backward()
-        t.adam.step(number, t.schedule.learning_rate_at(number))
-        update_occupancy(m, outputs, number, rng, padded=capacity is not None, may_wait=readback is None)
-
+        numbers = StepNumbers(t.adam.step_size(number, t.schedule.learning_rate_at(number)), distortion_weight(m, fraction), weight)
+        count = ray_count(settings, t.samples_per_ray)
+        with graphs.ordered():
+            count = count if readback is None else graphs.rays(count)
+            inputs = drawn_step(learner, sparse_depth if weight > 0 else None, count, rng, crop=number <= settings.precrop_steps)
+            aimed = 0 if inputs.aimed is None else len(inputs.aimed.distance)
+            rays = len(inputs.rays.pixel) + aimed
+            # Aimed rays begin closer to the camera, and end farther away.
+            capacity = None if readback is None else readback.capacity(rays + aimed)
+            plan = StepPlan(prune, samples_per_pivot, capacity, is_learned(fraction))
+            if readback is None:
+                fine_loss, outputs = step_on_rays(learner, plan, sent(inputs, m.device), numbers, rng)
+                counts, empty = _counted(t, rays, fine_loss, outputs), len(outputs.coarse.start) == 0
+                del outputs
+            else:
+                counts, empty = _not_waited_for(learner, graphs, readback, plan, inputs, numbers, rng), None
+                t.samples_per_ray = max(readback.fine_per_ray + readback.valid_per_ray, 1.0)
+            update_in_turn(m, number, rng, empty=empty)
         t.step = number
-        yield _progress(t, rays, fine_loss, outputs, readback)
+        yield Progress(t.step, counts.loss, rays, *counts[1:])
 
 
-def _progress(t: Trainer, rays: int, fine_loss: Tensor, outputs: RayOutputs, readback: AsyncReadback | None) -> Progress:
+def _counted(t: Trainer, rays: int, fine_loss: Tensor, outputs: RayOutputs) -> StepCounts:
     """The step's statistics; updates the running average of samples."""
-    if readback is not None:
-        counts = readback.record(rays, fine_loss, outputs.coarse, outputs.pivotal, outputs.fine)
-        t.samples_per_ray = max(readback.fine_per_ray + readback.valid_per_ray, 1.0)
-    else:
-        coarse, fine = outputs.coarse, outputs.fine
-        counts = StepCounts(float(fine_loss.detach()), coarse.tried, len(coarse.start), int(outputs.pivotal.sum()), len(fine.start))
-        t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((counts.fine + counts.valid) / rays, 1.0)
-    return Progress(t.step, counts.loss, rays, *counts[1:])
+    coarse, fine = outputs.coarse, outputs.fine
+    counts = StepCounts(float(fine_loss), coarse.tried, len(coarse.start), int(outputs.pivotal.sum()), len(fine.start))
+    t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((counts.fine + counts.valid) / rays, 1.0)
+    return counts
+
+
+def _not_waited_for(
+    learner: Learner, graphs: StepGraphs, readback: AsyncReadback, plan: StepPlan, inputs: StepInputs, numbers: StepNumbers, rng: np.random.Generator
+) -> StepCounts:
+    """A step on a device; statistics of some steps before."""
+    inputs = inputs._replace(explored=explored_of(learner.model, plan.capacity, rng))
+
+    def body(inputs: StepInputs, numbers: StepNumbers) -> Tensor:
+        return counts_of(*step_on_rays(learner, plan, inputs, numbers, rng))
+
+    # Strategies that draw as they sample, and samples that are counted, cannot be replayed.
+    if plan.capacity is None or not isinstance(learner.model.strategy, Efficient):
+        return readback.record(graphs.launch(inputs, numbers, body))
+    return readback.record(graphs.take(plan, inputs, numbers, body))

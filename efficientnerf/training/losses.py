@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.backends import dispatch
-from efficientnerf.backends.transfer import to_device
+from efficientnerf.backends.transfer import constant
 from efficientnerf.model import Model, RayOutputs
 from efficientnerf.training.exposure.model import Exposure, exposed, squared_error
 
@@ -42,9 +42,9 @@ def colour_losses(
     return losses[0], losses[1] if len(losses) > 1 else None
 
 
-def distortion_loss(m: Model, distortion: Tensor, fraction: float, complete: Tensor | None) -> Tensor:
-    """The distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15) of rays (R,), weighted; fraction of the schedule, 0 to 1."""
-    return m.space.distortion_schedule(fraction) * m.distortion * mean_over(distortion, complete)
+def distortion_weight(m: Model, fraction: float) -> float:
+    """Of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean of `RayOutputs.distortion`; fraction of the schedule, 0 to 1."""
+    return m.space.distortion_schedule(fraction) * m.distortion
 
 
 def scale_gradients_by_distance(m: Model, origins: Tensor, outputs: RayOutputs) -> None:
@@ -54,7 +54,7 @@ def scale_gradients_by_distance(m: Model, origins: Tensor, outputs: RayOutputs) 
     Rays are dense close to a camera: samples there get gradients far more often than those on the subject, and floaters grow before the camera.
     Philip and Deschaintre 2023, "Floaters no more: radiance field gradient scaling for improved near-camera training".
     """
-    subject = (origins - to_device(torch.as_tensor(m.space.centre, dtype=origins.dtype), origins.device)).norm(dim=-1)
+    subject = (origins - constant(m.space.centre, origins)).norm(dim=-1)
     subject = torch.nn.functional.pad(subject, (0, len(outputs.fine_opacity) - len(origins)), value=NEARBY)
     for samples, raw in ((outputs.coarse, outputs.coarse_raw), (outputs.fine, outputs.fine_raw)):
         if not raw.requires_grad:  # uniform sampling has no coarse stage

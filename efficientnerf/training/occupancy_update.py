@@ -17,22 +17,27 @@ SWEPT = 2**14  # the same in a sweep: what source views say of more does not fit
 
 
 @torch.no_grad()
-def update_occupancy(m: Model, outputs: RayOutputs, number: int, rng: np.random.Generator, *, padded: bool, may_wait: bool) -> None:
-    """After step `number`: the coarse densities on its rays and, every `train.occupancy_update_interval` steps, those of some voxels.
+def update_on_rays(m: Model, outputs: RayOutputs, *, padded: bool) -> None:
+    """The coarse densities on the rays of a step, whose samples may be `padded` to a capacity."""
+    if m.prunes:
+        update_at_points(m, outputs.coarse.point, outputs.coarse_raw[:, 0].detach(), count=outputs.coarse.first[-1] if padded else None)
 
-    padded    whether the step's samples are padded to a capacity
-    may_wait  whether the device may be asked for numbers
+
+@torch.no_grad()
+def update_in_turn(m: Model, number: int, rng: np.random.Generator, *, empty: bool | None) -> None:
+    """After step `number`: every `train.occupancy_update_interval` steps, the coarse densities in some voxels.
+
+    empty  whether the step had no samples; None: on a device, which is not asked
     """
     if not m.prunes:
         return
-    update_at_points(m, outputs.coarse.point, outputs.coarse_raw[:, 0].detach(), count=outputs.coarse.first[-1] if padded else None)
     due = number % m.settings.occupancy_update_interval == 0
     if due:
         update_at_random_cells(m, number, rng)
     # No samples, no gradients: a scene whose voxels are all invalid would stay empty.
-    if not may_wait and due:
+    if empty is None and due:
         reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
-    elif may_wait and len(outputs.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
+    elif empty and not bool((m.voxels.values > m.voxels.threshold).any()):
         reset_cells(m.voxels)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +35,15 @@ def parameter_groups(m: Model) -> list[ParameterGroup]:
     return [ParameterGroup(dense), ParameterGroup({name: p for name, p in m.parameters() if name in buffers}, sparse=True, buffers=buffers)]
 
 
+class StepSize(NamedTuple):
+    """Of a step of Adam: floats, or tensors () on the device of the parameters."""
+
+    learning_rate: Any
+    # 1 - beta^step of the first and the second moments
+    correction1: Any
+    correction2: Any
+
+
 class Adam:
     """Kingma and Ba's Adam."""
 
@@ -41,20 +51,28 @@ class Adam:
         self.groups, self.beta2, self.epsilon = groups, beta2, epsilon
         self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for group in groups for name, p in group.parameters.items()}
 
-    def step(self, number: int, learning_rate: float) -> None:
-        """The `number`-th step, from 1; clears the gradients."""
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        return [p for group in self.groups for p in group.parameters.values()]
+
+    def step_size(self, number: int, learning_rate: float) -> StepSize:
+        """Of the `number`-th step, from 1."""
+        return StepSize(learning_rate, 1 - BETA1**number, 1 - self.beta2**number)
+
+    def step(self, size: StepSize) -> None:
+        """A step; clears the gradients."""
         for group in self.groups:
             for name, p in group.parameters.items():
                 grad = group.gradient(name)
                 if grad is None:
                     continue
-                self._update(p, grad, *self.moments[name], number, learning_rate, sparse=group.sparse)
+                self._update(p, grad, *self.moments[name], size, sparse=group.sparse)
                 if grad is p.grad:
                     p.grad = None
                 else:
                     group.buffers[name].mark_cleared()
 
-    def _update(self, p: nn.Parameter, grad: Tensor, first: Tensor, second: Tensor, number: int, learning_rate: float, *, sparse: bool) -> None:
+    def _update(self, p: nn.Parameter, grad: Tensor, first: Tensor, second: Tensor, size: StepSize, *, sparse: bool) -> None:
         """One parameter and its moments, in place. numba's kernel, the only one that fills gradient buffers, clears the gradient, too."""
-        corrections = 1 - BETA1**number, 1 - self.beta2**number
-        dispatch.adam(p.detach(), grad, first, second, learning_rate, BETA1, self.beta2, *corrections, self.epsilon, skip_zeros=sparse)
+        corrections = size.correction1, size.correction2
+        dispatch.adam(p.detach(), grad, first, second, size.learning_rate, BETA1, self.beta2, *corrections, self.epsilon, skip_zeros=sparse)

@@ -13,12 +13,14 @@ import torch
 from torch import Tensor
 
 from efficientnerf.backends.transfer import to_host_async
+from efficientnerf.model import RayOutputs
 from efficientnerf.sampling.occupancy import DensityVoxels
-from efficientnerf.sampling.samples import SampleCapacity, Samples, complete_rays
+from efficientnerf.sampling.samples import SampleCapacity, complete_rays
 
 LAG = 8  # steps; the device is hardly ever further behind
 EXACT_STEPS = 64  # steps at the beginning, and when pruning begins, that are counted exactly, which the host waits for
 MARGIN = 1.3
+ENOUGH, MOST = 1.2, 1.5  # a capacity of so many times as many stays, so that steps have few different ones
 GRANULARITY = 4096  # samples: the allocator finds arrays of few different sizes again
 
 
@@ -33,6 +35,17 @@ class StepCounts(NamedTuple):
     left_out: int = 0
 
 
+def counts_of(loss: Tensor, outputs: RayOutputs) -> Tensor:
+    """(8,) float64, on the device: the numbers of StepCounts, and how many rays have all of their samples."""
+    coarse, fine = outputs.coarse, outputs.fine
+    # Numbers that the host has are filled in on the device: sending one makes it wait.
+    tried, every = (x if isinstance(x, Tensor) else torch.full((), x, device=loss.device) for x in (coarse.tried, len(outputs.fine_opacity)))
+    real = torch.arange(len(outputs.pivotal), device=loss.device) < coarse.first[-1]  # exploration may have chosen padding
+    masks = coarse.complete, complete_rays(coarse, fine)
+    complete = [every if mask is None else mask.sum() for mask in masks]
+    return torch.stack([x.double() for x in (loss, tried, coarse.first[-1], (outputs.pivotal & real).sum(), fine.first[-1], every, *complete)])
+
+
 class AsyncReadback:
     """The counts of the last steps, on their way to the host; arguments: see the module."""
 
@@ -42,27 +55,23 @@ class AsyncReadback:
         self.pending: deque[tuple[Tensor, Any]] = deque()
         self.known = StepCounts(0.0, 0, 0, 0, 0)
         self.valid_per_ray = self.fine_per_ray = 0.0
+        self.held = SampleCapacity(0, 0)
 
     def capacity(self, rays: int) -> SampleCapacity | None:
         """Of the next step; None while the averages are not known: then samples are counted, and waited for."""
         if self.steps < self.exact_steps:
             return None
-        size = self.granularity
-        coarse, fine = (max(size, -(-int(MARGIN * mean * rays) // size) * size) for mean in (self.valid_per_ray, self.fine_per_ray))
-        return SampleCapacity(coarse, fine)
+        means, size = (self.valid_per_ray, self.fine_per_ray), self.granularity
+        if not all(ENOUGH * mean * rays <= held <= size + MOST * mean * rays for mean, held in zip(means, self.held, strict=True)):
+            self.held = SampleCapacity(*(max(size, -(-int(MARGIN * mean * rays) // size) * size) for mean in means))
+        return self.held
 
     def restart(self) -> None:
         """Count exactly again: the number of samples on a ray changes."""
         self.steps, self.valid_per_ray, self.fine_per_ray = 0, 0.0, 0.0
 
-    def record(self, rays: int, loss: Tensor, coarse: Samples, pivotal: Tensor, fine: Samples) -> StepCounts:
-        """Start the transfer of a step's counts; returns the latest that have arrived: the step's own at first, later those of `lag` steps ago."""
-        # Numbers that the host has are filled in on the device: sending one makes it wait.
-        tried, every = (x if isinstance(x, Tensor) else torch.full((), x, device=loss.device) for x in (coarse.tried, rays))
-        real = torch.arange(len(pivotal), device=loss.device) < coarse.first[-1]  # exploration may have chosen padding
-        masks = coarse.complete, complete_rays(coarse, fine)
-        complete = [every if mask is None else mask.sum() for mask in masks]
-        numbers = torch.stack([x.detach().double() for x in (loss, tried, coarse.first[-1], (pivotal & real).sum(), fine.first[-1], every, *complete)])
+    def record(self, numbers: Tensor) -> StepCounts:
+        """Start the transfer of a step's `counts_of`; returns the latest that have arrived: the step's own at first, later those of `lag` steps ago."""
         self.pending.append(to_host_async(numbers))
         self.steps += 1
         while len(self.pending) > (0 if self.steps < self.exact_steps else self.lag):

@@ -1,15 +1,14 @@
 """Supervision by the sparse points of structure from motion (Deng et al. 2022, "Depth-supervised NeRF", DS-NeRF). A rays to points."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from efficientnerf.backends import dispatch
-from efficientnerf.backends.transfer import to_device
-from efficientnerf.model import UNSEEN, Model, RayOutputs
+from efficientnerf.model import UNSEEN, RayOutputs
 from efficientnerf.training.losses import mean_over
 
 # docs/experiments/losses.md
@@ -38,25 +37,28 @@ def sparse_depth_weight(weight: float, fraction: float) -> float:
 
 
 class AimedRays(NamedTuple):
-    """Rays that are aimed at sparse points: `bundle`, the arguments of `render_rays` as of `RayBatch`, the distances of the points (A,), and which are on the
-    support (A,) bool."""
+    """Rays that are aimed at sparse points: arrays of the host, or tensors of a device; fields as of `SparseDepthRays`."""
 
-    bundle: tuple[Tensor, ...]
-    distance: Tensor
-    on_support: Tensor
+    origins: Any
+    directions: Any
+    distance: Any
+    on_support: Any
+    offset: Any  # (A,) float32 of samples in their intervals
+
+    @property
+    def bundle(self) -> tuple[Tensor, ...]:
+        """The arguments of `render_rays`, of tensors: from a tenth of the points' distance to four times it."""
+        return self.origins, self.directions, 0.1 * self.distance, 4 * self.distance, self.offset, torch.full_like(self.directions, UNSEEN)
 
 
-def aimed_rays(m: Model, rays: SparseDepthRays, count: int, rng: np.random.Generator) -> AimedRays:
-    """`count` random rays to sparse points, from a tenth of their distance to four times it, and a quarter as many to the support, if there is one."""
+def aimed_rays(rays: SparseDepthRays, count: int, rng: np.random.Generator) -> AimedRays:
+    """`count` random rays to sparse points, and a quarter as many to the support, if there is one."""
     points = int(np.count_nonzero(~rays.on_support))
     pick = rng.integers(points, size=count)
     if points < len(rays):
         pick = np.concatenate([pick, rng.integers(points, len(rays), size=max(1, count // POINTS_PER_SUPPORT_RAY))])
         count = len(pick)
-    arrays = rays.origins, rays.directions, rays.distance, rays.on_support
-    origins, directions, distance, on_support = (to_device(torch.from_numpy(a[pick]), m.device) for a in arrays)
-    offset = to_device(torch.from_numpy(rng.random(count, np.float32)), m.device)
-    return AimedRays((origins, directions, 0.1 * distance, 4 * distance, offset, torch.full_like(directions, UNSEEN)), distance, on_support)
+    return AimedRays(rays.origins[pick], rays.directions[pick], rays.distance[pick], rays.on_support[pick], rng.random(count, np.float32))
 
 
 def sparse_depth_loss(outputs: RayOutputs, distance: Tensor, on_support: Tensor, samples_per_pivot: int, complete: Tensor | None) -> Tensor:

@@ -27,7 +27,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.backends.transfer import to_device
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.pixels import Pixels
 
@@ -101,12 +100,11 @@ def camera_numbers(cameras: Sequence[Camera]) -> np.ndarray:
     return np.array([numbers[key] for key in keys], np.int64)
 
 
-def places(pixels: Pixels, index: np.ndarray, device: torch.device) -> tuple[Tensor, Tensor]:
+def places(pixels: Pixels, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The photograph (R,) of each pixel, and r^2 (R,) in it."""
     view = pixels.view_of(index)
     y, x = np.divmod(index - pixels.offsets[view], pixels.width[view])
-    radius = squared_radius(x, y, pixels.width[view], pixels.height[view])
-    return to_device(torch.from_numpy(view), device), to_device(torch.from_numpy(radius), device)
+    return view, squared_radius(x, y, pixels.width[view], pixels.height[view])
 
 
 def squared_radius(x: np.ndarray, y: np.ndarray, width: np.ndarray | int, height: np.ndarray | int) -> np.ndarray:

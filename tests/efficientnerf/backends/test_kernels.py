@@ -22,7 +22,7 @@ def stepped(grads: list[torch.Tensor], *, sparse: bool = False) -> nn.Parameter:
     adam = Adam([ParameterGroup({"p": p}, sparse)])
     for number, (grad, rate) in enumerate(zip(grads, RATES, strict=True), 1):
         p.grad = grad.clone()
-        adam.step(number, rate)
+        adam.step(adam.step_size(number, rate))
         assert p.grad is None
     return p
 

@@ -2,8 +2,9 @@
 
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,12 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import efficientnerf
-from efficientnerf.backends import dispatch, transfer
+from efficientnerf.backends import Notice, dispatch, transfer
 from efficientnerf.geometry.spaces import space_from
 from efficientnerf.model import Model, model
 from efficientnerf.rendering import compositing
 from efficientnerf.sampling.samples import SampleCapacity, Samples, complete_rays
-from efficientnerf.training import loop, readback
+from efficientnerf.training import loop, readback, step_graphs
 from efficientnerf.training.exposure.model import exposure_of
 from efficientnerf.training.losses import mean_over
 from efficientnerf.training.readback import AsyncReadback
@@ -36,12 +37,17 @@ def samples(counts: list[int], tried: int = 50, capacity: int | None = None) -> 
     return Samples(first.clamp(max=len(empty)), empty, empty, empty, torch.zeros(len(empty), 3), tried, complete)
 
 
+def recorded(kept: AsyncReadback, rays: int, loss: float, coarse: Samples, fine: Samples) -> readback.StepCounts:
+    outputs: Any = SimpleNamespace(coarse=coarse, fine=fine, pivotal=torch.ones(len(coarse.start), dtype=torch.bool), fine_opacity=torch.zeros(rays))
+    return kept.record(readback.counts_of(torch.tensor(loss), outputs))
+
+
 def test_counts_arrive_late_once_the_averages_are_known() -> None:
     kept = AsyncReadback(lag=2, exact_steps=3)
     arrived, capacities = [], []
     for step in range(1, 9):
         capacities.append(kept.capacity(4))
-        counted = kept.record(4, torch.tensor(float(step)), samples([step, 0, 0, 0]), torch.ones(step, dtype=torch.bool), samples([2 * step, 0, 0, 0]))
+        counted = recorded(kept, 4, float(step), samples([step, 0, 0, 0]), samples([2 * step, 0, 0, 0]))
         arrived.append((counted.loss, counted.valid, counted.fine))
     assert [loss for loss, _, _ in arrived] == [1, 2, 2, 2, 3, 4, 5, 6]
     assert all(fine == 2 * valid for _, valid, fine in arrived)
@@ -50,6 +56,8 @@ def test_counts_arrive_late_once_the_averages_are_known() -> None:
     assert kept.fine_per_ray == pytest.approx(2 * kept.valid_per_ray)
     big = kept.capacity(10**6)
     assert big.fine >= readback.MARGIN * kept.fine_per_ray * 10**6 > big.fine - readback.GRANULARITY - 1
+    assert kept.capacity(1_050_000) == kept.capacity(900_000) == big  # steps have few different ones
+    assert kept.capacity(1_150_000).fine > big.fine > kept.capacity(10**5).fine
 
 
 def test_rays_whose_samples_do_not_fit_are_left_out() -> None:
@@ -74,7 +82,7 @@ def test_rays_that_were_left_out_are_counted_and_the_capacity_grows() -> None:
         each = 3 if step < 4 else 30
         capacity = kept.capacity(100) or SampleCapacity(3000, 3000)
         found = samples([each] * 100, capacity=capacity.coarse), samples([each] * 100, capacity=capacity.fine)
-        left_out.append(kept.record(100, torch.tensor(0.0), found[0], torch.ones(len(found[0].start), dtype=torch.bool), found[1]).left_out)
+        left_out.append(recorded(kept, 100, 0.0, *found).left_out)
     assert left_out[:4] == [0] * 4
     assert left_out[4] == 100 - int(1.3 * 300) // 30
     assert left_out[-1] == 0
@@ -150,6 +158,42 @@ def test_padded_steps_learn_what_counted_ones_do_and_no_line_of_them_waits(strat
         assert all(0.3 < step.valid / step.tried < 0.9 for step in steps[2][1:])
         # Only unpruned rays and updates at random cells query pruned voxels.
         assert (voxels[2] != EMPTY).float().mean() > (0.502 if whole else 0.5)
+
+
+@pytest.mark.parametrize("with_exposure", [False, True])
+def test_replayed_steps_are_those_that_are_launched_one_by_one(with_exposure: bool, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inputs and numbers of a step reach one that was recorded; on the CPU a recording is the step itself, on tensors that are filled anew."""
+    monkeypatch.setitem(dispatch.OPERATIONS["adam"], "triton", "backends.triton.adam")
+    monkeypatch.setattr(dispatch, "composite", compositing.composite)
+    ends, replayed = [], []
+
+    def record(run: Callable[[], torch.Tensor], pool: Any) -> Callable[[], torch.Tensor]:
+        return lambda: (replayed.append(None), run())[1]
+
+    for graphs in (False, True):
+        monkeypatch.setattr(step_graphs, "can_record", lambda device, graphs=graphs: graphs)
+        if DEVICE == "cpu":
+            monkeypatch.setattr(step_graphs, "record", record)
+        m = model_of("contracted" if with_exposure else "hash", iterations=9, exploration_fraction=0.1)
+        exposure = exposure_of(cameras(3, 8), device=DEVICE) if with_exposure else None
+        losses = [step.loss for step in loop.train(loop.trainer(m, exposure), pixels(3, 8), readback=quick_readback())]
+        ends.append((losses, dict(m.parameters()), m.voxels.values))
+    assert len(replayed) >= 3 or DEVICE != "cpu"
+    np.testing.assert_allclose(ends[1][0], ends[0][0], rtol=1e-5)
+    for name, p in ends[0][1].items():
+        torch.testing.assert_close(ends[1][1][name], p, rtol=1e-3, atol=1e-4, msg=name)
+    torch.testing.assert_close(ends[1][2], ends[0][2], rtol=1e-3, atol=1e-3)
+
+
+def test_steps_go_on_where_they_cannot_be_recorded(interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def record(run: Callable[[], torch.Tensor], pool: Any) -> Callable[[], torch.Tensor]:
+        raise RuntimeError("no memory for it\nand more")
+
+    monkeypatch.setattr(step_graphs, "can_record", lambda device: True)
+    monkeypatch.setattr(step_graphs, "record", record)
+    with pytest.warns(Notice, match="no memory for it"):
+        done = list(loop.train(loop.trainer(model_of("hash", iterations=8)), pixels(3, 8), readback=quick_readback()))
+    assert len(done) == 8
 
 
 class Waits(TorchDispatchMode):

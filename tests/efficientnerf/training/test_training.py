@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from efficientnerf.backends import transfer
+from efficientnerf.backends.transfer import sent
 from efficientnerf.model import Model, render_rays
 from efficientnerf.training.loop import Progress, restore, state_of, train, trainer
 from efficientnerf.training.optimiser import Adam, parameter_groups
@@ -115,11 +116,11 @@ def test_sparse_depth_gathers_the_weight_at_its_points() -> None:
     losses = []
     for step in range(1, 41):
         rng = np.random.default_rng(step)
-        aimed = aimed_rays(m, rays, 16, rng)
+        aimed = sent(aimed_rays(rays, 16, rng), m.device)
         outputs = render_rays(m, *aimed.bundle, prune=False, rng=rng)
         loss = sparse_depth_loss(outputs, aimed.distance, aimed.on_support, m.settings.samples_per_pivot, None)
         loss.backward()
-        adam.step(step, 3e-2)
+        adam.step(adam.step_size(step, 3e-2))
         losses.append(float(loss.detach()))
     assert 1.5 < losses[0] <= 2
     assert losses[-1] < 1.2
@@ -156,7 +157,7 @@ def test_rays_to_sparse_points_count_alone_though_others_come_first(complete: bo
     directions = rng.normal(size=(30, 3)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     rays = SparseDepthRays(-3 * directions, directions, rng.uniform(2, 4, 30).astype(np.float32), np.arange(30) % 3 == 0)
-    aimed, others = (aimed_rays(m, rays, count, np.random.default_rng(count)) for count in (9, 20))
+    aimed, others = (sent(aimed_rays(rays, count, np.random.default_rng(count)), m.device) for count in (9, 20))
     counted = torch.tensor([True] * 20 + [complete, True, complete] * 3)
 
     def found(parts: list[AimedRays]) -> tuple[float, torch.Tensor]:
