@@ -68,7 +68,7 @@ gpu:
 gpu-packages:
 	rm -rf $(GPU_PACKAGES)
 	$(PYTHON) -m pip download --quiet --dest $(GPU_PACKAGES) --no-deps --only-binary=:all: --python-version $(GPU_PYTHON) --implementation cp \
-		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt filelock msgspec platformdirs trimesh OpenEXR av fast_simplification
+		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt filelock msgspec platformdirs trimesh OpenEXR av fast_simplification backports.zstd
 
 PROCESSORS := haswell:+avx,+avx2,+fma,+f16c,+bmi,+bmi2,+lzcnt,+popcnt,+movbe,+sse4.2,+cx16 x86-64:+sse2
 KERNEL_TESTS ?= tests/efficientnerf/backends tests/efficientnerf/asset/test_format.py

@@ -224,7 +224,8 @@ def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwat
 def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
     """Renders of the tree as it is at the time."""
     def seen(camera: Camera) -> np.ndarray:
-        tree = replace(point.state.tree)  # what a renderer makes of values is kept with a tree, and these change
+        # What a renderer makes of values is kept with a tree, and these change.
+        tree = replace(point.state.tree).to(job.device if targets.on_device else "cpu")
         return render(tree, camera, background=targets.background, normals=False).colour
 
     return Previews(seen, targets.background, job.inputs[PosesOutputs.stage], s, job.work)
