@@ -39,21 +39,20 @@ def test_nothing_is_started_where_it_is_not_worth_it(tmp_path: Path, monkeypatch
     started: list[Any] = []
     monkeypatch.setattr(start, "start", lambda table: started.append(table))
 
-    def ran(device: str, memory: Limit | None, cores: int, stages: int) -> bool:
+    def ran(memory: Limit | None, cores: int, stages: int) -> bool:
         started.clear()
         monkeypatch.setattr(start, "cores", lambda: cores)
-        with start.precompiling(lambda stage, job: Usage(0.0, 0), settings(), device, memory) as execute:
+        with start.precompiling(lambda stage, job: Usage(0.0, 0), settings(), memory) as execute:
             for _ in range(stages):
                 execute(None, None)  # type: ignore[arg-type]
         assert len(started) <= 1
         return bool(started)
 
-    assert ran("cpu", None, 2, 3)
-    assert ran("cpu", Limit(start.MEMORY, "this machine"), 2, 1)
-    assert not ran("cpu", None, 2, 0)  # all stages are up to date
-    assert not ran("cpu", None, 1, 1)
-    assert not ran("cuda", None, 2, 1)
-    assert not ran("cpu", Limit(start.MEMORY - 1, "this machine"), 2, 1)
+    assert ran(None, 2, 3)
+    assert ran(Limit(start.MEMORY, "this machine"), 2, 1)
+    assert not ran(None, 2, 0)  # all stages are up to date
+    assert not ran(None, 1, 1)
+    assert not ran(Limit(start.MEMORY - 1, "this machine"), 2, 1)
 
 
 @pytest.mark.skipif(not hasattr(os, "nice"), reason="priorities are POSIX's")

@@ -122,7 +122,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
             for text in plan.warnings:
                 show(warning(text))
             with nullcontext(run) if dry_run else plan.written() as run, nullcontext() if dry_run else kept_in(run.path):
-                with precompiling(execute_alone, run.settings, device, plan.memory) as execute, _side_by_side(run, device, jobs) as side_by_side:
+                with precompiling(execute_alone, run.settings, plan.memory) as execute, _side_by_side(run, device, jobs) as side_by_side:
                     outcomes = run_stages(
                         run, workflow().stages, device=device, memory=plan.memory, report=show, dry_run=dry_run, execute=execute, side_by_side=side_by_side,
                         **selection,

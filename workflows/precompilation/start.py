@@ -51,13 +51,13 @@ def small_settings(settings: Table) -> dict[str, dict[str, Any]]:
 
 
 @contextlib.contextmanager
-def precompiling(execute: Executor, settings: Table, device: str, memory: Limit | None) -> Iterator[Executor]:
+def precompiling(execute: Executor, settings: Table, memory: Limit | None) -> Iterator[Executor]:
     """The executor within; when it runs its first stage, the kernels of all stages begin to be compiled in the background, until this is left.
 
     settings  of all stages, by stage; their choices tell which kernels there are
     memory    that the run may take; None: no limit is known
     """
-    worth_it = _is_worth_it(device, memory)
+    worth_it = _is_worth_it(memory)
     begun: list[subprocess.Popen[bytes] | None] = []
 
     def executed(stage: Stage, job: Job) -> Usage:
@@ -82,7 +82,7 @@ def start_alone() -> None:
     """Compile the kernels of runs with the usual settings, in a process that goes on when this one ends."""
     usual = Settings({stage.name: stage.settings for stage in WORKFLOW.stages})
     usual.put_table(read_preset(USUAL, WORKFLOW.presets).table, f"preset {USUAL}")
-    if _is_worth_it("cpu", limit_for(None, None)):
+    if _is_worth_it(limit_for(None, None)):
         start(table_of(usual.resolved()), detached=True)
 
 
@@ -110,8 +110,8 @@ def stamp_of(small: Table) -> Path:
     return place / hashlib.sha256(json.dumps(small, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _is_worth_it(device: str, memory: Limit | None) -> bool:
-    return device == "cpu" and cores() > 1 and (memory is None or memory.bytes >= MEMORY)
+def _is_worth_it(memory: Limit | None) -> bool:
+    return cores() > 1 and (memory is None or memory.bytes >= MEMORY)
 
 
 def _choices(table: Mapping[str, Any]) -> dict[str, Any]:
