@@ -156,7 +156,9 @@ class _Runner:
         with ThreadPoolExecutor(side_by_side.jobs, thread_name_prefix="stage") as pool:
             pending, new, asked = set[Future[Outcome]](), _ready(left), False
             while new or pending:
-                execute = partial(side_by_side.execute, among=len(pending) + len(new))
+                # The last ones begin with all cores: those that run end before them, and their cores are free then.
+                waits = len(left) > len(pending) + len(new)
+                execute = partial(side_by_side.execute, among=len(pending) + len(new) if waits or not pending else 1)
                 submitted = {pool.submit(self.one, stage, stage.name in forced, execute, memory): stage for stage in new}
                 begun |= submitted
                 pending |= submitted.keys()
