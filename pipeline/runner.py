@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NoReturn
 
 from pipeline import artifact, files, manifest
@@ -148,7 +147,7 @@ class _Runner:
         return all((need := self.side_by_side.need(stage)) is not None and need <= share for stage in stages)
 
     def _together(self, waiting: Sequence[Stage], forced: Collection[str]) -> list[Outcome]:
-        """`one` for each that is ready, at the same time, and for those that become ready while others still run: what is left then has all cores again.
+        """`one` for each that is ready, at the same time, and for those that become ready while others still run.
         The first error is raised once all have ended; no other stage begins after it."""
         assert self.side_by_side is not None
         side_by_side, left, begun = self.side_by_side, list(waiting), dict[Future[Outcome], Stage]()
@@ -156,10 +155,7 @@ class _Runner:
         with ThreadPoolExecutor(side_by_side.jobs, thread_name_prefix="stage") as pool:
             pending, new, asked = set[Future[Outcome]](), _ready(left), False
             while new or pending:
-                # The last ones begin with all cores: those that run end before them, and their cores are free then.
-                waits = len(left) > len(pending) + len(new)
-                execute = partial(side_by_side.execute, among=len(pending) + len(new) if waits or not pending else 1)
-                submitted = {pool.submit(self.one, stage, stage.name in forced, execute, memory): stage for stage in new}
+                submitted = {pool.submit(self.one, stage, stage.name in forced, side_by_side.execute, memory): stage for stage in new}
                 begun |= submitted
                 pending |= submitted.keys()
                 wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)

@@ -1,4 +1,4 @@
-"""Runs stages of one run at the same time, each in a child process, on a part of the cores; `pipeline.executors.serving` is the child's side."""
+"""Runs stages of one run at the same time, each in a child process, on the same cores; `pipeline.executors.serving` is the child's side."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SideBySide:
 
     module  what a child runs: it calls `serving.serve`
     jobs    stages at a time
-    cores   that all of them together may use
+    cores   that each of them may use: what one leaves idle the others take, and the last one has all of them
     need    stage -> bytes that it takes at its peak; None: not known
     least   seconds that the stages before have taken for it to be worth it: each child takes some to begin
     """
@@ -43,8 +43,8 @@ class SideBySide:
     def __exit__(self, *error: object) -> None:
         self._children.close()
 
-    def execute(self, stage: Stage, job: Job, among: int) -> Usage:
-        """Run the stage to its end on its part of the cores, `among` so many stages, in a child that one before it may have left. Raises what it raised."""
+    def execute(self, stage: Stage, job: Job) -> Usage:
+        """Run the stage to its end, in a child that one before it may have left. Raises what it raised."""
         facts = {
             "settings": settings_dict(job.settings),
             "inputs": {need: str(folder) for need, folder in job.inputs.items()},
@@ -54,9 +54,9 @@ class SideBySide:
             "device": job.device,
             "memory": None if job.memory is None else [job.memory.bytes, job.memory.whose],
         }
-        name, cores = self._free.get(), max(1, self.cores // min(self.jobs, among))
+        name = self._free.get()
         try:
-            answer = self._children.work({"kind": "job", "run": name, "stage": stage.name, "job": facts}, job.pass_on, cores=cores)
+            answer = self._children.work({"kind": "job", "run": name, "stage": stage.name, "job": facts}, job.pass_on, cores=self.cores)
         finally:
             self._free.put(name)
         if not answer["ok"]:

@@ -40,7 +40,7 @@ def test_they_run_at_the_same_time_and_the_artifacts_are_the_same(tmp_path: Path
     assert [outcome.stage for outcome in outcomes] == [stage.name for stage in STAGES]
     processes = {name: (place / name).read_text().split() for name in MIDDLE}
     assert len({pid for pid, _ in processes.values()} - {str(os.getpid())}) == 3
-    assert {threads for _, threads in processes.values()} == {"1"}, "4 cores for 3 stages"
+    assert {threads for _, threads in processes.values()} == {"4"}
     assert {event["stage"] for event in events.named("progress")} == {*MIDDLE}
     assert [event["stage"] for event in events.named("stage_done")][0::4] == ["top", "bottom"]
     alone = make_run(tmp_path / "alone")
@@ -58,8 +58,6 @@ def test_a_stage_begins_once_those_that_it_needs_have_ended_while_others_run(tmp
     with side_by_side(2) as together:
         outcomes = run_stages(run, stages, side_by_side=together)
     assert actions(outcomes) == {"top": "ran", "left": "ran", "right": "ran", "after_left": "ran"}
-    threads = {name: (place / name).read_text().split()[1] for name in ("left", "right", "after_left")}
-    assert threads == {"left": "2", "right": "2", "after_left": "4"}, "4 cores for two; for the last one all of them"
 
 
 @pytest.mark.parametrize(
