@@ -273,11 +273,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Make renames within the folder, which may be given by a link, survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    _sync(folder, os.O_DIRECTORY)
 
 
 def sync_tree(folder: Path) -> None:
@@ -290,7 +286,11 @@ def sync_tree(folder: Path) -> None:
 
 def sync_file(path: Path) -> None:
     """Raises OSError for a link."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    _sync(path, os.O_NOFOLLOW | os.O_NONBLOCK)
+
+
+def _sync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | flags)
     try:
         os.fsync(descriptor)
     finally:

@@ -12,8 +12,9 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,6 +37,15 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_threa
 def _old_objects_are_left_alone() -> None:
     """What earlier modules left is not looked at again when a stage collects garbage before it begins: with all kernels loaded that takes a second."""
     gc.freeze()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """One browser for all tests of a module."""
+    from tests.stages.viewer import browser  # after the threads above
+
+    with browser.chromium() as found:
+        yield found
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -12,7 +12,7 @@ from random import Random
 
 from benchmarks.fuzz import json_text
 from benchmarks.fuzz.binary import changed_bytes
-from benchmarks.fuzz.meshes import ply_changed
+from benchmarks.fuzz.meshes import glb_changed, ply_changed
 from benchmarks.fuzz.reader import Opened, Reader
 
 HEADER = 16  # bytes of SPZ: magic, version, number, degree, bits, flags, 0
@@ -98,5 +98,6 @@ READERS = {
         Reader("spz", "SPZ of 3D Gaussians", seeds(".spz"), spz_changed, open_splats(".spz")),
         Reader("sog", "SOG of 3D Gaussians", seeds(".sog"), sog_changed, open_splats(".sog")),
         Reader("splats_ply", "PLY of 3D Gaussians", seeds(".ply"), ply_changed, open_splats(".ply"), share=0.25),
+        Reader("splats_glb", "GLB of 3D Gaussians", seeds(".glb"), glb_changed, open_splats(".glb"), share=0.25),
     )
 }

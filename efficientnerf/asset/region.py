@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from efficientnerf.asset.cascades import brick_ranges, cascades_of, subset, voxel_sides
+from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades, voxel_coordinates, voxel_sides
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.geometry.cameras import Similarity
 
@@ -35,17 +35,9 @@ def inside_share(region: Region, points: np.ndarray) -> np.ndarray:
 
 def voxel_centres(tree: NerfTree) -> np.ndarray:
     """(N, 3) float64 centres of the stored voxels of all cascades, in the tree's frame."""
-    out = np.empty((len(tree.density_values), 3))
-    for cascade, (first, end) in zip(cascades_of(tree), brick_ranges(tree) if tree.outer else [(0, len(tree.voxel_index))], strict=True):
-        cells = np.flatnonzero(cascade.brick_index.reshape(-1) >= 0)
-        owner = np.zeros(end - first, np.int64)
-        owner[cascade.brick_index.reshape(-1)[cells] - first] = cells
-        rows = tree.voxel_index[first:end]
-        brick, local = np.nonzero(rows >= 0)
-        cell = np.stack(np.unravel_index(owner[brick], cascade.shape), axis=-1)
-        at = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
-        out[rows[brick, local]] = cascade.bounds_min + (at + 0.5) * cascade.voxel
-    return out
+    owner, cascades = voxel_cascades(tree), cascades_of(tree)
+    low, side = np.stack([cascade.bounds_min for cascade in cascades]), np.array([cascade.voxel for cascade in cascades])
+    return np.asarray(low[owner] + (voxel_coordinates(tree) + 0.5) * side[owner, None])
 
 
 def foreground(tree: NerfTree) -> NerfTree:

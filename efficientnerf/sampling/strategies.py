@@ -130,38 +130,43 @@ class Efficient:
 
 
 @dataclass(frozen=True)
-class Valid:
-    """Valid samples, then importance samples; `unpruned_fraction` as for `Efficient`."""
+class _ImportanceSampled:
+    """Importance samples of the fine field; pivots are counted only."""
 
-    prunes: ClassVar[bool] = True
     intervals: Intervals
     pivotal_threshold: float
     max_pivots: int
     num_importance_samples: int
+
+    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
+        assert coarse is not None
+        assert weight is not None
+        pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
+        quantile = _quantiles(len(request.offset), self.num_importance_samples, request.rng, request.offset.device)
+        distance = distances_at(coarse.samples, request.offset) if coarse.distance is None else coarse.distance
+        capacity = None if request.capacity is None else request.capacity.fine
+        rays = (request.rays.origins, request.rays.directions)
+        return pivotal, importance_samples(self.intervals.space, *rays, coarse.samples, distance, weight, quantile, capacity)
+
+
+@dataclass(frozen=True)
+class Valid(_ImportanceSampled):
+    """Valid samples, then importance samples; `unpruned_fraction` as for `Efficient`."""
+
+    prunes: ClassVar[bool] = True
     unpruned_fraction: float
 
     def coarse(self, request: SamplingRequest) -> CoarseStage:
         return CoarseStage(self.intervals.valid(request, self.unpruned_fraction))
 
-    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
-        return _by_importance(self, request, coarse, weight)
 
-
-@dataclass(frozen=True)
-class Hierarchical:
+class Hierarchical(_ImportanceSampled):
     """Stratified samples, then importance samples (NeRF, section 5.2)."""
 
     prunes: ClassVar[bool] = False
-    intervals: Intervals
-    pivotal_threshold: float
-    max_pivots: int
-    num_importance_samples: int
 
     def coarse(self, request: SamplingRequest) -> CoarseStage:
         return self.intervals.stratified(request, self.intervals.count, None if request.capacity is None else request.capacity.coarse)
-
-    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
-        return _by_importance(self, request, coarse, weight)
 
 
 @dataclass(frozen=True)
@@ -184,21 +189,6 @@ class Uniform:
 def distances_at(samples: Samples, offset: Tensor) -> Tensor:
     """(N,) distances of samples that lie at `offset` (R,) in their intervals."""
     return samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
-
-
-def _by_importance(strategy: Valid | Hierarchical, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
-    """Pivots, which are counted only, and importance samples."""
-    assert coarse is not None
-    assert weight is not None
-    pivotal = dispatch.select_pivots(weight, coarse.samples.first, strategy.pivotal_threshold, strategy.max_pivots)
-    return pivotal, _importance(strategy.intervals.space, request, coarse, weight, strategy.num_importance_samples)
-
-
-def _importance(space: Space, request: SamplingRequest, coarse: CoarseStage, weight: Tensor, count: int) -> Samples:
-    quantile = _quantiles(len(request.offset), count, request.rng, request.offset.device)
-    distance = distances_at(coarse.samples, request.offset) if coarse.distance is None else coarse.distance
-    capacity = None if request.capacity is None else request.capacity.fine
-    return importance_samples(space, request.rays.origins, request.rays.directions, coarse.samples, distance, weight, quantile, capacity)
 
 
 def _quantiles(rays: int, count: int, rng: np.random.Generator | None, device: torch.device) -> Tensor:

@@ -2,7 +2,7 @@
 
 A child works for one run (`pipeline.executors.serving` is its side) and is kept for the run's next stage: what it has imported and compiled is used again.
 One that prepares runs goes on to the next run, until a run whose stages begin takes it over; so does one whose run is done, unless it holds much memory.
-Parent and child speak lines of JSON:
+Parent and child speak lines of JSON (`pipeline.executors.pipes`):
 
     to the child    {"kind": "prepare" | "stage" | "job" | "finish" | "end", ...}, see `Children.work`
     from the child  the stages' events, then {"event": "result", "ok", ...}
@@ -11,21 +11,18 @@ Each child leads a group of processes. It ends with its parent, and whatever it 
 """
 
 import contextlib
-import ctypes
 import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from pipeline.executors.cores import VARIABLES
+from pipeline.executors.pipes import Child
 from pipeline.text import printable
 
 Event = dict[str, Any]
@@ -38,53 +35,30 @@ IDLE_SECONDS = 5.0  # seconds that a child without work is kept
 MAX_KEPT_BYTES = 2**30  # bytes that the child of a finished run may hold and be used again: for small scenes starting another takes a large part of the time
 GRACE = 20.0  # seconds that a child has to reach a safe point once it is asked to stop
 PREPARES = "prepares runs "
-_PR_SET_PDEATHSIG = 1  # prctl(2), Linux alone
-
-# An entry of sys.path that is empty stands for the working folder, which may hold anything: the parent's own entries take its place first.
-_BOOTSTRAP = "import sys, runpy; name = sys.argv.pop(1); sys.path[:] = sys.argv[1:]; del sys.argv[1:]; runpy.run_module(name, run_name='__main__')"
 
 
-def end_with(parent: int) -> None:
-    """Let this process die as soon as its parent does, even while a library keeps Python from running."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
-
-
-def command_for(module: str) -> list[str]:
-    """The command that runs a module as a child, with the import path of this process."""
-    paths = [os.getcwd() if entry == "" else entry for entry in sys.path]
-    return [sys.executable, "-c", _BOOTSTRAP, module, *paths]
-
-
-class _Child:
-    """One process and its pipes. Its result is {"ok": False, "kind": "died", "signal", "text"} where it ended without one."""
+class _Child(Child):
+    """One process and its pipes, the leader of a group. Its result is {"ok": False, "kind": "died", "signal", "text"} where it ended without one."""
 
     def __init__(self, module: str, kind: Kind) -> None:
+        super().__init__(module, group=True, env=_environment(*kind))
         self.kind = kind  # cores that it computes on, and CUDA devices that it sees
-        self.process = subprocess.Popen(
-            command_for(module), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, env=_environment(*kind)
-        )
         self.idle_since: float | None = None
         self.stopping = False
-        self._lines: deque[str] = deque(maxlen=LAST_LINES)
-        self._listener = threading.Thread(target=self._listen, name="standard error of a stage", daemon=True)
-        self._listener.start()
-        self._write({"parent": os.getpid()})
+        self.write({"parent": os.getpid()})
 
     def work(self, request: Mapping[str, Any], report: Report) -> Event:
         assert self.process.stdout is not None
         if request["kind"] == "prepare":
-            self._lines.clear()  # of the run before
-        self._write(request)
+            self.lines.clear()  # of the run before
+        self.write(request)
         while line := self.process.stdout.readline():
             try:
                 message = json.loads(line)
             except ValueError:  # half a line before its end
                 break
             if message.get("event") == "result":
-                return {**message, "lines": list(self._lines)}
+                return {**message, "lines": self._last_lines()}
             report(message)
         return self._died()
 
@@ -100,7 +74,7 @@ class _Child:
 
     def end(self) -> None:
         """Let it end; it has no work."""
-        self._write({"kind": "end"})
+        self.write({"kind": "end"})
         with contextlib.suppress(OSError):
             assert self.process.stdin is not None
             self.process.stdin.close()
@@ -121,7 +95,7 @@ class _Child:
         code = self.process.returncode
         number = -code if code < 0 else None
         how = f"was ended by {signal.Signals(number).name}" if number is not None else f"ended with exit code {code} and no answer"
-        return {"event": "result", "ok": False, "kind": "died", "signal": number, "text": f"its process {how}.", "lines": list(self._lines)}
+        return {"event": "result", "ok": False, "kind": "died", "signal": number, "text": f"its process {how}.", "lines": self._last_lines()}
 
     def _ended(self) -> bool:
         """Whether it has ended, or does within GRACE seconds; it is not reaped yet, so that its group's number is still its own."""
@@ -144,25 +118,10 @@ class _Child:
     def _reap(self) -> None:
         """Once it has ended, or was killed."""
         self.kill()  # what it started and left behind
-        self.process.wait()
-        self._listener.join(timeout=GRACE)
-        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-            with contextlib.suppress(OSError):
-                assert pipe is not None
-                pipe.close()
+        self.close()
 
-    def _write(self, request: Mapping[str, Any]) -> None:
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError, ValueError):  # a child that has ended is noticed where it is read from
-            self.process.stdin.write(json.dumps(request).encode() + b"\n")
-            self.process.stdin.flush()
-
-    def _listen(self) -> None:
-        assert self.process.stderr is not None
-        with contextlib.suppress(OSError, ValueError):
-            while line := self.process.stderr.readline(2**14):
-                if text := line.decode("utf-8", "replace").strip():
-                    self._lines.append(printable(text, LONGEST_LINE))
+    def _last_lines(self) -> list[str]:
+        return [printable(line.strip(), LONGEST_LINE) for line in list(self.lines)[-LAST_LINES:]]
 
 
 class Children:

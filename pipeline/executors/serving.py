@@ -1,11 +1,7 @@
 """The child's side of `pipeline.executors.child`: it reads requests from standard input, and answers on standard output."""
 
-import json
 import os
-import queue
-import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Sequence
@@ -16,9 +12,9 @@ from typing import Any, Protocol
 
 from pipeline.decide import survey
 from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, PipelineError, RunLocked, TooLittleMemory, UsageError
-from pipeline.executors.child import Event, end_with
 from pipeline.executors.local import execute_alone
 from pipeline.executors.memory import Limit, resident
+from pipeline.executors.pipes import Channel, end_with
 from pipeline.failures import history, interruption_in, translated
 from pipeline.interrupt import stopping
 from pipeline.library_output import warnings_for_users
@@ -57,41 +53,11 @@ class Program(Protocol):
         """Write the pages about a run whose stages are done."""
 
 
-class _Channel:
-    """The pipes to the parent; nothing else uses them from here on."""
-
-    def __init__(self) -> None:
-        self._out = os.dup(1)
-        os.dup2(2, 1)  # what a library prints is no message
-        self._lines: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._lock = threading.Lock()
-        threading.Thread(target=self._read, name="requests of the parent", daemon=True).start()
-
-    def _read(self) -> None:
-        ending = False
-        with open(0, "rb", closefd=False) as lines:
-            for line in lines:
-                request = json.loads(line)
-                ending = request.get("kind") == "end"
-                self._lines.put(request)
-        if not ending:  # the parent has gone: the run may be another's by now
-            os.killpg(0, signal.SIGKILL)
-
-    def send(self, event: Event) -> None:
-        data = memoryview(json.dumps(event, default=str).encode() + b"\n")
-        try:
-            with self._lock:
-                while data:
-                    data = data[os.write(self._out, data) :]
-        except BrokenPipeError:
-            os.killpg(0, signal.SIGKILL)
+class _Channel(Channel):
+    """The pipes to the parent."""
 
     def warn(self, stage: str, text: str) -> None:
         self.send({"event": "warning", "stage": stage, "text": text, "time": time.time()})
-
-    def receive(self) -> dict[str, Any]:
-        found: dict[str, Any] = self._lines.get()
-        return found
 
 
 def serve(program: Program) -> None:

@@ -72,17 +72,17 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     if moved:
         warn(f"markers {_listed(moved)} moved, or their number was printed twice; they are not used.")
     normal, tilt = _normal(capture, [*still.values()]) or (None, None)
-    facts = {"used": sorted(still), "moved": moved, "size": size, "error": error, "normal": None, "normal_error": tilt}
     words, frame = f"{len(still)} markers give the scale, within {error:.2g} of each length (99 %)", Similarity(size / length, np.eye(3), np.zeros(3))
     if normal is not None:
         words += f", and the upward axis, within {tilt:.2g} degrees"
         if capture.up is None and capture.bounds is None:  # nothing else states a frame
             frame = _on_marker(still[min(still)], normal, frame.scale)
             words += f"; the origin is the middle of marker {min(still)}"
-        facts["normal"] = (frame.rotation @ normal).tolist()
+        normal = frame.rotation @ normal
     job.say(f"{words}.")
+    facts = {"used": sorted(still), "moved": moved, "size": size, "error": error, "normal": None if normal is None else normal.tolist(), "normal_error": tilt}
     scaled = in_metres(capture, frame)
-    return replace(scaled, facts=scaled.facts | {"markers": facts})
+    return replace(scaled, facts=scaled.facts | {"markers": facts}, markers_up=normal)
 
 
 def _why_none(job: Job, capture: Capture) -> str:

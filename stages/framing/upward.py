@@ -43,11 +43,11 @@ def with_up(capture: Capture, choice: str, say: Callable[[str], None], warn: Cal
 
 def _said(capture: Capture) -> dict[str, np.ndarray]:
     """The upward axes that are known, by what says them, the most trusted first."""
-    found, gps, markers = {}, capture.provenance.gps, capture.facts.get("markers")
+    found, gps = {}, capture.provenance.gps
     if capture.up is not None:
         found["GPS" if gps is not None and "up" in gps.used else "the source"] = np.asarray(capture.up, np.float64) / np.linalg.norm(capture.up)
-    if isinstance(markers, dict) and markers["normal"] is not None:
-        found["markers"] = np.array(markers["normal"])
+    if capture.markers_up is not None:
+        found["markers"] = capture.markers_up
     gravity = up_by_gravity(capture)
     return found if gravity is None else found | {"gravity": gravity}
 

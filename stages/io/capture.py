@@ -127,6 +127,7 @@ class Capture:
     provenance  how the cameras were found, of photographs that state none
     overlaps    (name, name, verified matches) of pairs of photographs, registered or not, where they were compared
     markers     those in the photographs, where they were looked for
+    markers_up  (3,) unit, in the capture's frame: up by the markers that lie on the ground, if any do
     """
 
     kind: str
@@ -145,6 +146,7 @@ class Capture:
     rejected_files: dict[str, Path] = field(default_factory=dict)
     overlaps: tuple[tuple[str, str, int], ...] = ()
     markers: Markers | None = None
+    markers_up: np.ndarray | None = None
 
 
 def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, str]]) -> Capture:

@@ -1,7 +1,7 @@
 """Structure from motion in a process of its own: an abort inside of COLMAP, or the system's out-of-memory killer, then fails the stage and does not end
 the run.
 
-The child is a fresh interpreter (`stages.sfm.child`), never a fork: threads of torch would not survive one. It speaks lines of JSON over two pipes:
+The child is a fresh interpreter (`stages.sfm.child`), never a fork: threads of torch would not survive one. Both speak lines of JSON (see `Child`):
 
     to the child    {"parent": pid, "task": ..., "arguments": ...}, then a line "go" or "stop" for each safe point
     from the child  {"event": "progress" | "warning" | "safe point", ...}, in the end "result", "error" or "stopped"
@@ -11,24 +11,21 @@ A child that comes to no safe point, as within one bundle adjustment, is killed 
 """
 
 import builtins
-import contextlib
 import json
 import os
 import select
 import signal
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from pipeline import errors
 from pipeline.errors import StageFailed
-from pipeline.executors.child import command_for
+from pipeline.executors.pipes import Child
 from pipeline.text import printable
 
 _HANDLED = (signal.SIGINT, signal.SIGTERM)
-_TAIL_BYTES = 16384  # of the child's standard error that are kept
 _SHOWN_LINES, _SHOWN_CHARACTERS = 3, 240
 POLL_SECONDS = 0.2  # seconds between two looks whether to stop, while the child says nothing
 GRACE = 1.2  # seconds that the child has to come to a safe point, once it was asked to stop
@@ -64,7 +61,7 @@ def run(
                     warn(message["text"], **message["facts"])
                 case "safe point":
                     safe_point()
-                    child.answer("go")
+                    child.write("go")
                 case "error":
                     child.wait()
                     _raise(message)
@@ -80,20 +77,18 @@ def run(
     raise ChildAborted(_end_in_words(code, child.last_words()))
 
 
-class _Child:
+class _Child(Child):
     """The child process and its pipes."""
 
     def __init__(self, task: str, arguments: Mapping[str, Any]) -> None:
         # Signals that arrive while the interpreter starts wait until the child ignores them; the mask is inherited.
         former = signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
         try:
-            self.process = subprocess.Popen(command_for("stages.sfm.child"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+            super().__init__("stages.sfm.child")
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, former)
-        self._tail, self._said, self._looked = bytearray(), bytearray(), 0  # _looked: bytes of _said without a line end
-        self._listener = threading.Thread(target=self._listen, name="last words of structure from motion", daemon=True)
-        self._listener.start()
-        self._write(json.dumps({"parent": os.getpid(), "task": task, "arguments": arguments}))
+        self._said, self._looked = bytearray(), 0  # _looked: bytes of _said without a line end
+        self.write({"parent": os.getpid(), "task": task, "arguments": arguments})
 
     def receive(self, idle: Callable[[], None]) -> dict[str, Any] | None:
         """The next message; None once the child has ended. `idle` is called again and again until then."""
@@ -123,20 +118,11 @@ class _Child:
         assert self.process.stdout is not None
         return os.read(self.process.stdout.fileno(), 65536)
 
-    def answer(self, word: str) -> None:
-        self._write(json.dumps(word))
-
-    def _write(self, line: str) -> None:
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError):  # a child that has ended is noticed where it is read from
-            self.process.stdin.write(line.encode() + b"\n")
-            self.process.stdin.flush()
-
     def stop(self) -> None:
         """Let the child end at its next safe point, or kill it; at once where this is interrupted."""
         until = time.monotonic() + GRACE
         try:
-            self.answer("stop")
+            self.write("stop")
             while (left := until - time.monotonic()) > 0 and (not self._is_readable(left) or self._read()):
                 pass
             self.process.wait(max(0.0, until - time.monotonic()))
@@ -153,22 +139,11 @@ class _Child:
     def close(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
-            self.process.wait()
-        self._listener.join(1.0)
-        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-            assert pipe is not None
-            with contextlib.suppress(OSError):
-                pipe.close()
-
-    def _listen(self) -> None:
-        assert self.process.stderr is not None
-        while some := os.read(self.process.stderr.fileno(), 4096):
-            self._tail += some
-            del self._tail[:-_TAIL_BYTES]
+        super().close()
 
     def last_words(self) -> list[str]:
         """The last lines of its standard error, without stack traces."""
-        lines = [line for line in self._tail.decode(errors="replace").splitlines() if line.strip() and not line.startswith(_FRAMES)]
+        lines = [line for line in self.lines if not line.startswith(_FRAMES)]
         return [printable(line.strip(), _SHOWN_CHARACTERS) for line in lines[-_SHOWN_LINES:]]
 
 

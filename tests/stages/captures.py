@@ -13,6 +13,7 @@ from PIL import Image
 
 from efficientnerf.geometry.cameras import MODELS, Camera, opengl_from_pose, project, rays
 from stages.io.capture import Capture
+from tests.poses import looking_at
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 40.0
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -32,12 +33,7 @@ def cameras(count: int = 6, model: str = "SIMPLE_PINHOLE", params: tuple[float, 
     for index in range(count):
         angle = 2 * np.pi * index / count
         centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.5 + 0.1 * index])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], -1)
-        made.append(Camera(f"img_{index}.png", WIDTH, HEIGHT, model, params, pose))
+        made.append(Camera(f"img_{index}.png", WIDTH, HEIGHT, model, params, looking_at(centre)))
     return made
 
 

@@ -5,6 +5,7 @@ import numpy as np
 
 from benchmarks.scenes.room import TEXTURE, pattern
 from efficientnerf.geometry.cameras import Camera, rays
+from tests.poses import looking_at
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 420.0
 HALF = np.array([0.5, 0.4, 0.55])
@@ -16,12 +17,7 @@ def cameras(count: int, degrees: float = 360.0) -> list[Camera]:
     for n in range(count):
         angle = np.radians(degrees) * n / count
         centre = 3.4 * np.array([np.cos(angle) * 0.9, np.sin(angle) * 0.9, 0.42])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], -1)
-        made.append(Camera(f"{n:02d}.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (FOCAL, WIDTH / 2, HEIGHT / 2), pose))
+        made.append(Camera(f"{n:02d}.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (FOCAL, WIDTH / 2, HEIGHT / 2), looking_at(centre)))
     return made
 
 

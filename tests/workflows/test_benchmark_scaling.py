@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.scaling import CACHED, Bytes, Watch, as_markdown, bandwidth, predicted, serial_seconds
+from benchmarks.scaling import CACHED, Bytes, Watch, bandwidth, predicted, serial_seconds
 from efficientnerf.backends.numba.adam import adam
 from pipeline.text import printable
 
@@ -61,15 +61,3 @@ def test_large_arrays_of_kernels_are_counted_once_a_call() -> None:
     assert counted.moved == 4 * CACHED
     adam(*(large.copy() for _ in range(4)), *rates, False)
     assert counted.moved == 4 * CACHED
-
-
-def test_the_table_begins_with_what_is_most_serial() -> None:
-    found = {"processor": "P", "triad": [1e10, 2e10], "stages": {"train": {"": [10.0, 6.0], "a f": [4.0, 4.0], "b g": [6.0, 3.0]}}, "bytes": {"train": 6e10}}
-    table = as_markdown(found, {8: 3e10, 64: 1.2e11})
-    assert "10.0 GB/s on one core, 20.0 on two" in table
-    assert "assumed 40 GB/s on 4, 30 GB/s on 8, 160 GB/s on 16, 120 GB/s on 64" in table
-    assert "| train | 10.0 | 6.0 | 2.0 | 20% | 60 | 4.0 | 4.0 | 2.5 | 2.5 |" in table
-    assert "| all | 10.0 | 6.0 | 2.0 | 20% | 60 | 4.0 | 4.0 | 2.5 | 2.5 |" in table
-    assert table.index("| a f | 4.0 | 4.0 | 4.0 | 100% |  |") < table.index("| b g | 6.0 | 3.0 | 0.0 | 0% |")
-    found["bytes"] = {"train": 1e13}  # more than one core can have moved in eight seconds
-    assert "| train | 10.0 | 6.0 | 2.0 | 20% | 80 |" in as_markdown(found)

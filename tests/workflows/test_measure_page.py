@@ -1,7 +1,6 @@
 """Measuring in the page of a run, in a real browser: places lie on the surface, and lengths are those of the command that it gives."""
 
 import shlex
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,12 +40,6 @@ pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browse
 HOME: dict[str, Any] = {**ORBIT, "centre": (0.0, 0.0, 0.0)}
 BOX = "-0.1 -0.2 -0.3 0.2 0.2 0.2"
 CORNERS = np.array([[0.35, 0.3], [0.6, 0.45], [0.45, 0.7], [0.4, 0.5]])  # shares of the canvas
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    with browser.chromium() as found:
-        yield found
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from efficientnerf.backends import kernel_cache
-from pipeline.executors.child import command_for
 from pipeline.executors.cores import VARIABLES, cores
 from pipeline.executors.local import Usage
 from pipeline.executors.memory import Limit, limit_for
+from pipeline.executors.pipes import command_for
 from pipeline.runner import Executor
 from pipeline.stage import Job, Stage
 from workflows.asset import WORKFLOW

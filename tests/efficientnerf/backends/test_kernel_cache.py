@@ -207,17 +207,6 @@ def damaged(content: bytes) -> dict[str, bytes]:
     return {"empty": b"", "cut": content[:middle], "zeros": bytes(len(content)), "garbage": b"\x80\x05K\x01.", "flipped": flipped}
 
 
-def test_an_empty_kernel_index_is_removed_and_compiled_again(package: Path, tmp_path: Path) -> None:
-    """As a power cut leaves it; numba alone would end with EOFError."""
-    cache = tmp_path / "cache"
-    folder = Path(run(package, ENERF_CACHE_DIR=str(cache))["folder"])
-    for path in folder.rglob("*.nbi"):
-        path.write_bytes(b"")
-    again = run(package, ENERF_CACHE_DIR=str(cache))
-    assert (again["result"], again["functions"]) == (16, 2)
-    assert "removed, and compiled again" in again["stderr"]
-
-
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -> None:
     from efficientnerf.backends.numba.runtime import KernelFiles

@@ -3,17 +3,14 @@
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
+from tests.poses import looking_at
 
 
 def cameras_round(count: int, rng: np.random.Generator, model: str = "OPENCV") -> list[Camera]:
     found = []
     for index, angle in enumerate(np.linspace(0.0, 2.5, count)):
         centre = np.array([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(1.5, 2.5)])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
+        pose = looking_at(centre)
         params = (1500.0, 1510.0, 800.0, 600.0, -0.1, 0.02, 1e-3, -1e-3) if model == "OPENCV" else (1500.0, 1500.0, 800.0, 600.0, 0.01, 0.0, 0.0, 0.0)
         found.append(Camera(f"{index}.png", 1600, 1200, model, params, pose))
     return found

@@ -9,6 +9,7 @@ from efficientnerf.asset.region import inside_distance
 from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_foreground
 from efficientnerf.geometry.cameras import Camera, rays
+from tests.poses import looking_at
 
 SIDE = 48
 Shape = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -42,15 +43,8 @@ def box(low: Sequence[float], high: Sequence[float], *, from_within: bool = Fals
 
 
 def camera(at: Sequence[float], target: Sequence[float], fov: float = 60.0) -> Camera:
-    place = np.asarray(at, np.float64)
-    forward = np.asarray(target, np.float64) - place
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :4] = np.stack([right, np.cross(forward, right), forward, place], axis=1)
     focal = SIDE / 2 / np.tan(np.radians(fov / 2))
-    return Camera("", SIDE, SIDE, "SIMPLE_PINHOLE", (focal, SIDE / 2, SIDE / 2), pose)
+    return Camera("", SIDE, SIDE, "SIMPLE_PINHOLE", (focal, SIDE / 2, SIDE / 2), looking_at(at, target))
 
 
 def ring(count: int, radius: float, height: float, *, arc: float = 360.0, middle: float = -90.0, target: Sequence[float] = (0, 0, 0)) -> list[Camera]:

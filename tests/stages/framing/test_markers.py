@@ -16,6 +16,7 @@ from stages.framing.markers import with_markers
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.png import write_png
 from stages.poses.settings import PosesSettings
+from tests.poses import looking_at
 from tests.stages.framing.made_targets import KINDS, photograph
 
 EDGE = 0.05  # metres, of a capture whose unit is UNIT metres
@@ -32,11 +33,7 @@ def cameras() -> list[Camera]:
     found = []
     for index, angle in enumerate(np.linspace(0.0, 4.0, 6)):
         centre = (0.5 * (np.cos(angle) * side + np.sin(angle) * other) + (0.45 + 0.03 * index) * TRUE_UP) / UNIT
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, TRUE_UP)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
+        pose = looking_at(centre, up=TRUE_UP)
         found.append(Camera(f"{index}.png", WIDTH, HEIGHT, "PINHOLE", (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), pose))
     return found
 

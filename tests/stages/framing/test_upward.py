@@ -92,7 +92,7 @@ def test_what_contradicts_is_named(tmp_path: Path) -> None:
     found, said, _ = asked(phones)
     assert "floor or table is 1" in said[0]
     assert found.up @ UP > np.cos(np.radians(1.0))  # type: ignore[operator]
-    markers = replace(phones, facts={"markers": {"normal": other.tolist()}})
+    markers = replace(phones, markers_up=other)
     found, _, warned = asked(markers)
     assert "up is taken from markers, and contradicted by gravity (1" in warned[0]
     np.testing.assert_allclose(found.up, other)  # type: ignore[arg-type]

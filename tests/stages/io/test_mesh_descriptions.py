@@ -226,20 +226,6 @@ def test_an_obj_of_many_blocks_takes_time_by_its_size(tmp_path: Path) -> None:
     assert time.process_time() - began < 5.0
 
 
-@pytest.mark.parametrize("suffix", sorted(MESHES))
-def test_a_file_that_is_cut_short_or_altered_is_described_or_refused(tmp_path: Path, suffix: str) -> None:
-    path, mesh = tmp_path / f"a{suffix}", block()
-    if suffix in MESH_EXPORTERS:
-        MESH_EXPORTERS[suffix](mesh, path, Y_DOWN)
-    else:
-        POINT_EXPORTERS[suffix](PointCloud(mesh.vertices, mesh.normals, mesh.colours), path, Y_DOWN)
-    data, rng = path.read_bytes(), np.random.default_rng(0)
-    for place in np.unique(rng.integers(0, len(data), 200)).tolist():
-        for changed in (data[:place], data[:place] + bytes([int(rng.integers(256))]) + data[place + 1 :]):
-            with suppress(BadInput):
-                described(path, changed)
-
-
 def test_no_library_of_meshes_reads_a_file_of_anybody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What trimesh takes for a file is bounded by nothing."""
     for name in ("load", "load_mesh", "load_path", "load_scene"):

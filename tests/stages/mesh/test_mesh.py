@@ -22,6 +22,7 @@ from stages.io.scene import Scene, View, load, save
 from stages.mesh import run as stage
 from stages.mesh.settings import MeshSettings
 from stages.mesh.texture import textured
+from tests.poses import looking_at
 from tests.stages.mesh.balls import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 
 
@@ -33,11 +34,7 @@ def photograph_ball(folder: Path, colours: tuple[tuple[float, ...], ...] = ((0.9
     for number in range(8):
         turn, height_of_camera = number * np.pi / 4, 1.0 if number % 2 else -1.0
         centre = np.array([2.5 * np.cos(turn), 2.5 * np.sin(turn), height_of_camera])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
+        pose = looking_at(centre)
         camera = Camera(f"{number}.png", width, height, "SIMPLE_PINHOLE", (70.0, width / 2, height / 2), pose)
         origins, directions = rays(camera)
         along = -(origins * directions).sum(1)

@@ -11,6 +11,7 @@ from benchmarks.poses import aligned_errors
 from efficientnerf.geometry.cameras import Camera, project
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import WorkImage, database_path, open_database
+from tests.poses import looking_at
 
 SIZE = 480, 360
 COUNT, POINTS = 9, 250
@@ -26,11 +27,7 @@ def cameras(focal: tuple[float, ...] = (400.0,) * COUNT, cut: Sequence[tuple[int
     for k in range(COUNT):
         angle = 2.0 * k / COUNT
         centre = np.array([2 * np.cos(angle), 2 * np.sin(angle), 0.5 + 0.5 * np.sin(1.7 * k)])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], -1)
+        pose = looking_at(centre)
         made.append(Camera(f"{k}.png", *SIZE, "SIMPLE_RADIAL", (focal[k], SIZE[0] / 2 - cut[k][0], SIZE[1] / 2 - cut[k][1], -0.04), pose))
     return made
 

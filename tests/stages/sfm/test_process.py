@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import BadInput, Interrupted, StageFailed
+from pipeline.executors import pipes
 from stages.sfm import process
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -48,7 +49,7 @@ def child_does(monkeypatch: pytest.MonkeyPatch, body: str) -> None:
         f"import sys; sys.path[:] = {[entry or os.getcwd() for entry in sys.path]!r}\nimport ctypes, os, signal, time\nfrom stages.sfm import cameras, child\n"
         f"def capture_for(arguments, progress, safe_point, warn):\n{lines}\ncameras.capture_for = capture_for\nchild.main()\n"
     )
-    monkeypatch.setattr(process, "command_for", lambda module: [sys.executable, "-c", code])
+    monkeypatch.setattr(pipes, "command_for", lambda module: [sys.executable, "-c", code])
 
 
 def test_progress_warnings_and_the_result_come_through_in_order(monkeypatch: pytest.MonkeyPatch) -> None:

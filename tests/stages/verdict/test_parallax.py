@@ -10,18 +10,14 @@ from efficientnerf.geometry.cameras import Camera
 from stages.io.capture import Capture, Photo, Provenance, SparsePoints
 from stages.verdict.parallax import SMALL_ANGLE, parallax
 from stages.verdict.verdict import verdict_on
+from tests.poses import looking_at
 
 COUNT = 48
 RNG = np.random.default_rng
 
 
 def looking(centre: np.ndarray, at: np.ndarray, number: int) -> Photo:
-    forward = (at - centre) / np.linalg.norm(at - centre)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
-    return Photo(Camera(f"{number:02d}.jpg", 640, 480, "SIMPLE_PINHOLE", (500.0, 320.0, 240.0), pose), Path("none"))
+    return Photo(Camera(f"{number:02d}.jpg", 640, 480, "SIMPLE_PINHOLE", (500.0, 320.0, 240.0), looking_at(centre, at)), Path("none"))
 
 
 def on_circle(radius: float, height: float = 0.0, count: int = COUNT) -> np.ndarray:

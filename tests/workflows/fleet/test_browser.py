@@ -1,24 +1,17 @@
 """The page of a fleet in a browser: sorted, filtered, walked through by keys; pictures as they come into sight, the turntable of one scene at a time."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.stages.viewer.browser import chromium, missing, opened
+from tests.stages.viewer.browser import missing, opened
 from tests.workflows.fleet.fleets import facts, mixed, with_pictures
 from workflows.fleet.pages.updates import Pages
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
 WIDE = {"viewport": {"width": 1200, "height": 700}}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module", params=(24, 1000))
@@ -41,8 +34,8 @@ def names(page: Any) -> list[str]:
     return found
 
 
-def test_it_is_sorted_and_filtered(browser: Any, page_file: Path) -> None:
-    with opened(browser, page_file, **WIDE) as each:
+def test_it_is_sorted_and_filtered(chromium: Any, page_file: Path) -> None:
+    with opened(chromium, page_file, **WIDE) as each:
         page = each.page
         everything = names(page)
         count = sum(totals(page_file).values())

@@ -14,18 +14,12 @@ from pipeline.run import Run
 from stages.artifacts import BakeOutputs
 from stages.io.png import write_png
 from tests.efficientnerf.trees import random_tree
-from tests.stages.viewer.browser import Page, chromium, missing, opened
+from tests.stages.viewer.browser import Page, missing, opened
 from tests.workflows.viewing.growing import TRAIN, put, scratch
 from workflows.viewing.server import LOOPBACK, Server
 from workflows.viewing.sites import AssetSite, RunSite
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture
@@ -61,8 +55,8 @@ def points(page: Page, line: str) -> int:
     return len((page.page.get_attribute(f"svg polyline.{line}", "points") or "").split())
 
 
-def test_it_follows_a_run(browser: Any, run: Run, server: Server, picture: bytes) -> None:
-    with opened(browser, server.url, viewport={"width": 900, "height": 700}) as live:
+def test_it_follows_a_run(chromium: Any, run: Run, server: Server, picture: bytes) -> None:
+    with opened(chromium, server.url, viewport={"width": 900, "height": 700}) as live:
         page = live.page
         until(live, "document.querySelectorAll('#stages li').length === 1")
         assert page.get_attribute("#stages li", "class") == "missing"
@@ -91,8 +85,8 @@ def test_it_follows_a_run(browser: Any, run: Run, server: Server, picture: bytes
         assert page.locator("#stages li").count() == 1, "what was seen last stays when nobody answers any more"
 
 
-def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(browser: Any, run: Run, server: Server) -> None:
-    with opened(browser, server.url, viewport={"width": 900, "height": 900}) as live:
+def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(chromium: Any, run: Run, server: Server) -> None:
+    with opened(chromium, server.url, viewport={"width": 900, "height": 900}) as live:
         until(live, "document.querySelectorAll('#stages li').length === 1")
         asset = BakeOutputs.of_run(run.path).asset
         asset.parent.mkdir()
@@ -113,12 +107,12 @@ def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(browser: An
         assert live.console == []
 
 
-def test_a_page_that_another_put_in_its_place_runs_nothing(browser: Any, tmp_path: Path) -> None:
+def test_a_page_that_another_put_in_its_place_runs_nothing(chromium: Any, tmp_path: Path) -> None:
     page = tmp_path / "viewer.html"
     page.write_text("<!doctype html><title>mine</title><body><script>document.title = 'run'</script><img src=x onerror='document.title = 2'>", encoding="utf-8")
     with Server(AssetSite(page), LOOPBACK, 0) as made:
         threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
-        with opened(browser, made.url) as shown:
+        with opened(chromium, made.url) as shown:
             shown.page.wait_for_timeout(200)
             assert shown.page.title() == "mine"
         made.shutdown()

@@ -8,6 +8,7 @@ from efficientnerf.backends.numba.mesh import photometric as kernel
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.surface.fitting.photometric import refined
 from efficientnerf.surface.texturing.photographs import Photograph
+from tests.poses import looking_at
 
 SIDE, PIXELS = 41, 160
 
@@ -17,11 +18,7 @@ def cameras(count: int) -> list[Camera]:
     found = []
     for turn in np.arange(count) * 2 * np.pi / max(count, 1):
         centre = 3 * np.array([np.sin(0.5) * np.cos(turn), np.sin(0.5) * np.sin(turn), np.cos(0.5)])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0.3, 0.9, 0.1])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
+        pose = looking_at(centre, up=(0.3, 0.9, 0.1))
         found.append(Camera(f"{turn:.2f}", PIXELS, PIXELS, "SIMPLE_PINHOLE", (200.0, PIXELS / 2, PIXELS / 2), pose))
     return found
 

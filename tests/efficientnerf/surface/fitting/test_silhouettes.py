@@ -8,6 +8,7 @@ from efficientnerf.geometry.cameras import Camera
 from efficientnerf.surface.agreement import AssetView, agreement
 from efficientnerf.surface.fitting.silhouettes import distance_inside, fitted_to_silhouettes
 from efficientnerf.surface.rasteriser import mesh_image
+from tests.poses import looking_at
 
 PIXEL = 3.0 / 140  # at the origin
 
@@ -18,12 +19,7 @@ def cameras(count: int = 24) -> list[Camera]:
     for n in range(count):
         height, turn = 1.6 * (n + 0.5) / count - 0.8, 2.4 * n
         centre = 3 * np.array([np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height])
-        forward = -centre / 3
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
-        out.append(Camera(f"c{n}", 120, 110, "SIMPLE_PINHOLE", (140.0, 60.0, 55.0), pose))
+        out.append(Camera(f"c{n}", 120, 110, "SIMPLE_PINHOLE", (140.0, 60.0, 55.0), looking_at(centre)))
     return out
 
 

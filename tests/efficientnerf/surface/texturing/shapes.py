@@ -10,6 +10,7 @@ from efficientnerf.surface.mesh import vertex_normals
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 from efficientnerf.surface.texturing.atlas import Atlas, atlas_of
 from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, exposed_alike, survey
+from tests.poses import looking_at
 
 Colours = Callable[[np.ndarray], np.ndarray]
 
@@ -38,12 +39,7 @@ def cameras(count: int = 8, size: int = 96, distance: float = 3.2) -> list[Camer
     for number in range(count):
         turn, height = 2.4 * number, 2 * (number + 0.5) / count - 1
         centre = distance * np.array([np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
-        out.append(Camera(f"{number}", size, size, "SIMPLE_RADIAL", (1.1 * size, size / 2, size / 2, -0.03), pose))
+        out.append(Camera(f"{number}", size, size, "SIMPLE_RADIAL", (1.1 * size, size / 2, size / 2, -0.03), looking_at(centre)))
     return out
 
 
