@@ -133,7 +133,8 @@ def _made(job: Job, capture: Capture, field: FirstField, subject: Subject, folde
     why_not, compact = alike(small)
     if why_not:
         raise _refused(why_not)
-    cut = [photo.camera.name for photo, kept in compact if _border_share(kept) > AT_BORDER]
+    borders = [np.concatenate([kept[0], kept[-1], kept[1:-1, 0], kept[1:-1, -1]]) for _, kept in compact]
+    cut = [photo.camera.name for (photo, _), border in zip(compact, borders, strict=True) if border.mean() > AT_BORDER]
     if len(cut) > MOST_CUT * len(small):
         raise _refused(f"the border of the picture cuts off the silhouettes of {len(cut)} of {len(small)} photographs: {abbreviated(cut)}")
     overlap = hull_overlaps(capture, compact)
@@ -163,10 +164,6 @@ def cleaned(covered: np.ndarray) -> np.ndarray:
     gaps = [part for part in range(1, count) if stats[part, cv2.CC_STAT_AREA] <= GAP * mask.size]
     mask[np.isin(labels, gaps)] = 255
     return mask
-
-
-def _border_share(kept: np.ndarray) -> float:
-    return float(np.concatenate([kept[0], kept[-1], kept[1:-1, 0], kept[1:-1, -1]]).mean())
 
 
 def _draw(photos: Sequence[Photo], images: Sequence[np.ndarray], path: Path) -> None:

@@ -76,13 +76,9 @@ def begin_exposure(
 
 
 def differs(fit: ExposureFit) -> bool:
-    """Whether photographs differ by more than what points show of the direction that they are seen from."""
-    return bool(stops_apart(fit) > LEAST_STOPS and fit.explained > LEAST_EXPLAINED)
-
-
-def stops_apart(fit: ExposureFit) -> float:
-    """Standard deviation of the photographs' gains, of the channel in which it is largest, stops."""
-    return float((fit.gains.std(axis=0) / np.log(2)).max())
+    """Whether photographs differ by more than what points show of the direction that they are seen from: by the standard deviation of their gains, of the
+    channel in which it is largest."""
+    return bool((fit.gains.std(axis=0) / np.log(2)).max() > LEAST_STOPS and fit.explained > LEAST_EXPLAINED)
 
 
 def saved_exposure(e: Exposure | None, s: Scene) -> tuple[list[str], Exposure] | None:

@@ -38,6 +38,7 @@ from workflows.loading import load_asset
 TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
 REGIONS = ("foreground", "all")
 EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
+SURFACE_STAGES: dict[str, type] = {"mesh": mesh.MeshSettings, "points": points.PointsSettings, "splats": splats.SplatsSettings}
 Crop = tuple[float, float, float, float, float, float] | None
 
 
@@ -97,7 +98,7 @@ def export(
     options += [] if size is None else [f"mesh.texture_size={size}"]
     with display(as_json=as_json, quiet=quiet) as show:
         written = exporting.export_cameras(asked)
-        settings = _settings_for(what, (*sets, *options), _surface_stages())
+        settings = _settings_for(what, (*sets, *options), SURFACE_STAGES)
         written += exporting.export_viewers(asked)
         written += exporting.export_volumes(asked, settings)
         written += exporting_splats.export_splats(asked, settings, _progress("export", show))
@@ -108,10 +109,6 @@ def export(
         for entry in written:
             facts = ", ".join(f"{value} {name}" for name, value in entry.items() if name not in ("path", "beside"))
             closing(f"{entry['path']}  ({facts})", *(f"{each}  (belongs to it)" for each in entry.get("beside", ())))
-
-
-def _surface_stages() -> dict[str, type]:
-    return {"mesh": mesh.MeshSettings, "points": points.PointsSettings, "splats": splats.SplatsSettings}
 
 
 def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> Settings:

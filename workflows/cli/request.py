@@ -90,7 +90,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     if device is not None and device not in ("auto", "cpu", "cuda"):
         raise UsageError(f"--config {options.config}: device: found {device!r}, expected auto, cpu or cuda.")
     preset = options.preset or config.options.get("preset")
-    standing = _standing(path)
+    standing = recorded_run(path) if os.path.lexists(path / NAME) else None
     if standing is None:
         # Before anything else: a wrong folder is the first thing to report.
         Run(path, resume_text=resume_command).check_free()
@@ -197,10 +197,6 @@ def _beyond(limit: Limit | None, stages: Sequence[Stage]) -> list[str]:
     if limit.bytes < PAGES:
         found.append(f"{limit.whose}: {size_text(limit.bytes)}, and writing the pages of a run takes up to {size_text(PAGES)}")
     return found
-
-
-def _standing(path: Path) -> Run | None:
-    return recorded_run(path) if os.path.lexists(path / NAME) else None
 
 
 def _sources(given: Sequence[Path], standing: Run | None) -> tuple[Path, ...]:

@@ -177,7 +177,9 @@ def _run(folder: Path, scenes: Any, *, as_json: bool, quiet: bool, retry: Any, *
     if as_json:
         write_json({"event": "summary", "ok": found.exit_code == 0, "fleet": str(folder), "totals": asdict(found.totals), "exit_code": found.exit_code})
     elif not quiet:
-        closing(*_overview(folder, found), *(_line(scene) for scene in read_fleet(folder).scenes if _is_bad(scene)))
+        scenes = read_fleet(folder).scenes
+        bad = [each for each in scenes if each.state in ("failed", "quarantined") or (each.result is not None and each.result.grade in BAD_GRADES)]
+        closing(*_overview(folder, found), *map(_line, bad))
     return found.exit_code
 
 
@@ -186,10 +188,6 @@ def _overview(folder: Path, found: FleetState) -> list[str]:
     if found.totals.quarantined:
         lines.append(f"To try again what is quarantined: enerf fleet retry {folder}")
     return lines
-
-
-def _is_bad(scene: SceneState) -> bool:
-    return scene.state in ("failed", "quarantined") or (scene.result is not None and scene.result.grade in BAD_GRADES)
 
 
 def _line(scene: SceneState) -> str:

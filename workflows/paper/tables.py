@@ -190,16 +190,13 @@ def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
         "All rows share kernels, number type, batch, learning rate and loss. Seconds are of training steps alone; PSNR is of the network on test views.",
     ]
     if request.scale != 1:
-        low = [f"{row.name} on {scene.name}" for row in rows for scene in found if not measured(_quiet(request), scene, row).converged]
+        quiet = dataclasses.replace(request, say=lambda text: None, report=None)
+        low = [f"{row.name} on {scene.name}" for row in rows for scene in found if not measured(quiet, scene, row).converged]
         verdict = f"Rows that have not converged (less than {CONVERGED_PSNR:g} dB) and do not count: {', '.join(low)}." if low else (
             f"All rows have converged (at least {CONVERGED_PSNR:g} dB)."
         )  # fmt: skip
         notes.append(verdict)
     return notes
-
-
-def _quiet(request: Request) -> Request:
-    return dataclasses.replace(request, say=lambda text: None, report=None)
 
 
 def _data(request: Request) -> Any:

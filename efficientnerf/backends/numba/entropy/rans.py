@@ -191,17 +191,6 @@ def _cost(counts):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _merged_cost(a, b):  # type: ignore[no-untyped-def]
-    total, bits = 0.0, 0.0
-    for s in range(256):
-        c = a[s] + b[s]
-        if c > 0:
-            total += c
-            bits += 10.0 - c * np.log2(c)
-    return bits + (total * np.log2(total) if total > 0 else 0.0)
-
-
-@numba.njit(cache=True, error_model="numpy")
 def merge_contexts(counts, most):  # type: ignore[no-untyped-def]
     """Which contexts share a table: (n,) int64, the least context of each table. Pairs whose union costs least are joined until it costs more than it saves
     and at most `most` tables are left.
@@ -222,7 +211,7 @@ def merge_contexts(counts, most):  # type: ignore[no-untyped-def]
         if alive[i]:
             for j in range(i + 1, n):
                 if alive[j]:
-                    gain[i, j] = _merged_cost(counts[i], counts[j]) - own[i] - own[j]
+                    gain[i, j] = _cost(counts[i] + counts[j]) - own[i] - own[j]
     while left > 1:
         best, a, b = np.inf, -1, -1
         for i in range(n):
@@ -242,5 +231,5 @@ def merge_contexts(counts, most):  # type: ignore[no-untyped-def]
             gain[min(i, b), max(i, b)] = np.inf
         for i in range(n):
             if alive[i] and i != a:
-                gain[min(i, a), max(i, a)] = _merged_cost(counts[a], counts[i]) - own[a] - own[i]
+                gain[min(i, a), max(i, a)] = _cost(counts[a] + counts[i]) - own[a] - own[i]
     return owner
