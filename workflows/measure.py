@@ -12,7 +12,7 @@ from pipeline.errors import BadInput, CorruptArtifact, UsageError
 from pipeline.run import Run
 from stages.framing.true_frame import AS_CAPTURED, NAME, TrueFrame, load_frame, save_frame
 from workflows import measuring
-from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
+from workflows.cli.options import folder_type, output_options, workflow
 from workflows.cli.output import closing, listing, write_json
 from workflows.cli.resolve import metres_of
 from workflows.cli.target import open_run
@@ -30,9 +30,7 @@ from workflows.report.viewer import write_run_viewer
     help="A length that you know, such as 0.30m, 30cm or 12in, between two places; may be repeated. Gives metres; replaces those given before.",
 )
 @click.option("--forget", is_flag=True, help="Go back to the capture's unit.")
-@json_option
-@quiet_option
-@common_options
+@output_options
 def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str], ...], forget: bool, as_json: bool, quiet: bool) -> None:
     """Measure the lengths from each PLACE to the next, with their errors, or without any the mesh: the sides of the upright box round it; or give RUN metres
     by lengths that you know.
@@ -79,9 +77,7 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
 @click.option("--up", metavar="X,Y,Z", help="The direction that is up, in the frame of RUN's exports, instead of places. The ground is what is level under it.")
 @click.option("--plane", is_flag=True, help="The floor or table that the sparse points show, instead of places.")
 @click.option("--forget", is_flag=True, help="Go back to the up that RUN found.")
-@json_option
-@quiet_option
-@common_options
+@output_options
 def orient(run: Path, places: tuple[str, ...], up: str | None, plane: bool, forget: bool, as_json: bool, quiet: bool) -> None:
     """Set which way is up in a finished RUN, and where the ground is, by three PLACEs on it (as of `enerf measure`), far apart and not in a row; the cameras
     are above it.

@@ -6,7 +6,7 @@ import click
 
 from efficientnerf.asset.format import describe
 from pipeline.errors import UsageError
-from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option, workflow
+from workflows.cli.options import folder_type, force_option, output_options, workflow
 from workflows.cli.output import closing, listing, write_json
 from workflows.cli.progress import size
 from workflows.cli.target import asset_of
@@ -25,9 +25,7 @@ LAYOUTS = ("compact", "packed", "small", "sparse", "full", "full32")
 @click.argument("second", metavar="B", type=folder_type)
 @click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, on an orbit of A.")
 @click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Side of the renders in pixels.")
-@json_option
-@quiet_option
-@common_options
+@output_options
 def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet: bool) -> int:
     """Compare the assets (or runs) A and B: metadata and tensors that differ, and the PSNR between their renders.
 
@@ -49,9 +47,7 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 @click.option("--sh-degree", "degree", type=click.IntRange(0, 4), help="Keep the spherical harmonics up to this degree.")
 @click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side, or of the innermost cascade; fewer than ASSET has.")
 @force_option
-@json_option
-@quiet_option
-@common_options
+@output_options
 def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Write the asset of RUN, or ASSET, to the file OUT.
 
@@ -78,9 +74,7 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
 @click.option("--serve", "port", metavar="PORT", type=click.IntRange(0, 65535), help="Serve the page on this port until Ctrl-C; 0: any free port.")
 @click.option("--address", metavar="IP", help="With --serve: address to listen on, 127.0.0.1 by default. Everyone who can reach it can view the page.")
 @click.option("--force", is_flag=True, help="Rewrite the page even if it is up to date.")
-@json_option
-@quiet_option
-@common_options
+@output_options
 def view(what: Path, no_browser: bool, port: int | None, address: str | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Open the viewer page of RUN or ASSET, which works offline. For a run it is RUN/viewer.html, rewritten if it is missing, out of date or of another
     version. For an asset file it is a new page in a temporary folder.

@@ -26,7 +26,7 @@ from stages.turntable.memory import frames_needed
 from stages.turntable.run import cameras_of
 from stages.turntable.settings import TurntableSettings
 from workflows import exporting, exporting_splats
-from workflows.cli.options import common_options, crop_option, folder_type, force_option, json_option, memory_limit, memory_option, quiet_option, set_option
+from workflows.cli.options import common_options, crop_option, folder_type, force_option, json_option, memory_limit, memory_option, output_options, set_option
 from workflows.cli.output import closing, listing, write_json
 from workflows.cli.progress import display
 from workflows.cli.resolve import Settings
@@ -75,9 +75,7 @@ def _either(formats: Iterable[str]) -> str:
 @force_option
 @memory_option
 @set_option
-@json_option
-@quiet_option
-@common_options
+@output_options
 def export(
     what: Path | None, first: Path | None, more: tuple[Path, ...], as_list: bool, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool,
     **given: Any,
@@ -143,9 +141,7 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @force_option
 @memory_option
 @set_option
-@json_option
-@quiet_option
-@common_options
+@output_options
 def render(
     what: Path, out: Path, way: Path | None, crop: Crop, video: Path | None, force: bool, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any
 ) -> None:

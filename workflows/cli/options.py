@@ -53,3 +53,8 @@ def workflow() -> Workflow:
 def common_options(command: C) -> C:
     """--debug, which main() finds by itself, so that it holds for errors of the command line too."""
     return click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error, and the output of libraries.")(command)
+
+
+def output_options(command: C) -> C:
+    """--json, --quiet and the common ones."""
+    return json_option(quiet_option(common_options(command)))

@@ -18,7 +18,7 @@ from pipeline.stage import Stage, settings_from
 from stages.cores import count_cores
 from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
-from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_option, quiet_option, set_option, workflow
+from workflows.cli.options import device_option, folder_type, memory_option, output_options, set_option, workflow
 from workflows.cli.output import closing, write_json
 from workflows.cli.progress import display, warning
 from workflows.cli.request import Options, Plan, plan_run
@@ -66,9 +66,7 @@ GRADED = 6  # exit code of a run whose result is graded as --fail-on says
 @click.option("--viewer", type=click.Choice(["splats", "asset", "both", "off"]),
               help="What RUN/viewer.html shows: the Gaussians if there are any (default) or the asset; both: the asset in RUN/viewer_asset.html.")  # fmt: skip
 @click.option("--dry-run", is_flag=True, help="Show what would be done and why, and do nothing.")
-@json_option
-@quiet_option
-@common_options
+@output_options
 def run(
     sources: tuple[Path, ...], run_folder: Path, until: str | None, start: str | None, fail_on: str | None, jobs: int | None, dry_run: bool, as_json: bool,
     quiet: bool, **options: Any,
@@ -95,9 +93,7 @@ def run(
 @device_option
 @memory_option
 @click.option("--dry-run", is_flag=True, help="Show whether it would run and why, and do nothing.")
-@json_option
-@quiet_option
-@common_options
+@output_options
 def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Run the stage NAME of RUN on the artifacts of earlier stages. Those are not rerun; stale ones are listed."""
     names = [each.name for each in workflow().stages]

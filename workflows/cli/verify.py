@@ -7,7 +7,7 @@ import click
 from pipeline.errors import CorruptArtifact
 from pipeline.runner import verify as verify_run
 from workflows.cli.failures import Reported
-from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
+from workflows.cli.options import folder_type, output_options, workflow
 from workflows.cli.output import closing, write_json
 from workflows.cli.progress import display, size
 from workflows.cli.target import open_run
@@ -16,9 +16,7 @@ from workflows.report.signature import altered_pages
 
 @click.command()
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
-@json_option
-@quiet_option
-@common_options
+@output_options
 def verify(what: Path, as_json: bool, quiet: bool) -> None:
     """Compare the hash of every file of RUN, its pages included, with the recorded one; or check the hashes in ASSET and every rule of its format. The exit
     code is 4 if anything was altered.

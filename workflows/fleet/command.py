@@ -14,7 +14,7 @@ from pipeline.locks.lock import holder_of
 from pipeline.text import printable
 from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
-from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_limit, memory_option, quiet_option, set_option, workflow
+from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_limit, memory_option, output_options, set_option, workflow
 from workflows.cli.output import closing, listing, write_json
 from workflows.cli.progress import duration, size
 from workflows.cli.resolve import read_preset, read_toml
@@ -77,9 +77,7 @@ def _placement_options(command: Any) -> Any:
 @click.option("--seed", type=int, help="Random seed of all stages.")
 @click.option("--sweep", "sweeps", multiple=True, metavar="STAGE.NAME=A,B,...", help="Run each scene with each of these values; may be repeated.")
 @_placement_options
-@json_option
-@quiet_option
-@common_options
+@output_options
 def run(
     scenes: tuple[str, ...], folder: Path, preset: str | None, sets: tuple[str, ...], seed: int | None, sweeps: tuple[str, ...], roots: tuple[Path, ...],
     as_json: bool, quiet: bool, **options: Any,
@@ -119,9 +117,7 @@ def status(folder: Path, as_json: bool) -> None:
 @click.argument("folder", metavar="FLEET", type=folder_type)
 @click.argument("names", nargs=-1, metavar="[SCENE]...")
 @_placement_options
-@json_option
-@quiet_option
-@common_options
+@output_options
 def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> int:
     """Retry the failed and quarantined scenes of FLEET, or only the given ones. The process that runs FLEET does it; if there is none, this one."""
     chosen = scenes_to_retry(read_fleet(folder).scenes, names)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workflows.cli.options import common_options, folder_type, json_option, memory_limit, memory_option, quiet_option, set_option, workflow
+from workflows.cli.options import folder_type, memory_limit, memory_option, output_options, set_option, workflow
 from workflows.cli.output import closing, listing, write_json
 from workflows.inspection.check import check_source, in_words
 from workflows.precompilation.start import start_alone
@@ -15,9 +15,7 @@ from workflows.precompilation.start import start_alone
 @click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE, detected by default. See poses.format in 'enerf presets poses'.")
 @set_option
 @memory_option
-@json_option
-@quiet_option
-@common_options
+@output_options
 def check(source: Path, format_name: str | None, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool) -> int:
     """Check the photographs in the folder SOURCE, or frames of a video, before a run: sharpness, exposure, focal lengths, sizes, and overlap on small images.
     Report likely problems and what to do, and estimate the time and memory of camera poses and of a full run on this CPU.

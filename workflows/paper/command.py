@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from workflows.cli.device import resolve_device
-from workflows.cli.options import common_options, device_option, folder_type, json_option, quiet_option
+from workflows.cli.options import device_option, folder_type, output_options
 from workflows.cli.output import closing, write_json
 from workflows.cli.progress import display
 from workflows.destination import check_folder
@@ -19,9 +19,7 @@ from workflows.paper.document import Request, make
 @click.option("--scale", type=click.FloatRange(1e-5, 1.0), default=1.0, show_default=True,
               help="Scale of iterations, resolution, networks and grids; the table reports it.")  # fmt: skip
 @device_option
-@json_option
-@quiet_option
-@common_options
+@output_options
 def paper(table: str, data: Path | None, out: Path, scale: float, device: str | None, as_json: bool, quiet: bool) -> None:
     """Reproduce TABLE of the paper: 1 shares of samples, 2 quality and speed, 3 N1 to N4, 4 sizes of the networks, 5 modules one by one, 6 sampling
     strategies, 7 NerfTree against other structures. Writes DIR/table_N.md, .json and, if something is trained, .png.
