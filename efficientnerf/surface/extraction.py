@@ -13,13 +13,9 @@ from efficientnerf.surface.fitting.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.fusion import Fusion
 from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_threshold, enclosed_cells, isosurface, silent
 from efficientnerf.surface.mesh import Mesh, decimate, separate, tidy, vertex_normals
-from efficientnerf.surface.smoothing import rounds_within, smooth, smooth_normals
+from efficientnerf.surface.smoothing import FUSED_NORMALS, NORMALS, rounds_of, smooth, smooth_normals
 from efficientnerf.surface.visible_parts import Shown, visible_parts
 from efficientnerf.surface.volume import NdcVolume, Volume
-
-# Rounds of smoothing normals for each of smoothing, at most, and how sharp the edges are that stay. docs/experiments/surface.md
-NORMALS, FUSED_NORMALS = (1, 6, 0.6), (8, 80, 0.2)  # of surfaces of densities alone, and of fused ones
-SMOOTHING_REACH = 0.04  # of the diagonal of the surface's bounds: how far normals are smoothed. docs/experiments/surface.md
 
 
 def cleaned_surface(
@@ -88,10 +84,8 @@ def surface(
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # parts that decimation cut off
     if len(triangles):
-        times, most, sharpness = NORMALS if fusion is None else FUSED_NORMALS
-        most = min(most, rounds_within(SMOOTHING_REACH * float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices, triangles))
         low, high = vertices.min(0), vertices.max(0)
-        vertices = smooth_normals(vertices, triangles, min(times * rounds, most), sharpness)
+        vertices = smooth_normals(vertices, triangles, *rounds_of(NORMALS if fusion is None else FUSED_NORMALS, rounds, vertices, triangles))
         vertices = np.clip(fitted_to_silhouettes(vertices, triangles, silhouettes, lambda: progress(0, 1, "colours")), low, high)
     normals = vertex_normals(vertices, triangles)
     colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)

@@ -11,7 +11,10 @@ from scipy.sparse import csr_matrix
 from efficientnerf.backends.numba.mesh.normals import smooth_face_normals
 from efficientnerf.surface.mesh import face_neighbours, face_vectors, vertex_normals
 
-LEAST_ROUNDS = 6
+# Rounds of smoothing normals for each of smoothing, at most, and how sharp the edges are that stay: of surfaces of densities alone, of fused ones, and of
+# those that were fitted to photographs. docs/experiments/surface.md
+NORMALS, FUSED_NORMALS, FITTED_NORMALS = (1, 6, 0.6), (8, 80, 0.2), (4, 40, 0.2)
+REACH, LEAST_ROUNDS = 0.04, 6  # of the diagonal of the surface's bounds, how far normals are smoothed at most; but so many rounds may be
 FITS, DRIFT_ROUNDS = 40, 24  # of vertices to normals at most, and of averaging what all vertices of a place have in common. docs/experiments/surface.md
 
 
@@ -60,7 +63,14 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
     return fitted - drift * outward
 
 
-def rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
+def rounds_of(kind: tuple[int, int, float], rounds: int, vertices: np.ndarray, faces: np.ndarray) -> tuple[int, float]:
+    """Rounds and sharpness of `smooth_normals` for a kind, one of NORMALS and the others, and so many rounds of `smooth`."""
+    times, most, sharpness = kind
+    within = _rounds_within(REACH * float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices, faces)
+    return min(times * rounds, most, within), sharpness
+
+
+def _rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
     """How many rounds of smoothing spread over about `reach`, at least LEAST_ROUNDS: a round spreads over an edge, n rounds over the root of n edges."""
     edge = float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean())
     return max(LEAST_ROUNDS, int(min((reach / max(edge, 1e-300)) ** 2, 1e6)))

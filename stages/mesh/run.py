@@ -169,7 +169,7 @@ def run(job: Job) -> None:
     if "no_surface" in surface.facts:
         write_empty(outputs, surface, seen, frame, job)
         return
-    surface = refined_surface(surface, seen, inputs, settings.photometric_refinement, job)
+    surface = refined_surface(surface, seen, inputs, settings, job)
     rest = 1 - share
     found = textured(
         surface, tree, inputs, settings.texture, settings.texture_size, lambda done, total, text: job.reached(share * total + rest * done, total, text)

@@ -29,7 +29,9 @@ class MeshSettings:
         0.0, "Connected components with less than this fraction of the largest one's area are dropped; components that no view shows always are.", advanced=True
     )
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
-        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, follow for normals, which keep edges.", advanced=True
+        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, follow for normals, which keep edges,"
+        " and half of these after photometric refinement.",
+        advanced=True
     )
     photometric_refinement: Literal["auto", "off"] = setting(
         "auto",
@@ -54,4 +56,4 @@ class MeshSettings:
         return int(str(self.max_faces).replace("k", "000"))
 
 
-STAGE = Stage(name="mesh", version=20, settings=MeshSettings, needs=needs_of(MeshInputs), run=ByName("stages.mesh.run:run"))
+STAGE = Stage(name="mesh", version=21, settings=MeshSettings, needs=needs_of(MeshInputs), run=ByName("stages.mesh.run:run"))
