@@ -1,9 +1,9 @@
 """Vertices of a surface moved along their normals to where photographs agree on them. docs/experiments/surface.md
 
 An asset's density says within a voxel or two where a surface is; photographs from two sides say it within a fraction of a pixel. The patch around a vertex is
-compared in the photographs that show it, at offsets along its normal: where they agree best is the surface. Scores are averaged over neighbouring
-vertices, offsets are smoothed where photographs say little (plain or glossy parts), and what they do not show moves with what is next to it. No single
-photograph decides: a vertex needs three of them, and what its neighbours contradict does not count. Vu et al., "High accuracy and
+compared in the photographs that show it, at offsets along its normal: where they agree best is the surface. Offsets are smoothed where photographs say
+little (plain or glossy parts), and what they do not show moves with what is next to it. No single photograph decides: a vertex needs three of them, and
+what its neighbours contradict does not count. Vu et al., "High accuracy and
 visibility-consistent dense multiview stereo", TPAMI 2012; Goesele et al., "Multi-view stereo for community photo collections", ICCV 2007.
 
 C photographs, V vertices, F faces, K places for photographs of each vertex, S offsets.
@@ -25,17 +25,16 @@ from efficientnerf.surface.texturing.photographs import Photograph, halved, show
 # docs/experiments/surface.md
 PLACES = 6  # photographs that a vertex is compared in
 OFFSETS = 13
-ROUNDS = (0.5, 0.25)  # pixels that the patch moves from an offset to the next in the photograph with the second widest angle
+STEP = 0.5  # pixels that the patch moves from an offset to the next in the photograph with the second widest angle
 MAX_PIXELS = 2**21  # pixels of a photograph: larger ones are halved
 APART, WIDEST = np.radians(8), np.radians(60)  # between views of a vertex: from the first they count in full, up to the second at all
 LEAST_PARALLAX = 0.1  # pixels that a patch moves with a pixel along the normal
 NOISE = 2.0  # of 255: deviation of a patch that shows nothing
 TEXTURED = 4.0  # of 255: deviation of a patch that counts half
-RINGS = 3  # of neighbours that a score is averaged over
 PEAK, SCORE = 0.15, (0.3, 0.8)  # how far the best score has to be above the median, and what it has to be, to count in full
 STIFF, STAY = 0.5, 0.01  # weights of an edge and of staying
 SWEEPS, REWEIGHTED = 40, 3  # of smoothing offsets, and how often outliers are weighted down
-FARTHEST = 10.0  # pixels that a vertex moves in a round
+FARTHEST = 10.0  # pixels that a vertex moves
 AROUND = 8  # seen vertices, that one moves with which no photograph shows
 FEWEST = 100  # seen vertices
 
@@ -73,9 +72,7 @@ def refined(vertices: np.ndarray, faces: np.ndarray, photographs: Iterable[Photo
         return unmoved
     search = _Search(faces, cameras, greys, chosen, tick)
     before, weight = search.agreement(vertices)
-    moved = vertices
-    for parallax in ROUNDS:
-        moved = search.moved(moved, parallax)
+    moved = search.moved(vertices)
     after, _ = search.agreement(moved)
     means = [float((each * weight).sum() / max(weight.sum(), 1e-12)) for each in (before, after)]
     improved = means[1] > means[0]
@@ -110,16 +107,16 @@ class _Search:
         score, weight = self._scores(places, _pixel(places[:, 0]), np.zeros(len(vertices)), 1)
         return score[:, 0], weight
 
-    def moved(self, vertices: np.ndarray, parallax: float) -> np.ndarray:
-        """(V, 3) vertices after a round."""
+    def moved(self, vertices: np.ndarray) -> np.ndarray:
+        """(V, 3) vertices where the photographs agree on them."""
         normals = vertex_normals(vertices, self.faces)
         places = self._places(vertices, normals)
         pixel = _pixel(places[:, 0])
         widest = np.sort(_parallax(places, self.chosen), axis=1)[:, -2]
         known = self.seen & (widest * pixel > LEAST_PARALLAX)
-        step = np.where(known, parallax / np.maximum(widest, 1e-12), 0.0)
+        step = np.where(known, STEP / np.maximum(widest, 1e-12), 0.0)
         score, weight = self._scores(places, pixel, step, OFFSETS)
-        weight[~known | (score.max(axis=1) <= 0)] = 0.0
+        weight[~known] = 0.0
         best, confidence = self._best(score, weight)
         offset = self._smoothed(best, confidence) * step
         move = np.clip(offset, -FARTHEST * pixel, FARTHEST * pixel)[:, None] * normals
@@ -148,7 +145,7 @@ class _Search:
         return out
 
     def _scores(self, places: np.ndarray, pixel: np.ndarray, step: np.ndarray, offsets: int) -> tuple[np.ndarray, np.ndarray]:
-        """Scores (V, S), averaged over neighbours by what they count, and that weight (V,)."""
+        """Scores (V, S), and what each counts (V,)."""
         score, texture = np.zeros((len(places), offsets), np.float32), np.zeros(len(places), np.float32)
         for part in pieces(len(places), first=4096):
             self.tick()
@@ -156,11 +153,7 @@ class _Search:
                 part.start, part.stop, self.chosen, places, pixel.astype(np.float32), step.astype(np.float32), self.pixels, self.starts, self.shapes,
                 np.float32(NOISE), score, texture,
             )  # fmt: skip
-        weight = np.where(self.seen & (score.max(axis=1) > 0), texture**2 / (texture**2 + TEXTURED**2), 0.0)
-        total, weights = score * weight[:, None], weight[:, None]
-        for _ in range(RINGS):
-            total, weights = (0.5 * each + 0.5 * (self.neighbours @ each) / self.degree for each in (total, weights))
-        return np.asarray(total / np.maximum(weights, 1e-6)), weights[:, 0]
+        return score, np.where(self.seen & (score.max(axis=1) > 0), texture**2 / (texture**2 + TEXTURED**2), 0.0)
 
     def _best(self, score: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(V,) the best offset, in steps, of a parabola through the best score and those next to it, and how far it can be trusted: zero at either end."""
