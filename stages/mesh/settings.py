@@ -56,4 +56,4 @@ class MeshSettings:
         return int(str(self.max_faces).replace("k", "000"))
 
 
-STAGE = Stage(name="mesh", version=21, settings=MeshSettings, needs=needs_of(MeshInputs), run=ByName("stages.mesh.run:run"))
+STAGE = Stage(name="mesh", version=22, settings=MeshSettings, needs=needs_of(MeshInputs), run=ByName("stages.mesh.run:run"))
