@@ -1,6 +1,7 @@
 """Exports of a run: what its stage `mesh` has made is taken, and made again only where something else is wanted."""
 
 import base64
+import os
 import re
 import zlib
 from dataclasses import replace
@@ -161,6 +162,22 @@ def test_colours_of_vertices_are_asked_of_photographs_where_there_are_any(run: P
         export(run, "b.stl", texture="photographs")
     with pytest.raises(UsageError, match="keeps a texture"):
         export(run, "b.ply", picture="jpeg")
+
+
+@pytest.mark.parametrize("failing", [0, 1, 2])
+def test_a_full_disk_leaves_no_part_of_an_obj(run: Path, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
+    calls, real = iter(range(100)), os.fsync
+
+    def full(descriptor: int) -> None:
+        if next(calls) == failing:
+            raise OSError(28, "No space left on device")
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    before = sorted(run.parent.iterdir())
+    with pytest.raises(Exception, match=r"mesh\.obj"):
+        export(run, "mesh.obj")
+    assert sorted(run.parent.iterdir()) == before
 
 
 def test_a_page_for_browsers_holds_the_asset_or_what_is_asked_for_of_it(run: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -143,6 +144,24 @@ def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> No
     declared = targets.of(index, constant_background=True)[2]
     assert declared.opacity_weight == 0
     np.testing.assert_array_equal(declared.background, 0.5)
+
+
+def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
+    targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
+    whole, _ = fitted(ball_tree(), targets, 12)
+    again = initial_state(ball_tree())
+    told: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / 12), "seed": 1}
+    list(optimise(again, targets, until=5, **told))
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        list(optimise(again, targets, until=12, **told))
+    finally:
+        numba.set_num_threads(threads)
+    np.testing.assert_array_equal(again.result().density_values, whole.density_values)
+    np.testing.assert_array_equal(again.result().sh, whole.sh)
+    other, _ = fitted(ball_tree(), targets, 12, seed=2)
+    assert not np.array_equal(other.sh, whole.sh)
 
 
 def test_weights_are_what_voxels_contribute() -> None:

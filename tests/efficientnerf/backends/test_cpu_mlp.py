@@ -1,5 +1,6 @@
 """The hash field's network in tiles: products and passes are those of numpy and autograd, in both precisions, for every size, on any processor."""
 
+import copy
 import os
 import subprocess
 import sys
@@ -14,6 +15,8 @@ import torch
 from efficientnerf.backends.numba import mlp
 from efficientnerf.backends.numba.vector import products
 from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.fields import hash
+from efficientnerf.training.optimiser import ParameterGroup
 from tests.efficientnerf.networks import passes, weights_of
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -146,3 +149,25 @@ def test_a_processor_without_wide_registers_gives_the_same(tmp_path: Path) -> No
     with np.load(tmp_path / "out.npz") as there:
         for here, other in zip(passes(features, weights, grad, True), there.values(), strict=True):
             assert np.linalg.norm(here - other) < 1e-2 * np.linalg.norm(here)
+
+
+@pytest.mark.parametrize(("precision", "near", "layers"), [("float32", 1e-5, 1), ("bfloat16", 3e-2, 2), ("float32", 1e-5, 3)])
+def test_the_field_is_that_of_plain_torch(precision: str, near: float, layers: int) -> None:
+    """The same field in float64 goes through autograd alone."""
+    generator = torch.Generator().manual_seed(0)
+    field = hash.HashField(
+        levels=3, log2_table=10, coarsest=4, finest=16, hidden=16, layers=layers, degree=1, initial_density=0.5, generator=generator, precision=precision
+    )
+    field.table.data.normal_(generator=generator)
+    plain = copy.deepcopy(field).double()
+    at = torch.rand(777, 3, generator=generator)
+    towards = torch.randn(777, 13, generator=generator)
+    ours, theirs = field(at), plain(at.double())
+    (ours * towards).sum().backward()
+    (theirs * towards).sum().backward()
+    assert (ours - theirs).norm() < near * theirs.norm()
+    groups = (ParameterGroup(dict(each.named_parameters()), buffers=each.gradient_buffers) for each in (field, plain))
+    mine, its = ([group.gradient(name) for name in group.parameters] for group in groups)
+    for one, other in zip(mine, its, strict=True):
+        assert one is not None
+        assert (one - other).norm() < 5 * near * other.norm()  # ReLUs close to zero fall to the other side

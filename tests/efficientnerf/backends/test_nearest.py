@@ -1,4 +1,4 @@
-"""Nearest lookup: the values of the voxel that holds a point, in the kernels, in files and in the fit; rays are in `test_render` and `test_operations`."""
+"""Nearest lookup: the values of the voxel that holds a point, in the kernels, in files and in the fit; torch against the loop is in `test_render`."""
 
 import math
 from dataclasses import replace
@@ -40,6 +40,19 @@ def test_points_get_the_values_of_their_voxel(brick: int, degree: int) -> None:
     np.testing.assert_allclose(colour_at(tree, points, directions), np.where(stored[:, None], 1 / (1 + np.exp(-logit)), 0.5), atol=1e-5)
     other = replace(tree, lookup="trilinear")
     assert np.abs(density_at(tree, points) - density_at(other, points)).max() > 1
+
+
+@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
+def test_the_kernel_matches_the_torch_reference(brick: int, degree: int) -> None:
+    tree = nearest(brick, degree)
+    origins, directions = rays_at(tree, 400)
+    colour, opacity = render_reference(tree, *tensors(origins, directions))
+    outputs = render_rays(tree, origins, directions)
+    np.testing.assert_allclose(outputs.opacity, opacity, atol=1e-3)
+    np.testing.assert_allclose(outputs.colour, colour, atol=1e-3)
+    assert 0.2 < (outputs.opacity > 0.05).mean() < 0.9
+    other = render_rays(replace(tree, lookup="trilinear"), origins, directions)
+    assert np.abs(other.colour - outputs.colour).max() > 0.05
 
 
 def test_a_uniform_box_has_its_closed_form_to_its_very_face() -> None:

@@ -80,6 +80,11 @@ def test_nerfs_colour_depends_on_the_direction_and_its_density_does_not() -> Non
     assert (first[:, 1:] - second[:, 1:]).abs().min() > 0
 
 
+@pytest.mark.parametrize("degree", [0, 4])
+def test_any_degree_of_harmonics(degree: int) -> None:
+    assert MlpField(hidden=8, layers=2, degree=degree, generator=torch.Generator())(torch.rand(3, 3)).shape == (3, 1 + 3 * (degree + 1) ** 2)
+
+
 @pytest.mark.parametrize(("vendor", "flags", "chain_type", "fused_type"), [
     ("AuthenticAMD", "avx512f avx512_bf16", torch.bfloat16, torch.bfloat16),
     ("GenuineIntel", "avx512f avx512_bf16 amx_bf16", torch.bfloat16, torch.float32),

@@ -1,4 +1,4 @@
-"""Images of packed trees: against the torch reference, of every camera model, and what skipping may not change."""
+"""Images of packed trees: against the torch reference, of every camera model, and what skipping may not change. Parts of the kernel: `test_render_parts`."""
 
 from dataclasses import replace
 

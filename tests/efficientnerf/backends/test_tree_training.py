@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_coordinates, voxel_sides
+from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import MIN_THICKNESS, MOST_VARIATION
 from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
 from efficientnerf.backends.numba.tree_training.steps import Values, step, values_of
 from efficientnerf.backends.numba.vector.memory import pointer
@@ -85,6 +87,29 @@ def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree]) -> None:
         np.testing.assert_allclose(o.density, density, rtol=2e-3, atol=1e-5)
         np.testing.assert_allclose(o.sh, sh, atol=2e-3)
     assert len(np.unique(visits)) > 1  # some were not met by every bundle
+
+
+def test_the_same_bytes_on_any_number_of_threads() -> None:
+    tree, found = random_cascades(3, cells=8, brick=2, degree=2), []
+    threads = numba.get_num_threads()
+    origins, directions = nested_rays(tree, 1500)
+    seen = seen_at_random(1500, 0.2, np.float32)
+    start, along, bases = in_voxels(tree, origins, directions)
+    first = packets_of(1500, 7)
+    try:
+        for count in (1, threads):
+            numba.set_num_threads(count)
+            o = initial_state(tree)
+            moments, cells = moments_of(o), cells_of(tree)
+            values = values_of(cells, o.density, o.sh)
+            for _ in range(2):
+                loss, records = kernels.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer())
+                step(records, values, moments, rule_of())
+            found.append((loss, o.density, o.sh, *moments))
+    finally:
+        numba.set_num_threads(threads)
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 @numba.njit

@@ -165,6 +165,22 @@ def test_paths_that_leave_the_source(tmp_path: Path, listed: str) -> None:
         importers.files(folder, Settings())
 
 
+@pytest.mark.parametrize("what", ["images/img_0.png", "images", "mask.png"])
+def test_links_that_leave_the_source(tmp_path: Path, what: str) -> None:
+    frames = captures.frames(captures.cameras())
+    if what == "mask.png":
+        frames[0]["mask_path"] = what
+    folder = captures.nerfstudio(tmp_path / "a", frames=frames)
+    outside = tmp_path / "outside.png"
+    if what == "mask.png":
+        captures.write_picture(outside, captures.picture())
+    else:
+        (folder / what).rename(outside)
+    (folder / what).symlink_to(outside)
+    refusal(folder, "--allow-outside")
+    assert len(read(folder, allow_outside=True).photos) == 6
+
+
 # --- LLFF
 
 

@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 import torch
 
+from efficientnerf.training import loop
 from pipeline.errors import Interrupted
 from stages.artifacts import TrainOutputs
 from stages.io.field_file import read_tensors, write_tensors
 from stages.train import run as train
-from tests.efficientnerf.balls import settings
+from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import StopAt, job, poses
 from tests.stages.spoilers import SPOILERS
 
@@ -126,3 +127,26 @@ def test_every_scratch_file_of_training_may_be_damaged(stopped: tuple[Path, Path
     lines = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines][-1] == 9
     assert not any(path.is_symlink() for path in (tmp_path / "out").rglob("*"))
+
+
+def test_a_state_that_does_not_fit_leaves_the_trainer_as_it_was() -> None:
+    from efficientnerf.geometry.spaces import space_from
+    from efficientnerf.model import model
+
+    def made(seed: int) -> loop.Trainer:
+        return loop.trainer(model(space_from(BOUNDS), settings(seed=seed), (1.0, 1.0, 1.0), "cpu", (1.0, 5.0)))
+
+    t, other = made(0), loop.state_of(made(1))
+    before = {name: tensor.clone() for name, tensor in loop.state_of(t).items()}
+    other["progress"] = torch.tensor([3.0, 50.0], dtype=torch.float64)
+    last = sorted(name for name in other if name.startswith("adam.1."))[-1]
+    for spoilt in (
+        {**other, last: torch.zeros(2)},
+        {name: tensor for name, tensor in other.items() if name != last},
+        {**other, "progress": torch.zeros(2).double()},
+    ):
+        with pytest.raises(ValueError, match=r"adam|step 0"):
+            loop.restore(t, spoilt)
+        assert all(torch.equal(before[name], tensor) for name, tensor in loop.state_of(t).items())
+    loop.restore(t, other)
+    assert (t.step, t.samples_per_ray) == (3, 50.0)
