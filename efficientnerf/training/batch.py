@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.model import Model
-from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.device_pixels import DevicePixels, on_host
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
 
@@ -46,7 +46,7 @@ def ray_count(settings: TrainSettings, samples_per_ray: float) -> int:
 def drawn_rays(m: Model, pixels: Pixels | DevicePixels, count: int, rng: np.random.Generator, *, crop: bool) -> DrawnRays:
     """`count` random pixels; with `crop`, of the middle of the images."""
     pixel, offset = pixels.choose(count, rng, middle=crop), rng.random(count, np.float32)
-    behind, channels = None, (pixels.pixels if isinstance(pixels, DevicePixels) else pixels).images.shape[1]
+    behind, channels = None, on_host(pixels).images.shape[1]
     if m.space.reaches_infinity and m.background is None:
         # Behind a space that reaches to infinity nothing lies: a random colour for each ray keeps the field from staying half transparent.
         behind = rng.random((count, 3), np.float32)

@@ -65,3 +65,8 @@ class DevicePixels:
             assert self.images is not None
             colour = self.images[at]
         return *dispatch.pixel_rays(self.tables, self.pixels.stride, at), colour.float() / 255
+
+
+def on_host(pixels: Pixels | DevicePixels) -> Pixels:
+    """The pixels where they are chosen."""
+    return pixels.pixels if isinstance(pixels, DevicePixels) else pixels

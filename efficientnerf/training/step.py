@@ -11,7 +11,7 @@ from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.sampling.samples import SampleCapacity, complete_rays
 from efficientnerf.sampling.strategies import Efficient
 from efficientnerf.training.batch import DrawnRays, drawn_rays, ray_batch
-from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.device_pixels import DevicePixels, on_host
 from efficientnerf.training.exposure.model import Exposure, exposure_loss, places
 from efficientnerf.training.losses import colour_losses, mean_over, scale_gradients_by_distance
 from efficientnerf.training.occupancy_update import update_on_rays
@@ -57,14 +57,11 @@ class Learner:
     exposure: Exposure | None
 
 
-def drawn_step(
-    learner: Learner, sparse_depth: SparseDepthRays | None, count: int, rng: np.random.Generator, *, crop: bool
-) -> StepInputs:
+def drawn_step(learner: Learner, sparse_depth: SparseDepthRays | None, count: int, rng: np.random.Generator, *, crop: bool) -> StepInputs:
     """Rays through `count` pixels, with `crop` of the middle of the images, and rays to sparse points, where there are some."""
     rays = drawn_rays(learner.model, learner.pixels, count, rng, crop=crop)
     aimed = None if sparse_depth is None else aimed_rays(sparse_depth, max(1, count // RAYS_PER_RAY), rng)
-    host = learner.pixels.pixels if isinstance(learner.pixels, DevicePixels) else learner.pixels
-    return StepInputs(rays, None if learner.exposure is None else places(host, rays.pixel), aimed)
+    return StepInputs(rays, None if learner.exposure is None else places(on_host(learner.pixels), rays.pixel), aimed)
 
 
 def explored_of(m: Model, capacity: SampleCapacity | None, rng: np.random.Generator) -> Tensor | None:
@@ -82,9 +79,7 @@ def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: 
     batch = ray_batch(m, learner.pixels, inputs.rays)
     count, aimed = len(batch.origins), inputs.aimed
     bundle = batch[:6] if aimed is None else tuple(torch.cat(pair) for pair in zip(batch[:6], aimed.bundle, strict=True))
-    outputs = render_rays(
-        m, *bundle, prune=plan.prune, rng=rng, capacity=plan.capacity, samples_per_pivot=plan.samples_per_pivot, explored=inputs.explored
-    )  # fmt: skip
+    outputs = render_rays(m, *bundle, prune=plan.prune, rng=rng, capacity=plan.capacity, samples_per_pivot=plan.samples_per_pivot, explored=inputs.explored)
     fitting = complete_rays(outputs.coarse, outputs.fine)
     complete = None if fitting is None else fitting[:count]
     exposure = learner.exposure if learner.exposure is None or plan.learns_exposure else learner.exposure.detached

@@ -11,7 +11,7 @@ import torch
 from efficientnerf.backends import dispatch
 from efficientnerf.backends.layout import RayTargets
 from efficientnerf.rendering import environment
-from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.device_pixels import DevicePixels, on_host
 from efficientnerf.training.pixels import Pixels
 
 MEAN, VARIANCE = 0.5, 0.25  # of a random background: mean of a channel, and the three channels' variances summed; see `Targets`
@@ -49,7 +49,7 @@ class Targets:
     @property
     def host_pixels(self) -> Pixels:
         """The pixels where they are chosen."""
-        return self.pixels if isinstance(self.pixels, Pixels) else self.pixels.pixels
+        return on_host(self.pixels)
 
     def to(self, device: str) -> Targets:
         """These targets on "cpu" or "cuda", the latter where its kernels can be built."""

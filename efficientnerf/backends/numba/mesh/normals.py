@@ -9,10 +9,10 @@ from efficientnerf.backends.numba.runtime import numba
 def smooth_face_normals(normals, areas, neighbours, sharpness, out):  # type: ignore[no-untyped-def]
     """Of each face the mean of its own normal and those next to it, by area and exp(-difference^2 / (2 sharpness^2)).
 
-    normals  (F, 3) float64 unit
-    areas    (F,) float64
-    neighbours   (F, 3) int64 the face across each edge, -1: none
-    out      (F, 3) float64 unit
+    normals     (F, 3) float64 unit
+    areas       (F,) float64
+    neighbours  (F, 3) int64 the face across each edge, -1: none
+    out         (F, 3) float64 unit
     """
     for face in numba.prange(len(normals)):
         x, y, z = areas[face] * normals[face, 0], areas[face] * normals[face, 1], areas[face] * normals[face, 2]
