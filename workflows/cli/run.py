@@ -127,13 +127,13 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
                     write_pages(run, workflow().stages)
     except (Exception, KeyboardInterrupt) as error:
         raise Reported(error, summary(run.path, ())) from error
-    facts = summary(run.path, outcomes)
+    facts, elapsed = summary(run.path, outcomes), time.monotonic() - started
     found = None if dry_run or fail_on is None else graded(run.path, outcomes)
     code = GRADED if found is not None and found.is_as_bad_as(str(fail_on)) else 0
     if as_json:
-        write_json({"event": "summary", "ok": code == 0, **facts, "elapsed": time.monotonic() - started, "device": device, "exit_code": code})
+        write_json({"event": "summary", "ok": code == 0, **facts, "elapsed": elapsed, "device": device, "exit_code": code})
     elif not quiet and not dry_run:
-        closing(*in_words(run.path, outcomes))
+        closing(*in_words(run.path, outcomes, elapsed))
     return code
 
 

@@ -74,14 +74,16 @@ def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
-    """The summary as lines: the grade of the result first, where it was evaluated."""
+def in_words(run: Path, outcomes: Sequence[Outcome], elapsed: float) -> list[str]:
+    """The summary as lines: the grade of the result first, where it was evaluated.
+
+    elapsed  seconds of the command: less than those of its stages, where some ran side by side
+    """
     verdict = graded(run, outcomes)
     ran = [outcome for outcome in outcomes if outcome.action == "ran"]
-    spent = sum(outcome.seconds for outcome in ran)
     if ran:
         parts = ", ".join(f"{outcome.stage} {duration(outcome.seconds)}" for outcome in ran)
-        lines = [f"{run}: done in {duration(spent)} ({parts})" if len(ran) > 1 else f"{run}: {ran[0].stage} done in {duration(spent)}"]
+        lines = [f"{run}: done in {duration(elapsed)} ({parts})" if len(ran) > 1 else f"{run}: {ran[0].stage} done in {duration(ran[0].seconds)}"]
     else:
         lines = [f"{run}: everything is up to date"]
     if verdict is not None:
