@@ -321,7 +321,7 @@ def _of_sparse_points(metrics: Mapping[str, Any]) -> list[ResultProblem]:
 
 
 def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[ResultProblem]:
-    """Of the mesh where the asset's pictures are not poor themselves; and whether there is one."""
+    """Of the mesh where the asset's pictures have a better grade; and whether there is one."""
     picture = f"{MeshOutputs.stage}/{MeshOutputs.check}"
     if metrics["mesh"]["faces"] == 0:
         remedy = "Train longer, or set mesh.density_threshold by hand."
@@ -333,26 +333,26 @@ def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Res
         cause = "Photographs say little about walls and tables of one colour, which come out in rags; the asset shows them right from near the photographs."
         remedy = "Photograph such surfaces with something on them that has texture (posters, newspapers, chalk); use the asset or the splats."
         found.append(ResultProblem("rough mesh", "usable", sentence, cause, remedy, picture))
-    if not _only_of_this(figures["mesh_blur"], figures):
+    if not _is_worse(figures["mesh_blur"], figures["blur"]):
         return found
-    sentence = f"The mesh is far behind the asset: {metrics['mesh']['psnr']:.1f} dB, {blur_in_words(figures['mesh_blur'])}."
+    sentence = f"The mesh is behind the asset: {metrics['mesh']['psnr']:.1f} dB, {blur_in_words(figures['mesh_blur'])}."
     cause = "Its surface is not where the asset's is, or what it shows has none (fur, leaves, glass)."
     remedy = "Raise mesh.max_faces, or set mesh.density_threshold by hand; use the asset or the splats."
     return [*found, ResultProblem("mesh", "usable", sentence, cause, remedy, picture)]
 
 
 def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[ResultProblem]:
-    if not _only_of_this(figures["splats_blur"], figures):
+    if not _is_worse(figures["splats_blur"], figures["blur"]):
         return []
-    sentence = f"The 3D Gaussians are far behind the asset: {metrics['splats']['psnr']:.1f} dB, {blur_in_words(figures['splats_blur'])}."
+    sentence = f"The 3D Gaussians are behind the asset: {metrics['splats']['psnr']:.1f} dB, {blur_in_words(figures['splats_blur'])}."
     picture = f"{SplatsOutputs.stage}/{SplatsOutputs.preview}"
     remedy = "Raise splats.count or splats.iterations, or give more time (--budget, splats.time_budget)."
     return [ResultProblem("splats", "usable", sentence, "They are too few, or too few steps fitted them.", remedy, picture)]
 
 
-def _only_of_this(blur: float | None, figures: Mapping[str, Any]) -> bool:
-    """Whether pictures are poor, and the asset's are not: else that is reported."""
-    return blur is not None and blur > POOR_BLUR and figures["blur"] is not None and figures["blur"] <= POOR_BLUR
+def _is_worse(blur: float | None, asset: float | None) -> bool:
+    """Whether pictures have a worse grade than the asset's, which else says it all."""
+    return blur is not None and asset is not None and any(asset <= limit < blur for limit in (USABLE_BLUR, POOR_BLUR))
 
 
 def _of_cameras(cameras: CameraVerdict | None) -> list[ResultProblem]:
