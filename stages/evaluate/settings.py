@@ -54,7 +54,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="evaluate",
-    version=13,
+    version=14,
     settings=EvaluateSettings,
     needs=needs_of(EvaluateInputs),
     run=ByName("stages.evaluate.run:run"),

@@ -333,7 +333,7 @@ def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Res
         cause = "Photographs say little about walls and tables of one colour, which come out in rags; the asset shows them right from near the photographs."
         remedy = "Photograph such surfaces with something on them that has texture (posters, newspapers, chalk); use the asset or the splats."
         found.append(ResultProblem("rough mesh", "usable", sentence, cause, remedy, picture))
-    if not _is_worse(figures["mesh_blur"], figures["blur"]):
+    if not any(_passes(limit, figures["mesh_blur"], figures) for limit in (USABLE_BLUR, POOR_BLUR)):
         return found
     sentence = f"The mesh is behind the asset: {metrics['mesh']['psnr']:.1f} dB, {blur_in_words(figures['mesh_blur'])}."
     cause = "Its surface is not where the asset's is, or what it shows has none (fur, leaves, glass)."
@@ -342,7 +342,7 @@ def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Res
 
 
 def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[ResultProblem]:
-    if not _is_worse(figures["splats_blur"], figures["blur"]):
+    if not _passes(POOR_BLUR, figures["splats_blur"], figures):
         return []
     sentence = f"The 3D Gaussians are behind the asset: {metrics['splats']['psnr']:.1f} dB, {blur_in_words(figures['splats_blur'])}."
     picture = f"{SplatsOutputs.stage}/{SplatsOutputs.preview}"
@@ -350,9 +350,9 @@ def _of_splats(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[R
     return [ResultProblem("splats", "usable", sentence, "They are too few, or too few steps fitted them.", remedy, picture)]
 
 
-def _is_worse(blur: float | None, asset: float | None) -> bool:
-    """Whether pictures have a worse grade than the asset's, which else says it all."""
-    return blur is not None and asset is not None and any(asset <= limit < blur for limit in (USABLE_BLUR, POOR_BLUR))
+def _passes(limit: float, blur: float | None, figures: Mapping[str, Any]) -> bool:
+    """Whether pictures are worse than that, and the asset's are not: else that is reported."""
+    return blur is not None and figures["blur"] is not None and figures["blur"] <= limit < blur
 
 
 def _of_cameras(cameras: CameraVerdict | None) -> list[ResultProblem]:
