@@ -31,7 +31,8 @@ SPACING = 0.2  # mm, of points
 FARTHEST = 20.0  # mm
 AROUND = 60.0  # mm, by which the box of the observed part is larger, and twice as much on its upper sides
 MARGIN = 24  # pixels of a photograph of 1600, by which masks are dilated
-PER_SPACING = 4  # samples in a square of SPACING, of which one stays
+PER_SPACING = 2  # samples in a square of SPACING, of which about every fourth stays
+AT_ONCE = 50_000  # points whose neighbours are known at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +72,12 @@ def observed(folder: Path, scan: int) -> Observed:
 def thinned(points: np.ndarray, spacing: float) -> np.ndarray:
     """Points in a drawn order, each that is no nearer than `spacing` to one kept before it."""
     points = points[np.random.default_rng(0).permutation(len(points))]
-    kept = np.ones(len(points), bool)
-    for number, near in enumerate(cKDTree(points).query_ball_point(points, spacing)):
-        if kept[number]:
-            kept[[other for other in near if other > number]] = False
+    tree, kept = cKDTree(points), np.ones(len(points), bool)
+    for begin in range(0, len(points), AT_ONCE):
+        for number, near in enumerate(tree.query_ball_point(points[begin : begin + AT_ONCE], spacing), begin):
+            if kept[number]:
+                kept[near] = False
+                kept[number] = True
     return points[kept]
 
 
@@ -82,8 +85,8 @@ def distances(vertices: np.ndarray, faces: np.ndarray, truth: Observed) -> Dista
     """Of a mesh, in millimetres; infinite where nothing of it lies in the observed box."""
     count = int(np.ceil(PER_SPACING * face_areas(vertices, faces).sum() / SPACING**2))
     face, weight = sample(vertices, faces, count, seed=0)
-    points = thinned(np.einsum("nk,nkc->nc", weight, vertices[faces[face]]), SPACING)
-    points = points[((points >= truth.low - AROUND) & (points < truth.high + 2 * AROUND)).all(1)]
+    points = np.einsum("nk,nkc->nc", weight, vertices[faces[face]])
+    points = thinned(points[((points >= truth.low - AROUND) & (points < truth.high + 2 * AROUND)).all(1)], SPACING)
     cell = np.round((points - truth.low) / truth.step).astype(np.int64)
     inside = ((cell >= 0) & (cell < truth.mask.shape)).all(1)
     inside[inside] = truth.mask[tuple(cell[inside].T)]
