@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.numba.vector.memory import hold, pointer
 from efficientnerf.backends.numba.vector.products import (
     LANES,
     ROWS,
@@ -64,6 +64,7 @@ def _pack_weight(weight, per_word, forward, back):  # type: ignore[no-untyped-de
             padded[o, i] = transposed[i, o] = weight[o, i]
     pack_row_pairs(Rows(pointer(padded), 0, back.shape[1]), back.shape[1], pointer(back), len(back), back.shape[1])
     pack_row_pairs(Rows(pointer(transposed), 0, forward.shape[1]), forward.shape[1], pointer(forward), len(forward), forward.shape[1])
+    hold((padded, transposed))
 
 
 def pack_weights(weights: list[np.ndarray], bfloat16: bool) -> PackedWeights:
@@ -132,6 +133,7 @@ def _forward(inputs, first, middle, last, offset, element, chunk, activations, o
             for n in range(max(0, count - padded_outputs // outputs), count):
                 for column in range(outputs):
                     out[begin + n, column] = block_out[n, column]
+        hold((block_inputs, x, scratch, block_out))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -216,6 +218,7 @@ def _backward(grad, inputs, first_back, middle_back, last_back, element, chunk, 
             for i in range(features):
                 for n in range(count):
                     grad_inputs[i, begin + n] = block_inputs[i, n]
+        hold((block_inputs, x, block_grad, out_grad, out_grad_pairs, hidden_grad, transposed, hidden_grad_pairs, activation_pairs))
 
 
 def _chunk(samples: int) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.entropy.rans import coded, coded_bit, coded_few, digits, slice_of
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.numba.vector.memory import hold, pointer
 
 BIT_CONTEXTS = 128  # which of seven neighbours are set
 DENSITY_CONTEXTS = 33
@@ -58,6 +58,7 @@ def _walk_masks(coder, s, stored, before, border, inner, b, begin, end):  # type
             failed |= lacking
             near[p] = value
             voxels[n * cube + v] = value
+    hold((room,))
     coder.at[s], coder.failed[s] = at, failed
 
 

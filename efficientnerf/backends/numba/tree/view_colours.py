@@ -14,7 +14,7 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
 from efficientnerf.backends.numba.vector.halves import store_halves
 from efficientnerf.backends.numba.vector.maths import bits_of, broadcast, broadcast_like, fma, pack, sqrt, to_float32, unpack
-from efficientnerf.backends.numba.vector.memory import advanced, load, load_bytes8, pointer, store_nth
+from efficientnerf.backends.numba.vector.memory import advanced, hold, load, load_bytes8, pointer, store_nth
 from efficientnerf.rendering import harmonics
 
 VOXELS_PER_TASK = 2**14
@@ -257,3 +257,4 @@ def compute_view_colours(first, end, cascade, packed, direction, cone, density_s
         _colours(
             begin, min(end, begin + VOXELS_PER_TASK), cascade, packed, pointer(direction), pointer(cone), density_scale, degree, pointer(basis), pointer(out)
         )  # fmt: skip
+        hold((basis,))

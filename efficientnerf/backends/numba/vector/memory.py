@@ -16,7 +16,7 @@ _FLOATS, _INTS = types.CPointer(types.float32), types.CPointer(types.int32)
 
 @intrinsic
 def pointer(typing_context: Any, array: Any) -> Any:
-    """Pointer to the first element of a contiguous array, without bounds checks and without wraparound; the caller keeps the array alive."""
+    """Pointer to the first element of a contiguous array, without bounds checks and without wraparound; the caller keeps the array alive, see `hold`."""
     if not isinstance(array, types.Array) or array.layout != "C":
         raise TypeError(f"pointer of {array}: expected a contiguous array")
 
@@ -24,6 +24,12 @@ def pointer(typing_context: Any, array: Any) -> Any:
         return context.make_array(signature.args[0])(context, builder, args[0]).data
 
     return types.CPointer(array.dtype)(array), codegen
+
+
+@intrinsic
+def hold(typing_context: Any, arrays: Any) -> Any:
+    """Does nothing with a tuple of arrays of a kernel, behind the last use of pointers to them: numba frees an array after the last line that names it."""
+    return types.void(arrays), lambda context, builder, signature, args: context.get_dummy_value()
 
 
 @intrinsic
