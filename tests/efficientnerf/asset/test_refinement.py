@@ -68,8 +68,8 @@ def test_records_grow_until_all_samples_fit() -> None:
 
 def fitted(tree: NerfTree, targets: Targets, steps: int, **more: Any) -> tuple[NerfTree, list[float]]:
     o = initial_state(tree)
-    told = {"until": steps, "rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / steps), "seed": 1, **more}
-    errors = list(optimise(o, targets, **told))
+    rates = {"until": steps, "rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / steps), "seed": 1, **more}
+    errors = list(optimise(o, targets, **rates))
     return o.result(), errors
 
 
@@ -150,12 +150,12 @@ def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     whole, _ = fitted(ball_tree(), targets, 12)
     again = initial_state(ball_tree())
-    told: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / 12), "seed": 1}
-    list(optimise(again, targets, until=5, **told))
+    rates: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / 12), "seed": 1}
+    list(optimise(again, targets, until=5, **rates))
     threads = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
-        list(optimise(again, targets, until=12, **told))
+        list(optimise(again, targets, until=12, **rates))
     finally:
         numba.set_num_threads(threads)
     np.testing.assert_array_equal(again.result().density_values, whole.density_values)
