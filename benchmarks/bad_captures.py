@@ -21,10 +21,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from benchmarks.machine import hardware
 from benchmarks.poses import aligned_errors, true_centres
 from benchmarks.scenes import room
 from stages.io.pictures import opened, rgb_and_alpha
-from workflows.paper.document import hardware
 
 ROOT = Path(__file__).resolve().parents[1]
 GOOD, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.machine import hardware
 from benchmarks.minutes import code_version
 from benchmarks.poses import aligned_errors, true_centres
 from benchmarks.stage_runs import read_json
@@ -28,7 +29,6 @@ from pipeline.files import write_atomically
 from pipeline.run import NAME as RUN_FILE
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
 from workflows.asset import NAMES as STAGES
-from workflows.paper.document import hardware
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"

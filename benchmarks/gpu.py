@@ -27,7 +27,8 @@ ROOT = HERE.parent
 # Seconds at most. Most of the tests' time is compilation of kernels.
 PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "trees": 60.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
 TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
-TESTS = ["tests/efficientnerf", "tests/workflows/paper", "--ignore=tests/efficientnerf/backends/test_cuda_builds.py", "-k", "cuda or readback or device or gpu"]
+TESTS = ["tests/efficientnerf", "tests/benchmarks/paper", "--ignore=tests/efficientnerf/backends/test_cuda_builds.py", "-k",
+         "cuda or readback or device or gpu"]  # fmt: skip
 METHOD = ["torch", "triton", "numba", "scipy", "safetensors", "msgspec", "platformdirs"]
 PIPELINE = [
     "msgspec", "platformdirs", "jinja2",

@@ -231,8 +231,8 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
 
 def paper_rates(device: str, steps: int, side: int, views: int, **changes: Any) -> dict[str, Any]:
     """`training_rates` of the rows of table 5, and of uniform sampling, with the settings of the preset paper-n4 but for a short warm-up."""
+    from benchmarks.paper.tables import IMPORTANCE, LARGE, NERF
     from workflows.cli.resolve import read_preset
-    from workflows.paper.tables import IMPORTANCE, LARGE, NERF
 
     rows: dict[str, dict[str, Any]] = {
         "nerf": NERF, "uniform": {**NERF, "sampling": "uniform"}, "sh": {"sampling": "hierarchical", **IMPORTANCE, **LARGE},

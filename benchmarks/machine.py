@@ -3,6 +3,11 @@
 import os
 import platform
 from pathlib import Path
+from typing import Any
+
+import torch
+
+from pipeline.executors.cores import affinity
 
 STAT = Path("/proc/stat")
 
@@ -25,3 +30,11 @@ def busy_seconds() -> float | None:
     except (OSError, ValueError):
         return None
     return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")
+
+
+def hardware(device: str) -> dict[str, Any]:
+    """The hardware of a measurement on "cpu" or "cuda"."""
+    found: dict[str, Any] = {"processor": processor(), "cores": affinity(), "device": torch.cuda.get_device_name() if device == "cuda" else device}
+    if hasattr(os, "getloadavg"):
+        found["load"] = [round(x, 2) for x in os.getloadavg()]
+    return found

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.machine import hardware
 from benchmarks.minutes import RESULTS, code_version
 from benchmarks.stage_runs import read_json
 from efficientnerf.asset.format import load
@@ -35,7 +36,6 @@ from stages.io.refined_cameras import load_scene
 from stages.splats.run import gaussians_of
 from stages.splats.settings import SplatsSettings
 from tests.stages.formats.gaussians import read_spz
-from workflows.paper.document import hardware
 
 COLUMNS = ("Gaussians", "degree", "seed", "SPZ 4 / MB", "SPZ 3 / MB", "SOG / MB", "PSNR / dB, SSIM of SPZ", "before it", "processor seconds")
 

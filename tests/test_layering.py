@@ -62,7 +62,6 @@ LATE = {
     "workflows/cli/device.py": 1,
     "workflows/cli/progress.py": 2,
     "workflows/cli/verify.py": 1,
-    "workflows/paper/runs.py": 1,
     "workflows/report/pages.py": 2,
 }
 

@@ -73,7 +73,6 @@ def test_no_command_writes_into_a_run(enerf: Enerf, run: Path, asset: Path, tmp_
                     assert (code, "lies in the run" in said) == (2, True), (command, said)
     for command in (["export", run, "--to", run / "run.json"], ["convert", run, run / "bake/asset.nerftree"], ["render", run, "--out", run]):
         assert enerf(*command, "--force").code in (2, 4)  # 4: the link in it
-    assert enerf("paper", "7", "--out", run).code == 2
     assert contents(tmp_path) == before
 
 

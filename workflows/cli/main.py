@@ -35,7 +35,6 @@ COMMANDS = {  # name -> its module, and what `enerf --help` says of it
     "convert": ("workflows.cli.assets", "Write an asset in another layout, resolution or degree."),
     "view": ("workflows.cli.assets", "Show a run or an asset in a browser."),
     "presets": ("workflows.cli.presets", "List presets and settings with their defaults and meaning."),
-    "paper": ("workflows.paper.command", "Reproduce a table of the paper, next to our results."),
 }
 
 

@@ -136,7 +136,6 @@ COMMANDS: dict[str, tuple[list[str], str, set[str]]] = {
     "render --path": (["render", "ASSET", "--out", "NEW", "--path", "X"], ".json", set()),
     "render --video": (["render", "ASSET", "--frames", "1", "--width", "16", "--height", "16", "--out", "NEW", "--video", "X"], ".mp4",
                        {"missing", "odd_name"}),
-    "paper --out": (["paper", "9", "--out", "X"], "", set()),
     "presets": (["presets", "X"], "", set()),
     "presets --preset": (["presets", "--preset", "X"], "", set()),
     "run --preset": (["run", "SOURCE", "--out", "NEW", "--preset", "X"], "", set()),

@@ -5,9 +5,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from workflows.paper import pretrained
-from workflows.paper.result import PAPER, Request, Result
-from workflows.paper.runs import CONVERGED_PSNR, Figures, Row, measured, scenes, settings_of
+from benchmarks.paper import pretrained
+from benchmarks.paper.result import PAPER, Request, Result
+from benchmarks.paper.runs import CONVERGED_PSNR, Figures, Row, measured, scenes, settings_of
 
 # Table 1, percent: valid, pivotal.
 SHARES = {
@@ -135,7 +135,7 @@ def modules(request: Request) -> Result:
 
 
 def strategies(request: Request) -> Result:
-    """Table 6: NeRF, and NeRF-SH, which PlenOctree trains, from nothing; IBRNet and MVSNeRF finetuned (`workflows.paper.pretrained`)."""
+    """Table 6: NeRF, and NeRF-SH, which PlenOctree trains, from nothing; IBRNet and MVSNeRF finetuned (`benchmarks.paper.pretrained`)."""
     cases: list[tuple[str, str, str, dict[str, Any], float, float]] = [
         ("NeRF", "uniform", "nerf-uniform", {**NERF, "sampling": "uniform"}, 41.0, 30.06),
         ("NeRF", "NeRF", "nerf", NERF, 56.0, 31.01),

@@ -1,13 +1,13 @@
-"""`enerf paper`: what is written, and what is refused."""
+"""`python -m benchmarks.paper`: what is written, and what is refused."""
 
 import json
 from pathlib import Path
 
 import pytest
 
+from benchmarks.paper.__main__ import main
+from benchmarks.paper.document import PAPER, Request, Result, Table, make
 from pipeline.errors import BadInput, UsageError
-from workflows.cli.main import main
-from workflows.paper.document import PAPER, Request, Result, Table, make
 
 
 def measure(request: Request) -> Result:
@@ -35,4 +35,4 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         make("99", Request(tmp_path / "missing", tmp_path), SOME)
     with pytest.raises(UsageError, match="--data DIR"):
         make("98", Request(None, tmp_path), SOME)
-    assert main(["paper", "13", "--out", str(tmp_path), "--quiet"]) == 2
+    assert main(["13", "--out", str(tmp_path), "--quiet"]) == 2

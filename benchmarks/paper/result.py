@@ -1,4 +1,4 @@
-"""Request and result of a table of the paper (`workflows.paper.document`)."""
+"""Request and result of a table of the paper (`benchmarks.paper.document`)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workflows.paper.structures import BrickTree, DenseVoxels, FullBricks, HashMap, Octree, Structure
-from workflows.paper.voxels import Voxels, clustered, random_points, ray_points, scattered
+from benchmarks.paper.structures import BrickTree, DenseVoxels, FullBricks, HashMap, Octree, Structure
+from benchmarks.paper.voxels import Voxels, clustered, random_points, ray_points, scattered
 
 STRUCTURES = (DenseVoxels, HashMap, Octree, BrickTree, FullBricks)
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.paper.result import Request
 from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
@@ -32,7 +33,6 @@ from stages.io import scene
 from stages.io.field_file import load_renderer
 from workflows import asset
 from workflows.cli.resolve import Settings, read_preset, table_of
-from workflows.paper.result import Request
 
 PRESET = "paper-n4"
 CONVERGED_PSNR = 22.0  # less is not converged: such a row says nothing about the method

@@ -1,9 +1,9 @@
 """Train IBRNet or MVSNeRF over drawn scenes, and measure it on scenes that it was not trained on.
 
     python -m benchmarks.scenes SCENES --drawn 150 --size 128 --train 40 --val 0 --test 0
-    python -m benchmarks.pretraining train SCENES ibrnet workflows/paper/weights/ibrnet.safetensors --steps 4000
-    python -m benchmarks.pretraining train SCENES mvsnerf workflows/paper/weights/mvsnerf.safetensors --steps 5000
-    python -m benchmarks.pretraining measure SCENES ibrnet workflows/paper/weights/ibrnet.safetensors
+    python -m benchmarks.paper.pretraining train SCENES ibrnet benchmarks/paper/weights/ibrnet.safetensors --steps 4000
+    python -m benchmarks.paper.pretraining train SCENES mvsnerf benchmarks/paper/weights/mvsnerf.safetensors --steps 5000
+    python -m benchmarks.paper.pretraining measure SCENES ibrnet benchmarks/paper/weights/ibrnet.safetensors
 
 These made the weights of this package, with one thread.
 The last HELD_OUT scenes are those to measure on. `measure` renders views of them from the others without finetuning, and compares with a picture that is
@@ -21,10 +21,11 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks.paper.pretrained import NETWORKS, pretrained_network
+from benchmarks.paper.source_view_training import FAR, SETTINGS, SOURCES, WHITE, PosedImages, pretrain
+from benchmarks.paper.source_views import SourceViews, angles, bilinear, projected
 from benchmarks.scenes.drawn import MIDDLE
-from benchmarks.source_view_training import FAR, SETTINGS, SOURCES, WHITE, PosedImages, pretrain
 from efficientnerf.evaluation.metrics import psnr
-from efficientnerf.fields.source_views import SourceViews, angles, bilinear, projected
 from efficientnerf.geometry.cameras import Camera, pose_from_opengl, rays, resized
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import model
@@ -32,7 +33,6 @@ from efficientnerf.rendering.field_renderer import FieldRenderer
 from stages.evaluate.views import evenly_spaced, subsample, subsample_camera
 from stages.io.field_file import write_tensors
 from stages.io.png import read_png
-from workflows.paper.pretrained import NETWORKS, pretrained_network
 
 HELD_OUT = 10
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.paper.result import PAPER, Request, Result
+from benchmarks.paper.structures import BrickTree, DenseVoxels, FullBricks, HashMap, Octree, Structure
+from benchmarks.paper.voxels import Voxels, clustered, random_points, ray_points, scattered
 from pipeline.errors import StageFailed
 from stages.cores import use_all_cores
-from workflows.paper.result import PAPER, Request, Result
-from workflows.paper.structures import BrickTree, DenseVoxels, FullBricks, HashMap, Octree, Structure
-from workflows.paper.voxels import Voxels, clustered, random_points, ray_points, scattered
 
 KINDS: dict[str, type[Structure]] = {
     "dense voxels": DenseVoxels,

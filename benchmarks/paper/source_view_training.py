@@ -1,4 +1,4 @@
-"""Training of a network over many scenes (`efficientnerf.fields.ibrnet`, `efficientnerf.fields.mvsnerf`): one flat loop.
+"""Training of a network over many scenes (`benchmarks.paper.ibrnet`, `benchmarks.paper.mvsnerf`): one flat loop.
 
 A step renders rays of one photograph of a random scene from the other photographs that are nearest to it. Every second step takes uniform samples, the others
 coarse and pivotal ones without density voxels, so that the same weights serve both.
@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.fields.mvsnerf import VIEWS
-from efficientnerf.fields.source_views import SourceViews, source_views
+from benchmarks.paper.mvsnerf import VIEWS
+from benchmarks.paper.pretrained import SourceViewNetwork
+from benchmarks.paper.source_views import SourceViews, source_views
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model, render_rays
 from efficientnerf.training.losses import colour_losses
 from efficientnerf.training.optimiser import Adam, ParameterGroup
 from efficientnerf.training.settings import TrainSettings
-from workflows.paper.pretrained import SourceViewNetwork
 
 WHITE = (1.0, 1.0, 1.0)
 RAYS = 96

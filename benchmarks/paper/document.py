@@ -1,4 +1,4 @@
-"""`enerf paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, next to the paper's figures.
+"""`python -m benchmarks.paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, next to the paper's figures.
 
     OUT/table_N.md     for people
     OUT/table_N.json   {"table", "title", "scale", "columns", "rows", "notes", "hardware", "versions"}
@@ -9,22 +9,18 @@ from a Request to a Result, and TABLES says which; what trains keeps its runs un
 """
 
 import json
-import os
-import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
+from benchmarks.machine import hardware
+from benchmarks.paper import tables
+from benchmarks.paper.result import PAPER, Request, Result, Table
+from benchmarks.paper.table7 import structures
 from pipeline.errors import BadInput, UsageError
-from pipeline.executors.cores import affinity
 from pipeline.files import write_atomically
 from pipeline.manifest import tool_versions
 from stages.figures.plots import curve, with_palette
-from workflows.paper import tables
-from workflows.paper.result import PAPER, Request, Result, Table
-from workflows.paper.table7 import structures
 
 __all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
 
@@ -93,22 +89,6 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}"
     return str(value)
-
-
-def hardware(device: str) -> dict[str, Any]:
-    """The hardware of the measurement."""
-    name = platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
-    except OSError:
-        pass
-    found: dict[str, Any] = {"processor": name, "cores": affinity(), "device": device}
-    if hasattr(os, "getloadavg"):
-        found["load"] = [round(x, 2) for x in os.getloadavg()]
-    if device == "cuda":
-        found["device"] = torch.cuda.get_device_name()
-    return found
 
 
 def versions() -> dict[str, str]:

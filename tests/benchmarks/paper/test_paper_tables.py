@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from tests.workflows.paper.scenes import ball
-from workflows.cli.main import main
-from workflows.paper import document as paper
-from workflows.paper import pretrained, tables
-from workflows.paper.document import PAPER, Request
-from workflows.paper.pretrained import Finetuned
-from workflows.paper.runs import Figures, Row, _pace, settings_of
+from benchmarks.paper import document as paper
+from benchmarks.paper import pretrained, tables
+from benchmarks.paper.__main__ import main
+from benchmarks.paper.document import PAPER, Request
+from benchmarks.paper.pretrained import Finetuned
+from benchmarks.paper.runs import Figures, Row, _pace, settings_of
+from tests.benchmarks.paper.scenes import ball
 
 
 def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
@@ -80,7 +80,7 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
 
 def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, out = ball(tmp_path / "ball"), tmp_path / "out"
-    command = ["paper", "1", "--data", str(data), "--out", str(out), "--scale", "0.00001", "--device", "cpu", "--json"]
+    command = ["1", "--data", str(data), "--out", str(out), "--scale", "0.00001", "--device", "cpu", "--json"]
     assert main(command) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert events[-1]["event"] == "summary"

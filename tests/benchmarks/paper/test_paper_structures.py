@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from workflows.cli.main import main
-from workflows.paper import table7
+from benchmarks.paper import table7
+from benchmarks.paper.__main__ import main
 
 
 def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table7, "CACHINGS", 1)
     monkeypatch.setattr(table7, "QUERIES", 1)
-    assert main(["paper", "7", "--out", str(tmp_path), "--scale", "0.12", "--device", "cpu", "--quiet"]) == 0
+    assert main(["7", "--out", str(tmp_path), "--scale", "0.12", "--device", "cpu", "--quiet"]) == 0
     table = json.loads((tmp_path / "table_7.json").read_text())
     assert table["columns"] == list(table7.COLUMNS)
     cases = {row["voxels"] for row in table["rows"]}
@@ -31,6 +31,6 @@ def test_table_7_on_cuda(tmp_path: Path) -> None:
 
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device that torch can use")
-    assert main(["paper", "7", "--out", str(tmp_path), "--scale", "0.06", "--device", "cuda", "--quiet"]) == 0
+    assert main(["7", "--out", str(tmp_path), "--scale", "0.06", "--device", "cuda", "--quiet"]) == 0
     table = json.loads((tmp_path / "table_7.json").read_text())
     assert {row["voxels"] for row in table["rows"]} == {"64³, 20% clustered", "64³, 20% scattered"}

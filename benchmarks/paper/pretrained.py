@@ -1,4 +1,4 @@
-"""IBRNet and MVSNeRF of table 6: networks that `python -m benchmarks.pretraining` trained over drawn scenes, finetuned on a scene.
+"""IBRNet and MVSNeRF of table 6: networks that `python -m benchmarks.paper.pretraining` trained over drawn scenes, finetuned on a scene.
 
 Both samplings begin with the same weights, and differ in nothing else: uniform sampling takes UNIFORM even samples of the fine field, ours valid and pivotal
 ones, with density voxels that are swept before the first step. Finetunings are kept under OUT/runs as others are.
@@ -16,10 +16,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from benchmarks.paper.ibrnet import IbrNet
+from benchmarks.paper.mvsnerf import MvsNerf
+from benchmarks.paper.result import PAPER, Request, Result
+from benchmarks.paper.source_views import source_views
 from efficientnerf.evaluation.metrics import psnr
-from efficientnerf.fields.ibrnet import IbrNet
-from efficientnerf.fields.mvsnerf import MvsNerf
-from efficientnerf.fields.source_views import source_views
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model
 from efficientnerf.rendering.field_renderer import FieldRenderer
@@ -35,7 +36,6 @@ from stages.io.field_file import digest_of, read_tensors, space_of
 from stages.io.scene import View
 from stages.train.data import depth_range, pixels_of
 from workflows import asset
-from workflows.paper.result import PAPER, Request, Result
 
 SourceViewNetwork = IbrNet | MvsNerf
 NETWORKS: dict[str, type[IbrNet] | type[MvsNerf]] = {"ibrnet": IbrNet, "mvsnerf": MvsNerf}
@@ -174,7 +174,7 @@ def _psnr(renderer: FieldRenderer, folder: Path, views: tuple[View, ...], backgr
 def rows(request: Request, data: Sequence[Path], settings: dict[str, dict[str, Any]]) -> Result:
     """The rows of IBRNet and MVSNeRF: means over scenes and SEEDS; no columns."""
     if not all(weights_of(method).exists() for method in NETWORKS):
-        return Result([], [], [f"IBRNet and MVSNeRF are left out: python -m benchmarks.pretraining has made no weights in {WEIGHTS}."])
+        return Result([], [], [f"IBRNet and MVSNeRF are left out: python -m benchmarks.paper.pretraining has made no weights in {WEIGHTS}."])
     steps = finetuning_settings(settings["train"], "uniform", 0).iterations
     table: list[dict[str, Any]] = []
     curves: dict[str, tuple[Sequence[float], Sequence[float]]] = {}

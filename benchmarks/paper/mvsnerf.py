@@ -20,9 +20,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.fields.encoders import FeatureNetwork, VolumeNetwork
-from efficientnerf.fields.ibrnet import INITIAL, layers
-from efficientnerf.fields.source_views import SourceViewField, SourceViews, as_logit, bilinear, look_up, projected, trilinear
+from benchmarks.paper.encoders import FeatureNetwork, VolumeNetwork
+from benchmarks.paper.ibrnet import INITIAL, layers
+from benchmarks.paper.source_views import SourceViewField, SourceViews, as_logit, bilinear, look_up, projected, trilinear
 
 FEATURES = 8  # of a photograph
 ENCODING = 8  # of a voxel

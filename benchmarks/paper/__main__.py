@@ -1,18 +1,20 @@
-"""`enerf paper`."""
+"""`python -m benchmarks.paper`."""
 
+import sys
 from pathlib import Path
 
 import click
 
+from benchmarks.paper.document import Request, make
 from workflows.cli.device import resolve_device
+from workflows.cli.failures import report_failure
 from workflows.cli.options import device_option, folder_type, output_options
 from workflows.cli.output import closing, write_json
 from workflows.cli.progress import display
 from workflows.destination import check_folder
-from workflows.paper.document import Request, make
 
 
-@click.command()
+@click.command(context_settings={"max_content_width": 110})
 @click.argument("table", metavar="TABLE")
 @click.option("--data", type=folder_type, metavar="DIR", help="Data set, or folder of data sets (table 7 needs none).")
 @click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder of the table and its runs, which are resumed.")
@@ -32,3 +34,16 @@ def paper(table: str, data: Path | None, out: Path, scale: float, device: str | 
         write_json({"event": "summary", "ok": True, "table": table, "files": {kind: str(path) for kind, path in written.items()}, "exit_code": 0})
     elif not quiet:
         closing(*written["markdown"].read_text(encoding="utf-8").split("\n"))
+
+
+def main(arguments: list[str]) -> int:
+    """The exit code, as `enerf` has them."""
+    try:
+        paper.main(args=arguments, prog_name="python -m benchmarks.paper", standalone_mode=False)
+    except BaseException as error:
+        return report_failure(error, as_json="--json" in arguments, debug=False)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -23,8 +23,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.fields.encoders import FeatureNetwork
-from efficientnerf.fields.source_views import Lookup, SourceViewField, SourceViews, as_logit, bilinear, look_up
+from benchmarks.paper.encoders import FeatureNetwork
+from benchmarks.paper.source_views import Lookup, SourceViewField, SourceViews, as_logit, bilinear, look_up
 from efficientnerf.rendering.compositing import ray_of_sample
 
 FEATURES = 8

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.pretraining import warped
-from efficientnerf.fields.source_views import source_views
+from benchmarks.paper import pretrained
+from benchmarks.paper.pretrained import BOTH, CHECKS, Finetuned, SourceViewNetwork, finetuned
+from benchmarks.paper.pretraining import warped
+from benchmarks.paper.result import Request
+from benchmarks.paper.runs import Row, settings_of
+from benchmarks.paper.source_views import source_views
 from efficientnerf.geometry.spaces import BoundedSpace
+from tests.benchmarks.paper.scenes import ball
 from tests.efficientnerf.balls import cameras
-from tests.workflows.paper.scenes import ball
-from workflows.paper import pretrained
-from workflows.paper.pretrained import BOTH, CHECKS, Finetuned, SourceViewNetwork, finetuned
-from workflows.paper.result import Request
-from workflows.paper.runs import Row, settings_of
 
 
 def test_the_curve_says_when_a_level_is_reached() -> None:

@@ -9,10 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.source_view_training import SETTINGS, WHITE, PosedImages, pretrain
-from efficientnerf.fields.ibrnet import IbrNet, RayAttention, moments, normalised
-from efficientnerf.fields.mvsnerf import ENCODING, SIDE, MvsNerf, cost_volume
-from efficientnerf.fields.source_views import SourceViews, as_logit, bilinear, look_up, source_views, trilinear
+from benchmarks.paper.ibrnet import IbrNet, RayAttention, moments, normalised
+from benchmarks.paper.mvsnerf import ENCODING, SIDE, MvsNerf, cost_volume
+from benchmarks.paper.pretrained import SourceViewNetwork
+from benchmarks.paper.source_view_training import SETTINGS, WHITE, PosedImages, pretrain
+from benchmarks.paper.source_views import SourceViews, as_logit, bilinear, look_up, source_views, trilinear
 from efficientnerf.geometry.cameras import project, rays
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import model
@@ -20,7 +21,6 @@ from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.sampling.occupancy import sweep_cells
 from efficientnerf.training.occupancy_update import sweep_occupancy
 from tests.efficientnerf.balls import cameras, picture
-from workflows.paper.pretrained import SourceViewNetwork
 
 BOX = BoundedSpace(np.array([[-1.0, -0.8, -0.9], [1.0, 0.8, 0.9]]))
 CAMERAS = cameras(7, 16)

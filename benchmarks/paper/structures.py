@@ -6,7 +6,7 @@
     FullBricks   NerfTree as the paper prints it: a number for each coarse cell of 4^3 voxels, and bricks of 64 values, occupied or not
     BrickTree    NerfTree of occupied voxels only: bit masks of blocks of 4^3 coarse cells, of occupied cells, and values
 
-All are built by gathers, scatters and scans from one list of voxels (`workflows.paper.voxels`), of which all give the same 64-bit words back.
+All are built by gathers, scatters and scans from one list of voxels (`benchmarks.paper.voxels`), of which all give the same 64-bit words back.
 
 N voxels, M points.
 """
