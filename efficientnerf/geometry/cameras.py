@@ -30,6 +30,7 @@ MODELS: dict[str, tuple[str, ...]] = {
 # What a model with one focal length becomes when width and height are scaled by different amounts; the new parameters are zero.
 _TWO_FOCAL_LENGTHS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 _OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+POINTS_AT_ONCE = 2**16  # that are projected: more would go through memory in each of some twenty operations
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +181,19 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     Pixels are nan for what the camera cannot see wherever the image ends: points behind it, and points beyond the angle where the
     distortion model folds back (COLMAP would place those inside the image).
     """
-    local = (np.asarray(points, np.float64) - camera.centre) @ camera.world_from_camera[:3, :3]  # (N, 3)
+    points = np.asarray(points, np.float64)
+    if len(points) <= POINTS_AT_ONCE:
+        return _projected(camera, points)
+    pixels, depth = np.empty((len(points), 2)), np.empty(len(points))
+    for begin in range(0, len(points), POINTS_AT_ONCE):
+        part = slice(begin, begin + POINTS_AT_ONCE)
+        pixels[part], depth[part] = _projected(camera, points[part])
+    return pixels, depth
+
+
+def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`project`, of few points."""
+    local = (points - camera.centre) @ camera.world_from_camera[:3, :3]  # (N, 3)
     depth = local[:, 2]
     k = camera.intrinsics
     top, bottom = _radial_polynomials(camera)

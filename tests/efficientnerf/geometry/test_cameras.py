@@ -5,6 +5,7 @@ import pytest
 
 from efficientnerf.geometry.cameras import (
     MODELS,
+    POINTS_AT_ONCE,
     Camera,
     Similarity,
     opengl_from_pose,
@@ -49,6 +50,17 @@ def test_project_and_rays_are_inverse(model: str) -> None:
     again, depth = project(camera, origins + distance * directions)
     np.testing.assert_allclose(again, pixels, atol=1e-7)
     np.testing.assert_allclose(depth, distance[:, 0] * (directions @ camera.forward), rtol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_many_points_project_as_each_does(model: str) -> None:
+    camera, points = camera_of(model), np.random.default_rng(3).normal(size=(2 * POINTS_AT_ONCE + 3, 3))
+    pixels, depth = project(camera, points)
+    for part in (slice(0, 1000), slice(POINTS_AT_ONCE - 500, POINTS_AT_ONCE + 500), slice(-1000, None)):
+        own = project(camera, points[part])
+        np.testing.assert_allclose(pixels[part], own[0], rtol=1e-12)
+        np.testing.assert_allclose(depth[part], own[1], rtol=1e-12)
+    assert np.isnan(pixels).any(axis=1).sum() > 1000, "those behind the camera are not seen"
 
 
 @pytest.mark.parametrize("model", MODELS)
