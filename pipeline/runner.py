@@ -388,9 +388,10 @@ def _emit(report: Report | None, event: str, stage: str, **facts: Any) -> None:
 
 
 def _warn_of_stale_needs(run: Run, stages: Sequence[Stage], only: str, report: Report | None, hashes: Hashes) -> None:
-    """Name each stage before a single one that is not up to date."""
+    """Name each stage before a single one that is not up to date, but for what it needs and cannot run without."""
+    direct = next(stage.needs for stage in stages if stage.name == only)
     for decision in survey(needed_by(stages, only), run, hashes=hashes):
-        if not decision.fresh:
+        if not (decision.fresh or (decision.state == "missing" and decision.stage in direct)):
             text = f"{decision.stage} is {decision.state} ({decision.reason}); {only} uses what the run has. To bring all up to date: {run.how_to_resume()}"
             _emit(report, "warning", only, text=text, about=decision.stage, state=decision.state, reason=decision.reason)
 

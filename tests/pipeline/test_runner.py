@@ -96,8 +96,10 @@ def test_one_stage_alone_uses_what_there_is_and_warns_of_what_is_stale(run: Run)
 
 
 def test_one_stage_alone_without_what_it_needs(run: Run) -> None:
+    events = Events()
     with pytest.raises(BadInput, match="run the stages until count of "):
-        run_stages(run, STAGES, only="count")
+        run_stages(run, STAGES, only="count", report=events)
+    assert events.named("warning") == [], "that it uses what there is"
     run_stages(run, STAGES)
     for name in ("count.txt", "manifest.json"):
         (run.folder("count") / name).write_text("{")
