@@ -4,7 +4,6 @@ OpenCV finds them; its corners are up to two pixels off where a picture is blurr
 where half of the light between inside and outside is reached, of light that is linear, so that blur does not move it.
 """
 
-import contextlib
 import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,6 @@ from efficientnerf.rendering.colour import linear_from_srgb
 from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.cores import count_cores, in_order
-from stages.framing.circular_targets import count_targets
 from stages.framing.gps import in_metres
 from stages.framing.training_frame import estimated_up
 from stages.io.capture import Capture, Markers
@@ -36,7 +34,6 @@ LARGEST_ERROR = 0.03  # of a length: what is less sure is no scale
 TILT = 30.0  # degrees from the upward axis that the cameras suggest, up to which markers are taken to lie on the ground
 TIED = 1.5  # times as sure as their four corners are the nine tie points of a marker taken to be
 LEAST_MISS = 0.2  # px, of tie points: those of one marker agree by what they are made of
-FEW = 3  # photographs that are searched for other targets, of few; and targets in all, from which they are named
 MIN_CONTRAST = 0.02  # of linear light between inside and outside of an edge
 Seen = dict[tuple[str, int], np.ndarray]  # dictionary and number of a marker -> (4, 2) its corners
 Size = tuple[int, int]
@@ -53,7 +50,7 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     }
     views = {number: found for number, found in views.items() if len(found) >= MIN_VIEWS}
     if not views:
-        warn(f"no marker is seen by {MIN_VIEWS} photographs: lengths stay as they are. {_why_none(job, capture)}")
+        warn(f"no marker is seen by {MIN_VIEWS} photographs: lengths stay as they are. {_INSTEAD}")
         return capture
     fits = {number: fit_square([photo.camera for photo, _ in found], np.stack([corners for _, corners in found])) for number, found in views.items()}
     still = {number: fit for number, fit in fits.items() if fit.still}
@@ -85,21 +82,11 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     return replace(scaled, facts=scaled.facts | {"markers": facts}, markers_up=normal)
 
 
-def _why_none(job: Job, capture: Capture) -> str:
-    """What was looked for, or what there is instead, by a few of the photographs."""
-    some, counts = capture.photos[:: max(1, len(capture.photos) // max(FEW, len(capture.photos) // 10))], []
-    for photo in some:
-        job.safe_point()
-        with contextlib.suppress(UnreadableImage):  # reported where it is needed
-            counts.append(count_targets(cv2.cvtColor(read_photo(photo.image, MAX_SIDE).rgb, cv2.COLOR_RGB2GRAY)))
-    shown = sum(count > 0 for count in counts)
-    if sum(counts) < FEW or shown < 2:
-        return f"Dictionaries tried: {', '.join(DICTIONARIES)}."
-    found = f"Circular coded targets are, in {shown} of {len(counts)} photographs that were looked at; what these encode is not read."
-    return f"{found} Print markers (enerf board), or give the distance of two: enerf measure RUN --known-length PLACE PLACE LENGTH."
-
-
 _LINEAR = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
+_INSTEAD = (
+    f"Dictionaries tried: {', '.join(DICTIONARIES)}; circular targets are not read. Print markers (enerf board), or give the distance of two places:"
+    " enerf measure RUN --known-length PLACE PLACE LENGTH."
+)
 _REMEDY = "the cameras are wrong. Without --marker-size (poses.marker_size=off) they are not looked for."
 
 

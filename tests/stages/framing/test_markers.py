@@ -17,7 +17,6 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.png import write_png
 from stages.poses.settings import PosesSettings
 from tests.poses import looking_at
-from tests.stages.framing.made_targets import KINDS, photograph
 
 EDGE = 0.05  # metres, of a capture whose unit is UNIT metres
 UNIT = 0.31
@@ -124,18 +123,6 @@ def test_markers_of_two_sizes_are_refused_and_none_leave_lengths_without_a_unit(
     found, said = measured(tmp_path, capture_of(tmp_path, "APRILTAG_16h5"))
     assert not found.metric
     assert "no marker is seen" in said[0]
-    assert "Circular" not in said[0]
-
-
-def test_circular_targets_are_named_with_a_remedy(tmp_path: Path) -> None:
-    picture = np.dstack([photograph(KINDS["12 bits"], 12, 40)] * 3)
-    photos = []
-    for camera in cameras():
-        write_png(picture, tmp_path / camera.name)
-        photos.append(Photo(replace(camera, width=picture.shape[1], height=picture.shape[0]), tmp_path / camera.name))
-    found, said = measured(tmp_path, Capture("photographs", tuple(photos), None))
-    assert not found.metric
-    assert "Circular coded targets are, in 3 of 3 photographs" in said[0]
     assert "enerf board" in said[0]
     assert "--known-length" in said[0]
 
