@@ -5,8 +5,6 @@ import platform
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from pipeline.executors.cores import affinity
 
 STAT = Path("/proc/stat")
@@ -34,7 +32,11 @@ def busy_seconds() -> float | None:
 
 def hardware(device: str) -> dict[str, Any]:
     """The hardware of a measurement on "cpu" or "cuda"."""
-    found: dict[str, Any] = {"processor": processor(), "cores": affinity(), "device": torch.cuda.get_device_name() if device == "cuda" else device}
+    found: dict[str, Any] = {"processor": processor(), "cores": affinity(), "device": device}
+    if device == "cuda":
+        import torch  # programs that choose their cores do so before they load it
+
+        found["device"] = torch.cuda.get_device_name()
     if hasattr(os, "getloadavg"):
         found["load"] = [round(x, 2) for x in os.getloadavg()]
     return found
