@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.maths import bits_of, select, sqrt
 from efficientnerf.backends.numba.vector.memory import load, pointer, store
 
@@ -44,7 +44,7 @@ def _adam_range(value, grad, first, second, begin, end, beta1, beta2, scale1, sc
         grad[n] = zero
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def adam(value, grad, first, second, learning_rate, beta1, beta2, correction1, correction2, eps, skip_zeros):  # type: ignore[no-untyped-def]
     """A step of Adam in place, on flat float32 arrays of one length; clears the gradient.
 

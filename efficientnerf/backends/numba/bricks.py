@@ -5,12 +5,12 @@ B coarse cells with a row of brick^3 voxels each, N voxels.
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 RAYS = 256  # per task
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def threshold_and_dilate(
     cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], brick: int, dilate: int, row_of: np.ndarray, into: np.ndarray
 ) -> None:
@@ -49,7 +49,7 @@ def flat_indices(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int
                 n += 1
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def coordinates_of(flat, rows, columns, index):  # type: ignore[no-untyped-def]
     """Coordinates (N, 3) int32 of flat indices (N,) in a grid (., rows, columns)."""
     for n in numba.prange(len(flat)):
@@ -159,7 +159,7 @@ def weigh_voxels(  # type: ignore[no-untyped-def]
     return rows
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def greatest_around(indices: np.ndarray, greatest: np.ndarray, shape: tuple[int, int, int], brick: int, row_of: np.ndarray, out: np.ndarray) -> None:
     """The greatest weight of voxels (N, 3), and that of each and the 26 around it, to the columns of `out` (N, 2).
 
@@ -179,7 +179,7 @@ def greatest_around(indices: np.ndarray, greatest: np.ndarray, shape: tuple[int,
         out[n, 0], out[n, 1] = own, best
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def boxes_of_samples(origin, direction, first, start, extent, boxes, out):  # type: ignore[no-untyped-def]
     """Number of the first of the boxes (L, 2, 3) float64 that holds the middle of each sample, L where none does, to out (M,) int64; the rest as for
     `weigh_voxels`, in float32."""

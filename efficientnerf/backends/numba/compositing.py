@@ -8,7 +8,7 @@ R rays, N samples, K harmonics.
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.rendering.compositing import LARGEST_LOGIT
 
 BLOCK = 64  # rays per task
@@ -28,7 +28,7 @@ def activate_density(x, exponential):  # type: ignore[no-untyped-def]
     return max(z, np.float32(0)) + np.log1p(e), (one if z >= 0 else e) / (one + e)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def composite(raw, length, first, harmonics, background, exponential, colour, opacity, distortion, weight, rgb):  # type: ignore[no-untyped-def]
     """`efficientnerf.rendering.compositing.composite`, forward.
 
@@ -79,7 +79,7 @@ def _weight_grad(g0, g1, g2, rgb, g_distortion, w, length, middle, front_weight,
     return g0 * rgb[0] + g1 * rgb[1] + g2 * rgb[2] + g_distortion * distortion
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def composite_backward(  # type: ignore[no-untyped-def]
     raw, length, first, harmonics, background, exponential, weight, rgb,
     grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background,
@@ -135,7 +135,7 @@ def composite_backward(  # type: ignore[no-untyped-def]
                         grad_raw[n, 1 + channel * terms + k] = d * harmonics[r, k]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def scaled_by_distance(values, start, first, subject, out):  # type: ignore[no-untyped-def]
     """`efficientnerf.rendering.compositing.scaled_by_distance`; writes out (N, C)."""
     rays, one = len(subject), np.float32(1)

@@ -12,7 +12,7 @@ N samples, L levels, T table entries.
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corners
 from efficientnerf.backends.numba.vector.memory import pointer, touch
 
@@ -61,7 +61,7 @@ def _prefetch_level(entries, side, dense, start, mask, samples):  # type: ignore
             touch(entries, 2 * at)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def transpose_points(points, out):  # type: ignore[no-untyped-def]
     """points (N, 3) into out (3, N)."""
     count = len(points)
@@ -70,7 +70,7 @@ def transpose_points(points, out):  # type: ignore[no-untyped-def]
             out[0, n], out[1, n], out[2, n] = points[n, 0], points[n, 1], points[n, 2]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _encode(points, table, sides, dense, starts, mask, tasks, out):  # type: ignore[no-untyped-def]
     samples = points.shape[1]
     task_samples, entries = (samples + tasks - 1) // tasks, pointer(table)
@@ -106,7 +106,7 @@ def encode(points: np.ndarray, table: np.ndarray, sides: np.ndarray, dense: np.n
     _encode(points, table, sides, dense, starts, mask, tasks, out)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _encode_backward(points, grad, sides, dense, starts, mask, order, table_grad):  # type: ignore[no-untyped-def]
     samples, entries = points.shape[1], pointer(table_grad)
     for task in numba.prange(len(order)):

@@ -7,13 +7,13 @@ n vectors of D numbers, P centroids.
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 LANES = 64  # vectors that are compared together
 ALONE = 64 * LANES  # vectors that one thread has compared before others have begun
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def nearest_centroids(vectors_t, centroids, index, distance):  # type: ignore[no-untyped-def]
     """Index of the nearest centroid of each vector, the first of equals, and the squared distance to it.
 
@@ -54,7 +54,7 @@ def sum_clusters(vectors, index, total, count):  # type: ignore[no-untyped-def]
             total[index[n], d] += vectors[n, d]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-def]
     """Lower distance (n,) to the squared distance from `centroid` (D,) to each of vectors_t (D, n) where that is less."""
     count = vectors_t.shape[1]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.memory import hold, pointer
 from efficientnerf.backends.numba.vector.products import (
     LANES,
@@ -93,7 +93,7 @@ def _copy_block(x, row, column, height, width, out):  # type: ignore[no-untyped-
             out[i, j] = x[row + i, column + j]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _forward(inputs, first, middle, last, offset, element, chunk, activations, out):  # type: ignore[no-untyped-def]
     """activations  (L, N rounded up to blocks, W) of the hidden layers, for the backward pass; (L, 0, W) keeps none
     element      an empty array of the activations' type
@@ -159,7 +159,7 @@ def _grad_inputs(grad, words, transposed, weight, out, features):  # type: ignor
     product(Matrix(weight.data, weight.start, 1, weight.row), Rows(transposed, 0, BLOCK), out, words, features, BLOCK)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _backward(grad, inputs, first_back, middle_back, last_back, element, chunk, activations, grad_first, grad_middle, grad_last, grad_inputs):  # type: ignore[no-untyped-def]
     """grad_first (C, I rounded up to ROWS, W), grad_middle (C, L - 1, W, W), grad_last (C, V, W): of the weights for each chunk, the first transposed."""
     (features, samples), outputs = inputs.shape, grad.shape[1]

@@ -7,14 +7,14 @@ pseudorandom number generators"): each core draws its own, and any number of cor
 import numpy as np
 
 from efficientnerf.backends.numba.compositing import activate_density
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 BLOCK = 1024  # samples per task
 SCAN = 2**15  # voxels per task
 RANDOM_BITS = 21  # of a coordinate in its cell
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def cells_of_points(point, side, cell):  # type: ignore[no-untyped-def]
     """`efficientnerf.sampling.occupancy.cell_of` of points (N, 3) into cell (N,) int32."""
     for block in numba.prange((len(cell) + BLOCK - 1) // BLOCK):
@@ -25,7 +25,7 @@ def cells_of_points(point, side, cell):  # type: ignore[no-untyped-def]
             cell[n] = (i * side + j) * side + k
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def update_occupancy_maximum(cell, raw, exponential, flat, parts):  # type: ignore[no-untyped-def]
     """Raise voxels `flat` (D^3,) to the density of samples in cells (N,) int32, `raw` (N,) activated; masked voxels (-inf) stay masked.
 
@@ -52,7 +52,7 @@ def _random(seed, n):  # type: ignore[no-untyped-def]
     return z ^ (z >> np.uint64(31))
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def points_in_cells(cell, side, seed, point):  # type: ignore[no-untyped-def]
     """A random point (N, 3), grid coordinates, in each of the cells (N,) int32; seed uint64."""
     mask, unit = np.uint64(2**RANDOM_BITS - 1), np.float32(2.0**-RANDOM_BITS)
@@ -65,7 +65,7 @@ def points_in_cells(cell, side, seed, point):  # type: ignore[no-untyped-def]
             point[n, 2] = (np.float32(c % side) + np.float32((bits >> np.uint64(2 * RANDOM_BITS)) & mask) * unit) / size
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def random_cells(flat, threshold, seed, half, cell):  # type: ignore[no-untyped-def]
     """`efficientnerf.sampling.occupancy.random_cells`: the first `half` of cell (N,) int32 among all voxels `flat` (D^3,), the others among the valid.
 

@@ -5,7 +5,7 @@ The reference of the first, and the meaning of the letters, is `efficientnerf.ge
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.torch.rays import LEAST_SLANT
 from efficientnerf.geometry.ndc import BEYOND, Ndc, NdcRays
 from efficientnerf.rendering import harmonics
@@ -62,7 +62,7 @@ def world_normal(x, y, z, nx, ny, nz, ndc):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _warp_rays(origins, directions, ndc, start, along, begin, ds_dt, dlogz_dt):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(origins), block * BLOCK + BLOCK)):
@@ -82,7 +82,7 @@ def warp_rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> NdcRays:
     return NdcRays(start, along, begin, ds_dt, dlogz_dt)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _unwarp_hits(start, along, begin, ds_dt, dlogz_dt, distance, normal, ndc, out_distance, out_normal):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(start) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(start), block * BLOCK + BLOCK)):
@@ -108,7 +108,7 @@ def unwarp_hits(ndc: Ndc, warped: NdcRays, distance: np.ndarray, normal: np.ndar
     return out
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def pixel_rays(tables, stride, index, origins, directions, near, far):  # type: ignore[no-untyped-def]
     """`efficientnerf.backends.torch.rays.pixel_rays` into origins and directions (R, 3), near and far (R,)."""
     lookup, lens, knots, offsets, width, rotation, centre, all_near, all_far = tables
@@ -143,7 +143,7 @@ def pixel_rays(tables, stride, index, origins, directions, near, far):  # type: 
         near[n], far[n] = all_near[v] / slant, all_far[v] / slant
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def basis(directions, degree, out):  # type: ignore[no-untyped-def]
     """`efficientnerf.rendering.harmonics.basis` of unit directions (R, 3) into out (R, K); products in its order, so that both give the same bytes."""
     one, two, three, four, seven = np.float32(1), np.float32(2), np.float32(3), np.float32(4), np.float32(7)

@@ -28,7 +28,8 @@ from types import FunctionType
 from typing import Any
 
 import numba
-from numba.core import caching, dispatcher, event
+from numba.core import caching, codegen, dispatcher, event
+from numba.core.cpu_options import ParallelOptions
 
 try:
     import fcntl
@@ -41,6 +42,11 @@ from efficientnerf.backends.numba.bound import bound
 
 if os.environ.get("NUMBA_THREADING_LAYER_PRIORITY", LAYERS) == LAYERS:
     numba.config.THREADING_LAYER_PRIORITY = LAYERS.split()  # numba may have been imported before the environment said so
+
+
+# For `parallel`: loops over prange alone. With True each np.zeros, sum or comparison of arrays is a parallel loop too: a second to compile, and threads to wake
+# at every call. An object, for numba empties a dictionary as it reads it, and then means True.
+PRANGE: Any = ParallelOptions(dict.fromkeys(("comprehension", "reduction", "inplace_binop", "setitem", "numpy", "stencil", "fusion"), False))
 
 
 class KernelLocator(caching._CacheLocator):
@@ -271,10 +277,38 @@ class _Compilations(event.Listener):
             _locks.give_back(form)
 
 
+# numba's names of the two functions between one with a parallel loop and the loop's body
+WRAPPERS = ("parallelgufuncwrapper", "<numba.np.ufunc.wrappers._GufuncWrapper")
+
+
+def compile_wrappers_once(library: Any) -> None:
+    """Let numba's class of libraries of machine code make none of the wrappers of parallel loops alone, which nothing calls.
+
+    numba optimises and translates each of them with all that the loop calls, then the function that they are linked into: a fifth of the time of compiling.
+    Here they are linked into it as they are.
+    """
+    finalized, module = library._ensure_finalized, library._get_module_for_linking
+
+    def ensure_finalized(part: Any) -> None:
+        if not part.name.startswith(WRAPPERS):
+            finalized(part)
+
+    def module_for_linking(part: Any) -> Any:
+        if part.name.startswith(WRAPPERS) and not part._finalized:
+            for other in dict.fromkeys(part._linking_libraries):
+                part._reload_init.update(other._reload_init)
+                part._final_module.link_in(other._get_module_for_linking(), preserve=True)
+            part._finalized = True
+        return module(part)
+
+    library._ensure_finalized, library._get_module_for_linking = ensure_finalized, module_for_linking
+
+
 _locks = ByteLocks()
 _compilations = _Compilations()
 caching.CacheImpl._locator_classes.insert(0, KernelLocator)
 dispatcher.FunctionCache = KernelCache  # type: ignore[attr-defined]
 event.register("numba:compile", _compilations)
+compile_wrappers_once(codegen.JITCodeLibrary)
 
-__all__ = ["numba"]
+__all__ = ["PRANGE", "numba"]

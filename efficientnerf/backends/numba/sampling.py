@@ -13,7 +13,7 @@ import numpy as np
 from efficientnerf.backends.layout import RayBundle, SampleColumns
 from efficientnerf.backends.numba import intervals
 from efficientnerf.backends.numba.intervals import LANES
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.maths import lowest_bit
 from efficientnerf.backends.numba.vector.memory import pointer
 from efficientnerf.geometry.spaces import FARTHEST
@@ -63,7 +63,7 @@ def _init_lane(origins, directions, near, far, centre, half, contracted, r, stat
     state[intervals.T, lane], state[intervals.T_EXIT, lane] = t, t_exit
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, counts, visited, t_exit, starts):  # type: ignore[no-untyped-def]
     """March rays in groups of one per SIMD lane; writes the starts (R, max_intervals) of valid intervals, and of each ray how many are valid and visited."""
     (origins, directions, near, far, offset), (centre, half, contracted) = rays, box
@@ -93,7 +93,7 @@ def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, cou
             visited[r], t_exit[r] = np.int64(state[intervals.VISITED, r - begin]), state[intervals.T_EXIT, r - begin]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _write_valid(rays, box, step, t_exit, starts, first, start, extent, length, point):  # type: ignore[no-untyped-def]
     """Pack the intervals that `_find_valid` found."""
     (origins, directions, _near, _far, offset), (centre, half, contracted) = rays, box
@@ -131,7 +131,7 @@ def valid_samples(bundle: RayBundle, box: Box, step: float, max_intervals: int, 
     return first, start, extent, length, point, int(visited.sum())
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def select_pivots(weight, first, threshold, max_pivots, out):  # type: ignore[no-untyped-def]
     """`efficientnerf.sampling.pivotal.select_pivots` into out (N,) bool."""
     rays = len(first) - 1
@@ -156,7 +156,7 @@ def select_pivots(weight, first, threshold, max_pivots, out):  # type: ignore[no
                 out[n] = out[n] and keep
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _write_pivotal(rays, box, first, coarse, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point):  # type: ignore[no-untyped-def]
     """Divides the pivotal ones of the samples `coarse`."""
     (origins, directions, _near, _far, offset), (centre, half, contracted), (start, extent, length, _point) = rays, box, coarse

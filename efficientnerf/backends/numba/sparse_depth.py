@@ -5,7 +5,7 @@ The operations and their order are the reference's, so that both give the same b
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.torch.sparse_depth import LEAST_LIGHT
 
 BLOCK = 64  # rays per task
@@ -30,7 +30,7 @@ def _light(begin, end, weight, start, extent, distance, width):  # type: ignore[
     return np.float32(1) - before, ending
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def sparse_depth_errors(weight, start, extent, first, distance, on_support, width, out):  # type: ignore[no-untyped-def]
     """`efficientnerf.backends.torch.sparse_depth.sparse_depth_errors` into out (A,)."""
     zero, one, rays, before = np.float32(0), np.float32(1), len(distance), len(first) - 1 - len(distance)
@@ -47,7 +47,7 @@ def sparse_depth_errors(weight, start, extent, first, distance, on_support, widt
             out[a] = one - near
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def sparse_depth_errors_backward(grad, weight, start, extent, first, distance, on_support, width, grad_weight):  # type: ignore[no-untyped-def]
     """Gradient of the weights (N,), zero before, from grad (A,)."""
     zero, one, least, rays, before = np.float32(0), np.float32(1), np.float32(LEAST_LIGHT), len(distance), len(first) - 1 - len(distance)

@@ -9,7 +9,7 @@ N stored voxels, P entries of a palette, D numbers of a vector, T entries of a t
 import numpy as np
 
 from efficientnerf.backends.numba.entropy.walks import NEW, REPEAT_CONTEXTS, base_prediction, density_context, known_codes, near_voxels, newness
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -59,7 +59,7 @@ def _choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, cod
         beside[n] = 4 * (newness(best) if found == NEW else 0) + (situation & 3)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, first, begin, end):  # type: ignore[no-untyped-def]
     """Codes (N,) uint8 of one group. A palette is searched only where its cheapest entry, were it exact, would be better than a neighbour's.
 
@@ -89,7 +89,7 @@ def _choose_bases(values, weight, table, neighbours, bits, codes, channel, begin
         codes[3 * n + channel] = best
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def choose_bases(values, weight, table, neighbours, bits, codes, channel, first, begin, end):  # type: ignore[no-untyped-def]
     """Codes (3 N,) uint8 of one channel, of those between the nearest one, which is there before, and the one that is predicted.
 
@@ -114,7 +114,7 @@ def _choose_densities(opacity, weight, table, neighbours, bits, codes, begin, en
         codes[n] = best
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def choose_densities(opacity, weight, table, neighbours, bits, codes, first, begin, end):  # type: ignore[no-untyped-def]
     """Codes (N,) uint8.
 

@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.memory import advanced, pointer
 
 BITS = 14  # of probabilities
@@ -147,7 +147,7 @@ def fill_slots(frequency, shares, symbol):  # type: ignore[no-untyped-def]
             reached += count
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def encode(symbols, contexts, lanes, table, shares, words, begin, end, at, state, done, most):  # type: ignore[no-untyped-def]
     """Encode `most` symbols of each slice that are left, the last first, after `done` before; words are written from the end towards the beginning.
 

@@ -9,7 +9,7 @@ B bricks, N stored voxels, b voxels along a side of a brick, S slices, G groups 
 import numpy as np
 
 from efficientnerf.backends.numba.entropy.rans import coded, coded_bit, coded_few, digits, slice_of
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.memory import hold, pointer
 
 BIT_CONTEXTS = 128  # which of seven neighbours are set
@@ -62,7 +62,7 @@ def _walk_masks(coder, s, stored, before, border, inner, b, begin, end):  # type
     coder.at[s], coder.failed[s] = at, failed
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def walk_masks(coder, stored, before, border, inner, b, first, begin, end):  # type: ignore[no-untyped-def]
     """Voxels of bricks.
 
@@ -81,7 +81,7 @@ def _slot(p, q, r, b):  # type: ignore[no-untyped-def]
     return (p * b + q) * b + r
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def find_neighbours(index, before, b, neighbours, begin, end):  # type: ignore[no-untyped-def]
     """Voxels one step back along x, y and z from those of bricks `begin` to `end`: neighbours (N, 3) int32, -1 where none is stored.
 
@@ -143,7 +143,7 @@ def _walk_densities(coder, s, codes, neighbours, entries, begin, end):  # type: 
     coder.at[s], coder.failed[s] = at, failed
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def walk_densities(coder, codes, neighbours, entries, first, begin, end):  # type: ignore[no-untyped-def]
     """Codes (N,) uint8 into a table of so many entries.
 
@@ -193,7 +193,7 @@ def _walk_bases(coder, s, codes, neighbours, entries, begin, end):  # type: igno
     coder.at[s], coder.failed[s] = at, failed
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def walk_bases(coder, codes, neighbours, entries, first, begin, end):  # type: ignore[no-untyped-def]
     """Codes (N, 3) uint8: of each voxel green, then red, then blue, each of which has a lane.
 
@@ -256,7 +256,7 @@ def _walk_codes(coder, s, codes, neighbours, densities, quarters, shift, begin, 
     coder.at[s], coder.failed[s] = at, failed
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def walk_codes(coder, codes, neighbours, densities, quarters, shift, first, begin, end):  # type: ignore[no-untyped-def]
     """Codes (N, G) of the groups of each voxel, each of which has a lane: whether one is that of a neighbour, and which if not.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tasks import interleaved
 
 INSIDE = 1e-3  # barycentric coordinate from which a sample is inside a face, not on an edge that two faces share
@@ -81,7 +81,7 @@ def best_turns(places, begin, turns):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def overlapping(corners, begin, sizes, out):  # type: ignore[no-untyped-def]
     """Marks faces of charts that lie over a face before them in the same chart, at the centres of a grid of unit squares.
 

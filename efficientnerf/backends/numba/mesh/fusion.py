@@ -5,7 +5,7 @@ C cameras, H x W pixels, N voxels. A plane that a camera sees has an inverse dep
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tasks import interleaved
 
 W, A, B, LENGTH, CONFIDENCE, NEAREST = 0, 1, 2, 3, 4, 5  # channels of a pixel
@@ -78,7 +78,7 @@ def _plane(inverse, y, x, shares, whole, radius, band, even):  # type: ignore[no
     return w + (sw - a * su - b * sv) / n, a, b, full / (1.0 + 16.0 * error)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def fit_planes(depth, opacity, lens, begin, end, radius, band, even, out):  # type: ignore[no-untyped-def]
     """What each pixel of the rows `begin` to `end` of an image sees.
 
@@ -125,7 +125,7 @@ def _slope_of_plane(pixel, column, row, m, w, lens):  # type: ignore[no-untyped-
     return np.sqrt(q0 * q0 + q1 * q1 + q2 * q2) / w
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def fuse(first, low, voxel, depth_scale, wanted, planes, cameras, lenses, truncation, distance, weight):  # type: ignore[no-untyped-def]
     """Signed distance of voxels from the surface that views see, positive before it.
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def smooth_face_normals(normals, areas, neighbours, sharpness, out):  # type: ignore[no-untyped-def]
     """Of each face the mean of its own normal and those next to it, by area and exp(-difference^2 / (2 sharpness^2)).
 

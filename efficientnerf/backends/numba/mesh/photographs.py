@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 WEIGHT = 65535.0  # of a photograph that shows a texel best
 
@@ -90,7 +90,7 @@ def _catmull_rom(t):  # type: ignore[no-untyped-def]
     return first, second, one - first - second - last, last
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def observe(  # type: ignore[no-untyped-def]
     begin_face, end_face, texel_begin, share, faces, pixels, depth, facing, near, clear, photo, gain, reach, slack, beside, density, sharpness, seen, weights,
 ):  # fmt: skip
@@ -168,7 +168,7 @@ def observe(  # type: ignore[no-untyped-def]
                 seen[texel, place, channel] = np.uint8(min(max(value * gain[channel] + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def blend(begin, end, seen, weights, scale, prior, vote, trust, out, known):  # type: ignore[no-untyped-def]
     """One colour for each of the texels `begin` to `end` from what they have seen.
 

@@ -5,14 +5,14 @@ V vertices, K places for photographs of each, S offsets along the normal. A patc
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tasks import interleaved
 
 SIDE = 7
 AREA = SIDE * SIDE
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def choose(vertices, centres, grades, apart, widest, out):  # type: ignore[no-untyped-def]
     """The photographs that a vertex is compared in: the one that shows it best, then one after the other that which shows it well from elsewhere.
 
@@ -82,7 +82,7 @@ def _patch(pixels, start, width, height, x, y, along, across, size, out, row):  
     return np.sqrt(spread / AREA)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def agreement(begin, end, chosen, places, size, step, pixels, starts, shapes, noise, score, texture):  # type: ignore[no-untyped-def]
     """How well the photographs of each of the vertices `begin` to `end` agree at offsets along its normal.
 

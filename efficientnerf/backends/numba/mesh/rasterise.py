@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 CHUNK = 1024  # triangles that a thread takes at a time
 
@@ -37,7 +37,7 @@ def _triangle(x, y, inverse, number, top, bottom, width, near, shown):  # type: 
                     shown[row, column] = number
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def row_spans(pixels, depth, faces, begin, end, height, width, rows):  # type: ignore[no-untyped-def]
     """First and last + 1 of the rows of an image in which triangles `begin` to `end` may hold a pixel's centre, to `rows` (F, 2) int32; both zero for those
     that cannot, most of those smaller than a pixel. The other arguments are those of `rasterise`."""
@@ -54,7 +54,7 @@ def row_spans(pixels, depth, faces, begin, end, height, width, rows):  # type: i
                 rows[face, 0], rows[face, 1] = top, bottom
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def rasterise(pixels, depth, faces, rows, begin, end, bands, near, shown):  # type: ignore[no-untyped-def]
     """Lays triangles `begin` to `end` over an image; of those that a pixel's centre meets the nearest stays, of equally near ones the first.
 

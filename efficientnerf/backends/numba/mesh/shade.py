@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -48,7 +48,7 @@ def _add_texture(place, area, weight, texels, levels, out):  # type: ignore[no-u
     _texel(texels, levels[level, 0], levels[level, 1], levels[level, 2], u, v, out)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def shade(pixels, depth, faces, coordinates, texels, levels, colours, shown, begin, end, colour):  # type: ignore[no-untyped-def]
     """Rows `begin` to `end` of the image of a mesh: sums over the samples of each pixel, as many as are covered.
 

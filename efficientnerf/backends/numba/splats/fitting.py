@@ -9,7 +9,7 @@ Squares of gradients are averaged over a Gaussian's mean, scales, rotation, opac
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.projection import LANES, basis16, colour16, conic16, image16
 from efficientnerf.backends.numba.vector.maths import broadcast, maximum, minimum, select, sigmoid, sqrt
 from efficientnerf.backends.numba.vector.memory import load, pointer, store
@@ -130,7 +130,7 @@ def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):
         store(p, row, minimum(maximum(load(p, row, LANES), h.least), h.greatest))
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def step(values, moments, lens, degree, first, sums, h, errors):  # type: ignore[no-untyped-def]
     """A step of all Gaussians that have pairs, in place.
 

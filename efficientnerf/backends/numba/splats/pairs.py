@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.splat_layout import CONIC_A, CONIC_B, CONIC_C, DEPTH, HEIGHT, REACH, TILE, WIDTH, X, Y
 
 BLOCK = 4
@@ -105,7 +105,7 @@ def _across(ellipse, row, begin, end):  # type: ignore[no-untyped-def]
     return begin, end
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _masks(records, columns, rows, first, masks):  # type: ignore[no-untyped-def]
     """Blocks of each pair, (P,) by slot."""
     for task in numba.prange((len(records) + GAUSSIANS_A_TASK - 1) // GAUSSIANS_A_TASK):

@@ -10,7 +10,7 @@ harmonics, coefficient by coefficient.
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.view_colours import sh_basis
 from efficientnerf.backends.numba.vector.maths import arctangent, broadcast, exp, maximum, minimum, select, sigmoid, sqrt
 from efficientnerf.backends.numba.vector.memory import load, pointer, store
@@ -189,7 +189,7 @@ def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore
             out[first + lane, n] = row[16 * n + lane]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def project(values, lens, degree, out):  # type: ignore[no-untyped-def]
     """Records (16 G, RECORD) float32 of Gaussians (G, rows, 16), in the image of a lens."""
     groups, rows = values.shape[0], values.shape[1]

@@ -12,7 +12,7 @@ P pairs, N Gaussians, H x W pixels.
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.pairs import BLOCK, Pairs
 from efficientnerf.backends.numba.splats.projection import LANES
 from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each
@@ -104,7 +104,7 @@ def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, tran
                     transmittance[i, j] = place[48 + lane]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _render(begin, end, workers, task, records, pairs, longest, colour, transmittance):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
         met, place = np.empty(longest, np.int64), np.empty(64, np.float32)
@@ -197,7 +197,7 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):  # typ
     return total
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
         met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(80, np.float32)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from efficientnerf.backends.layout import EARLY_STOP
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, corner_weight, stored_voxel, tree_pointers
 from efficientnerf.backends.numba.tree.march import march_with
 from efficientnerf.backends.numba.tree_training.scalars import cast_like
@@ -45,7 +45,7 @@ def _raise(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-unty
 _march = march_with(_raise)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _max_contributions(cells, origins, directions, density, stop, transmittance, visibility):  # type: ignore[no-untyped-def]
     """Share p of the rays raises visibility[p]: no races, and a maximum does not depend on the order."""
     shares, rays = len(visibility), len(origins)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.packets.layout import ENDS, FLOATS, INTS, LANES, TILE_RAYS, WARPED
 from efficientnerf.backends.numba.tree.packets.pixels import Outputs, write_clear
 from efficientnerf.backends.numba.tree.packets.tiles import Scene, TileScratch, clear_block, render_tile
@@ -60,7 +60,7 @@ def beginning(threads: int) -> np.ndarray:
     return progress
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def render_batch(  # type: ignore[no-untyped-def]
     batch, background, packed, brick, view_colours, views, voxel, tile, threads, budget, progress,
     colour, opacity, depth, normal,
@@ -106,7 +106,7 @@ def render_batch(  # type: ignore[no-untyped-def]
     return progress[:threads, 0].min() >= (height + rows - 1) // rows * ((width + columns - 1) // columns)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def downsample(supersample, fine_colour, fine_opacity, fine_depth, fine_normal, colour, opacity, depth, normal):  # type: ignore[no-untyped-def]
     """Pixels from their supersample^2 rays: mean colour and opacity, median depth, mean normal.
 

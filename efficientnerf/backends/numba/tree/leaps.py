@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 CELLS_PER_CALL = 2**25
 
@@ -60,7 +60,7 @@ def leaps(occupied: np.ndarray) -> np.ndarray:
     return out
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _sweep_octants(occupied, out):  # type: ignore[no-untyped-def]
     nx, ny, nz = occupied.shape
     for octant in numba.prange(8):

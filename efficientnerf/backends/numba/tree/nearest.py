@@ -7,7 +7,7 @@ import numpy as np
 
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import EARLY_STOP
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.cells import cells_of, stored_voxel, tree_pointers
 from efficientnerf.backends.numba.tree.march import march_with
 from efficientnerf.backends.numba.tree.queries import normal_at
@@ -58,7 +58,7 @@ def _composite(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-
 _march = march_with(_composite)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _render(cells, density, sh, origins, directions, bases, colour, opacity, half_distance):  # type: ignore[no-untyped-def]
     rays, terms = len(origins), bases.shape[1]
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):

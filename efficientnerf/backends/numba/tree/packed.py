@@ -15,7 +15,7 @@ from efficientnerf.asset import cascades
 from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree, leaps
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packets.rows import MOST_SIDE, fill_rows, order_voxels
 from efficientnerf.rendering.harmonics import squared_slopes
@@ -104,7 +104,7 @@ def _block_has_density(owner, cells, brick, brick_index, voxel_index, values, de
                         dense[x + 1 + (p - 1) * brick, y + 1 + (q - 1) * brick, z + 1 + (r - 1) * brick] = 1
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _has_density(first, end, cells, brick, brick_index, voxel_index, values, out):  # type: ignore[no-untyped-def]
     """`Packed.has_density` of bricks first <= B < end into `out`, which is zero."""
     side = brick + 2

@@ -7,7 +7,7 @@ import numpy as np
 
 from efficientnerf.asset.cascades import cascades_of, point_cascades
 from efficientnerf.asset.tree import Cascade, NerfTree
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, tree_pointers
 from efficientnerf.rendering.harmonics import basis_numpy
 
@@ -89,7 +89,7 @@ def _colour(index, weight, sh, basis, out):  # type: ignore[no-untyped-def]
     out[2] = one / (one + np.exp(-b))
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
@@ -98,7 +98,7 @@ def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
             out[n] = _density(points[n, 0], points[n, 1], points[n, 2], tree, index, weight)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _distances_back(points, directions, optical, step, most, grid, density, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
@@ -117,7 +117,7 @@ def _distances_back(points, directions, optical, step, most, grid, density, out)
                 passed, after = passed + more, before
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
@@ -126,7 +126,7 @@ def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
             _normal(points[n, 0], points[n, 1], points[n, 2], tree, index, weight, out[n])
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _colours(points, bases, grid, density, sh, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)

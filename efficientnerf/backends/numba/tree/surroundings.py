@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
 from efficientnerf.backends.numba.tree.ray_batch import RayBatch, ray_at, ray_pointers
 from efficientnerf.backends.numba.vector.memory import pointer
@@ -32,7 +32,7 @@ def _lookup(x, y, z, environment, height, width, out):  # type: ignore[no-untype
         out[c] = upper * (1 - down) + lower * down
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _add(first, end, batch, environment, opacity, colour):  # type: ignore[no-untyped-def]
     height, width = environment.shape[:2]
     for row in numba.prange(first, end):

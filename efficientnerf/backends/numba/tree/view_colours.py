@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
 from efficientnerf.backends.numba.vector.halves import store_halves
 from efficientnerf.backends.numba.vector.maths import bits_of, broadcast, broadcast_like, fma, pack, sqrt, to_float32, unpack
@@ -242,7 +242,7 @@ def _colours(first, end, cascade, packed, direction, cone, density_scale, degree
             store_halves(out, 4 * n, pack((grid.density[n] * density_scale, r, g, b)))
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def compute_view_colours(first, end, cascade, packed, direction, cone, density_scale, degree, out):  # type: ignore[no-untyped-def]
     """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of voxels first <= n < end of the packed order, all of one
     cascade, into out (N + 1, 4) uint16, the bits of half floats.

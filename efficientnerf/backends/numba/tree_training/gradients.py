@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.layout import EARLY_STOP, RayTargets
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.cells import Cells, tree_pointers
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
@@ -265,7 +265,7 @@ def _work(task, cells, values, packets, targets, limits, numbers, gradient, begi
         chunk = fetch_add(pointer(task), 0, 1)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _forward_backward(workers, task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
         _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss)

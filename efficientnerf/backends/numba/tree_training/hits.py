@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.march import box_distances
 
 
@@ -29,7 +29,7 @@ def _comes_near(ox, oy, oz, dx, dy, dz, leap):  # type: ignore[no-untyped-def]
     return False
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def come_near(origins, directions, leap, found):  # type: ignore[no-untyped-def]
     """Whether rays (R, 3), unit directions and origins in coarse cells, meet a cell whose leap is 0, into `found` (R,) bool."""
     for n in numba.prange(len(origins)):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.layout import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION, Hyperparameters, Moments
-from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.cells import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
@@ -231,7 +231,7 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
         slab = fetch_add(pointer(task), 0, 1)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
         _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square)
@@ -250,7 +250,7 @@ def _copy_bins(task, records, values):  # type: ignore[no-untyped-def]
         slab = fetch_add(pointer(task), 0, 1)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _copy(workers, task, records, values):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
         _copy_bins(task, records, values)
