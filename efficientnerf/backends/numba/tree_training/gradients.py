@@ -215,8 +215,8 @@ def _sort_records(written, numbers, gradient, begin, base, out_numbers, out_grad
     """Puts records in order of their bins, and within these as they were, from `base` on; begin: counts by bins after a zero, afterwards where bins begin."""
     begin[0] = base
     for n in range(1, len(begin)):
+        place[n - 1] = begin[n - 1]
         begin[n] += begin[n - 1]
-    place[:] = begin[:-1]
     for n in range(written):
         v = numbers[n, 0]
         to = place[v >> BIN_BITS]
@@ -230,7 +230,9 @@ def _sort_records(written, numbers, gradient, begin, base, out_numbers, out_grad
 def _enlarged(values, count, room):  # type: ignore[no-untyped-def]
     """The first `count` rows in an array of `room`."""
     out = np.empty((room, values.shape[1]), values.dtype)
-    out[:count] = values[:count]
+    for n in range(count):  # an assignment of slices would take three seconds to compile: its error's text
+        for k in range(values.shape[1]):
+            out[n, k] = values[n, k]
     return out
 
 
@@ -239,13 +241,13 @@ def _work(task, cells, values, packets, targets, limits, numbers, gradient, begi
     """Takes chunks until none is left. Chunk u writes its records from u * capacity on, and to counts[u] how many there are; more than `capacity`: none."""
     first, density = packets.first, values.density
     tree, flat = tree_pointers(cells, density), pointer(values.sh)
-    arrays = packet_arrays(FIRST_BLOCKS, FIRST_SAMPLES, tree.cube, density)
+    arrays = packet_arrays(np.int64(FIRST_BLOCKS), np.int64(FIRST_SAMPLES), tree.cube, density)
     ends, left = np.empty(16, np.int64), np.empty(16, np.float64)
     own_numbers, own_gradient = np.empty((128 * CHUNK, 2), np.int32), np.empty((128 * CHUNK, 4), density.dtype)
     place = np.empty(begin.shape[1] - 1, np.int64)
     chunk = fetch_add(pointer(task), 0, 1)
     while chunk * CHUNK < len(first) - 1:
-        written, bins = 0, begin[chunk]
+        written, bins = np.int64(0), begin[chunk]
         bins[:] = 0
         for number in range(chunk * CHUNK, min(len(first) - 1, (chunk + 1) * CHUNK)):
             rays = first[number + 1] - first[number]
