@@ -12,6 +12,8 @@ ERROR = 9  # of them: the squared error where the Gaussian shows, times its weig
 PARTS = 6  # mean, scales, rotation, opacity, base colour, other harmonics
 VISITS, SQUARES, GRADIENTS = 0, 1, 1 + PARTS  # of a Gaussian's moments: steps taken; running means of squares; running means of gradients
 TILE = 16  # pixels along a side of one
+LANES = 16  # Gaussians of a group
+DRAWS = 2**16  # numbers of noise that are drawn at once; those of a step begin at any of them
 LOW_PASS = np.float32(0.3)  # square pixels that covariances in the image grow by
 LEAST_ALPHA, MOST_ALPHA = np.float32(1 / 255), np.float32(0.99)
 LEAST_TRANSMITTANCE = np.float32(1e-4)
@@ -56,6 +58,12 @@ class Rates(NamedTuple):
     # of_mean, of_square: (V,) float32: 1 / (1 - momentum^n) and 1 / (1 - decay^n) after n steps, the last for all beyond
     of_mean: np.ndarray
     of_square: np.ndarray
+    # What 3DGS-MCMC calls regularisers: `fade` is taken from the logits of what is in the image; its means are moved by normal noise, in longest standard
+    # deviations `noise` large: three times LANES numbers for a group, of `draws` (DRAWS + 3 LANES,) float32, from `shift` on
+    fade: np.float32
+    noise: np.float32
+    draws: np.ndarray
+    shift: int
     # least, greatest: logarithms of the scales
     least: np.float32
     greatest: np.float32

@@ -5,13 +5,14 @@ backgrounds at once. The order of the pictures and the rows are drawn by (seed, 
 threads.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from efficientnerf.backends.dispatch import splats_on
-from efficientnerf.backends.splat_layout import GRADIENTS, OPACITY, ROTATION, SCALE, TILE, Picture, Rates, SplatState
+from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, LANES, OPACITY, ROTATION, SCALE, TILE, Picture, Rates, SplatState
 from efficientnerf.geometry.cameras import Camera, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import LOG_SCALES, gaussians_from, lens_of, values_of
@@ -23,6 +24,8 @@ HARMONICS_PER_VIEW, LEAST_HARMONICS, MOST_HARMONICS = 1 / 320, 0.25, 0.75
 PIXELS = 2**18  # of a step
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
+NOISE = 0.05  # of `Rates`, at the first step
+FADE, MOST_FADE = 9.0, 0.015  # the same, over the number of steps, and at most
 LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS
 SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the error is, up to the most allowed
 # Of so many steps and more: when that is done, and the share, of the most transparent, that is left out for it each time. 3DGS-MCMC relocates dead ones.
@@ -71,7 +74,7 @@ def refitted(
     used = began = 0.0 if time_used is None else time_used()
     times, relocated = _divisions(steps)
     order: list[int] = []
-    harmonics = harmonics_rate(views)
+    harmonics, fade = harmonics_rate(views), min(FADE / max(steps, 1), MOST_FADE)
     for number in range(steps):
         if time_used is not None:
             used = time_used()
@@ -88,7 +91,7 @@ def refitted(
             fit = begin(*_divided(fit.state(), most, relocated), gaussians.degree, device)
         whole = views[order.pop()]
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
-        fit.step(lens_of(view.camera, whole.camera), _picture(view, background), rates_of(max(number / max(steps - 1, 1), used), harmonics))
+        fit.step(lens_of(view.camera, whole.camera), _picture(view, background), rates_of(max(number / max(steps - 1, 1), used), harmonics, fade, seed, number))
         if reached is not None:
             reached(number + 1)
     fitted = gaussians_from(fit.state().rows)
@@ -154,13 +157,22 @@ def harmonics_rate(views: Sequence[View]) -> float:
     return HARMONICS * min(max(HARMONICS_PER_VIEW * len(views), LEAST_HARMONICS), MOST_HARMONICS)
 
 
-def rates_of(done: float, harmonics: float) -> Rates:
-    """The rates when so much, 0 to 1, of the steps is done."""
+def rates_of(done: float, harmonics: float, fade: float = MOST_FADE, seed: int = 0, number: int = 0) -> Rates:
+    """The rates of a step, with its number, when so much, 0 to 1, of the steps is done; harmonics and fade: of the first step."""
     fall = LAST_RATE**done
     rates = np.asarray([MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, harmonics], np.float32) * np.float32(fall)
+    shift = int(np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 7, number])).integers(DRAWS))
     return Rates(
-        rates, np.float32(MOMENTUM), np.float32(DECAY), np.float32(EPSILON), _corrections(MOMENTUM), _corrections(DECAY), *map(np.float32, LOG_SCALES)
+        rates, np.float32(MOMENTUM), np.float32(DECAY), np.float32(EPSILON), _corrections(MOMENTUM), _corrections(DECAY), np.float32(fade * fall),
+        np.float32(NOISE * fall), _draws(seed), shift, *map(np.float32, LOG_SCALES),
     )  # fmt: skip
+
+
+@functools.cache
+def _draws(seed: int) -> np.ndarray:
+    """`Rates.draws`: the first come again at the end."""
+    drawn = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 8, 0])).standard_normal(DRAWS, np.float32)
+    return np.concatenate([drawn, drawn[: 3 * LANES]])
 
 
 def _corrections(decay: float) -> np.ndarray:

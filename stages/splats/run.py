@@ -38,7 +38,7 @@ from stages.splats.memory import most_gaussians, needed, needed_on_device
 from stages.splats.pictures import photographs, render_cameras, renders
 from stages.splats.settings import SplatsSettings
 
-PASSES, FEWEST_STEPS, MOST_STEPS = 16, 600, 3600  # docs/experiments/splats.md
+PASSES, FEWEST_STEPS, MOST_STEPS = 16, 900, 3600  # docs/experiments/splats.md
 MOST_TIMED_STEPS = 8000  # where a time budget may end them earlier
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
 

@@ -7,12 +7,13 @@ import pytest
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.splats import fitting, raster
-from efficientnerf.backends.numba.splats.fit import grouped, projected, ungrouped
+from efficientnerf.backends.numba.splats.fit import SplatFit, grouped, projected, ungrouped
 from efficientnerf.backends.numba.splats.projection import LANES, project
 from efficientnerf.backends.numba.vector.memory import pointer
-from efficientnerf.backends.splat_layout import RECORD, SUMS
+from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, OPACITY, RECORD, SCALE, SUMS, VISITS, SplatState
 from efficientnerf.geometry import cameras
 from efficientnerf.splats.gaussians import Gaussians
+from efficientnerf.splats.refit import MOST_FADE, NOISE, rates_of
 from efficientnerf.splats.rendering import gaussians_from, lens_of, render, values_of
 from tests.efficientnerf.splats_reference import (
     HEIGHT,
@@ -72,6 +73,43 @@ def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool) -> N
     for name, part, leaf in zip(("means", "scales", "rotations", "logits", "harmonics"), np.split(rows, [3, 6, 10, 11], axis=1), wanted, strict=True):
         gradient = leaf.grad.reshape(len(gaussians), -1).numpy()
         np.testing.assert_allclose(part, gradient, rtol=2e-3, atol=2e-4 * np.abs(gradient).max(), err_msg=name)
+
+
+def test_a_step_moves_means_by_noise_in_longest_deviations_and_takes_from_opacities() -> None:
+    """Of what is in the image; the noise of another step is another one, of the same step the same."""
+    gaussians = some_gaussians(count=500, degree=0)
+    unseen = np.arange(500) % 5 == 0
+    means = np.where(unseen[:, None], camera().centre - camera().forward, gaussians.means).astype(np.float32)
+    rows, lens, picture = values_of(replace(gaussians, means=means)), lens_of(camera()), picture_of(0, True)
+
+    def after(fade: float, noise: float, number: int) -> SplatState:
+        fit = SplatFit(rows, np.zeros((len(rows), GRADIENTS + rows.shape[1]), np.float32), 0)
+        fit.step(lens, picture, rates_of(0.0, 0.004, seed=3, number=number)._replace(fade=np.float32(fade), noise=np.float32(noise)))
+        return fit.state()
+
+    still, moments, _errors = after(0.0, 0.0, 1)
+    moved = moments[:, VISITS] > 0
+    assert 100 < moved.sum() <= 400
+    assert not moved[unseen].any()
+    by = after(MOST_FADE, NOISE, 1).rows - still
+    np.testing.assert_allclose(by[:, OPACITY], np.where(moved, -MOST_FADE, 0), atol=1e-5)
+    noise = by[moved, :3] / np.exp(rows[moved, SCALE : SCALE + 3]).max(axis=1, keepdims=True) / NOISE
+    assert abs(noise.mean()) < 0.15
+    assert noise.std() == pytest.approx(1, abs=0.1)
+    assert len(np.unique(noise.round(4))) > 0.9 * noise.size
+    np.testing.assert_array_equal(np.delete(by, [0, 1, 2, OPACITY], axis=1), 0)
+    np.testing.assert_array_equal(by[~moved], 0)
+    np.testing.assert_array_equal(after(MOST_FADE, NOISE, 1).rows - still, by)
+    assert (after(MOST_FADE, NOISE, 2).rows - still != by)[moved, :3].mean() > 0.9
+
+
+def test_noise_of_a_step_begins_at_any_of_the_numbers_that_are_drawn() -> None:
+    shifts = [rates_of(0.0, 0.004, number=number).shift for number in range(100)]
+    assert len(set(shifts)) > 95
+    assert max(shifts) > 0.9 * DRAWS
+    draws = rates_of(0.0, 0.004).draws
+    np.testing.assert_array_equal(draws[DRAWS:], draws[: 3 * LANES])
+    assert (draws != rates_of(0.0, 0.004, seed=1).draws).any()
 
 
 @pytest.mark.parametrize(("model", "extra"), LENSES)

@@ -13,7 +13,7 @@ from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.projection import LANES, basis16, colour16, conic16, image16
 from efficientnerf.backends.numba.vector.maths import broadcast, maximum, minimum, select, sigmoid, sqrt
 from efficientnerf.backends.numba.vector.memory import load, pointer, store
-from efficientnerf.backends.splat_layout import ERROR, GRADIENTS, HARMONICS, MEAN, OPACITY, PARTS, ROTATION, SCALE, SQUARES, SUMS
+from efficientnerf.backends.splat_layout import DRAWS, ERROR, GRADIENTS, HARMONICS, MEAN, OPACITY, PARTS, ROTATION, SCALE, SQUARES, SUMS
 
 GROUPS_A_TASK = 64
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -108,7 +108,7 @@ def _step_part(p, at, m, to, part, begin, end, rate, ahead, correction, moves, h
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):  # type: ignore[no-untyped-def]
+def _step_group(p, at, m, to, lens, degree, h, drawn, total, basis, gradient, correct):  # type: ignore[no-untyped-def]
     """A step of a group with such sums of its pairs."""
     moves = load(total, 16 * SUMS, LANES) > _HALF
     visits = load(m, to, LANES)
@@ -128,6 +128,12 @@ def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):
     for n in range(3):
         row = at + 16 * (SCALE + n)
         store(p, row, minimum(maximum(load(p, row, LANES), h.least), h.greatest))
+    row = at + 16 * OPACITY
+    store(p, row, load(p, row, LANES) - select(moves, h.fade, _NONE))
+    far = select(moves, longest * h.noise, _NONE)
+    for n in range(3):
+        row = at + 16 * (MEAN + n)
+        store(p, row, load(p, row, LANES) + far * load(pointer(h.draws), drawn + 16 * n, LANES))
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
@@ -147,8 +153,8 @@ def step(values, moments, lens, degree, first, sums, h, errors):  # type: ignore
         for group in range(task * GROUPS_A_TASK, min(groups, (task + 1) * GROUPS_A_TASK)):
             if _gather_sums(group, first, sums, total):
                 _step_group(
-                    p, np.int64(group) * rows * LANES, m, np.int64(group) * moments.shape[1] * LANES, lens, degree, h, pointer(total), pointer(basis),
-                    pointer(gradient), pointer(correct),
+                    p, np.int64(group) * rows * LANES, m, np.int64(group) * moments.shape[1] * LANES, lens, degree, h,
+                    (h.shift + np.int64(group) * 3 * LANES) % DRAWS, pointer(total), pointer(basis), pointer(gradient), pointer(correct),
                 )  # fmt: skip
                 for lane in range(LANES):
                     errors[group * LANES + lane] += total[16 * ERROR + lane]

@@ -22,6 +22,7 @@ from efficientnerf.backends.splat_layout import (
     DEPTH,
     HARMONICS,
     HEIGHT,
+    LANES,
     LEAST_ALPHA,
     LOW_PASS,
     MOST_LOG_SCALE,
@@ -37,7 +38,6 @@ from efficientnerf.backends.splat_layout import (
     Y,
 )  # fmt: skip
 
-LANES = 16  # Gaussians of a group
 GROUPS_A_TASK = 64
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 

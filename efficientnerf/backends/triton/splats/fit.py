@@ -64,6 +64,7 @@ class SplatFit:
     def __init__(self, rows: np.ndarray, moments: np.ndarray, degree: int, device: str = "cuda") -> None:
         self.values, self.moments, self._degree = columns_of(rows, device), columns_of(moments, device), degree
         self.errors = torch.zeros(len(rows), device=device)
+        self._draws: Tensor | None = None  # of all steps the same
 
     def step(self, lens: layout.Lens, picture: Picture, rates: Rates) -> None:
         """A step of all Gaussians that are in the image."""
@@ -73,10 +74,12 @@ class SplatFit:
         raster.fit_tiles[(len(pairs.begin) - 1, raster.BLOCKS)](
             records, pairs, Target(pixels, mask, tuple(picture.background.tolist())), sums, lens.width, lens.height, OVER_ALL=picture.over_all, num_warps=1
         )
-        numbers = rates.momentum, rates.decay, rates.epsilon, rates.least, rates.greatest
+        numbers = rates.momentum, rates.decay, rates.epsilon, rates.fade, rates.noise, rates.least, rates.greatest
+        if self._draws is None:
+            self._draws = to_device(torch.from_numpy(rates.draws), self.values.device)
         step[(blocks(len(tiles)),)](
             self.values, self.moments, self.errors, sums, tiles, len(tiles), lens_of(lens), Rule(tuple(rates.rates.tolist()), *map(float, numbers)),
-            FISHEYE=lens.fisheye, K=(self._degree + 1) ** 2, BLOCK=LANES,
+            self._draws, rates.shift, FISHEYE=lens.fisheye, K=(self._degree + 1) ** 2, BLOCK=LANES,
         )  # fmt: skip
 
     def state(self) -> SplatState:

@@ -15,6 +15,7 @@ from efficientnerf.backends.triton.splats.raster import ERROR, SUMS
 from efficientnerf.backends.triton.vectors import Vec3, sigmoid
 
 SQUARES, GRADIENTS = tl.constexpr(layout.SQUARES), tl.constexpr(layout.GRADIENTS)
+DRAWS, LANES = tl.constexpr(layout.DRAWS), tl.constexpr(layout.LANES)
 
 
 class Rule(NamedTuple):
@@ -24,6 +25,8 @@ class Rule(NamedTuple):
     momentum: Any
     decay: Any
     epsilon: Any
+    fade: Any
+    noise: Any
     least: Any
     greatest: Any
 
@@ -118,9 +121,12 @@ def _colour(walk, view, g, K: tl.constexpr):  # type: ignore[no-untyped-def]
             _descend(walk, HARMONICS + 3 * k + 2, basis * g.z, scale)
 
 
-@triton.jit(do_not_specialize=["count"])
-def step(values, moments, errors, sums, tiles, count, lens, rule, FISHEYE: tl.constexpr, K: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """A step of the Gaussians that are in tiles, and their part in the error added to `errors` (N,); sums (N, SUMS) are of `raster.fit_tiles`."""
+@triton.jit(do_not_specialize=["count", "shift"])
+def step(  # type: ignore[no-untyped-def]
+    values, moments, errors, sums, tiles, count, lens, rule, draws, shift, FISHEYE: tl.constexpr, K: tl.constexpr, BLOCK: tl.constexpr
+):  # fmt: skip
+    """A step of the Gaussians that are in tiles, and their part in the error added to `errors` (N,); sums (N, SUMS) are of `raster.fit_tiles`, draws and shift
+    of `splat_layout.Rates`."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     moves = (n < count) & (tl.load(tiles + n, n < count, other=0) > 0)
     visits = tl.load(moments + n, moves, other=0.0) + 1
@@ -137,7 +143,13 @@ def step(values, moments, errors, sums, tiles, count, lens, rule, FISHEYE: tl.co
     opacity = tl.load(values + count * OPACITY + n, moves, other=0.0)
     px, py = conic.a * vx + conic.b * vy, conic.b * vx + conic.c * vy
     by_mean = Vec3(px * p.by_x.x + py * p.by_y.x, px * p.by_x.y + py * p.by_y.y, px * p.by_x.z + py * p.by_y.z)
-    _descend_three(walk, MEAN, 0, by_mean, tl.maximum(p.scales.x, tl.maximum(p.scales.y, p.scales.z)) * rule.rates[0])
+    longest = tl.maximum(p.scales.x, tl.maximum(p.scales.y, p.scales.z))
+    mean = _descend_three(walk, MEAN, 0, by_mean, longest * rule.rates[0])
+    drawn = draws + (shift + n // LANES * (3 * LANES)) % DRAWS + n % LANES
+    far = longest * rule.noise
+    tl.store(walk.value + count * MEAN, mean.x + far * tl.load(drawn), moves)
+    tl.store(walk.value + count * (MEAN + 1), mean.y + far * tl.load(drawn + LANES), moves)
+    tl.store(walk.value + count * (MEAN + 2), mean.z + far * tl.load(drawn + 2 * LANES), moves)
     dx, dy = _by_covariance(conic, second)
     ax, ay = conic.ax, conic.ay
     by_scales = Vec3(dx.x * ax.x + dy.x * ay.x, dx.y * ax.y + dy.y * ay.y, dx.z * ax.z + dy.z * ay.z)
@@ -147,6 +159,7 @@ def step(values, moments, errors, sums, tiles, count, lens, rule, FISHEYE: tl.co
     tl.store(walk.value + count * (SCALE + 2), tl.minimum(tl.maximum(scales.z, rule.least), rule.greatest), moves)
     _turn(walk, p, dx, dy)
     by_logit = v * (1 - sigmoid(opacity))
-    _descend(walk, OPACITY, by_logit, _scale(walk, 3, by_logit * by_logit, rule.rates[3]))
+    logit = _descend(walk, OPACITY, by_logit, _scale(walk, 3, by_logit * by_logit, rule.rates[3]))
+    tl.store(walk.value + count * OPACITY, logit - rule.fade, moves)
     red, green, blue = tl.load(at + 6, moves, other=0.0), tl.load(at + 7, moves, other=0.0), tl.load(at + 8, moves, other=0.0)
     _colour(walk, view, Vec3(tl.where(colour.x > 0, red, 0.0), tl.where(colour.y > 0, green, 0.0), tl.where(colour.z > 0, blue, 0.0)), K)
