@@ -285,23 +285,34 @@ def compile_wrappers_once(library: Any) -> None:
     """Let numba's class of libraries of machine code make none of the wrappers of parallel loops alone, which nothing calls.
 
     numba optimises and translates each of them with all that the loop calls, then the function that they are linked into: a fifth of the time of compiling.
-    Here they are linked into it as they are.
+    Here they are linked into it as they are. One that is called itself, as of `numba.vectorize`, is still finished then.
     """
-    finalized, module = library._ensure_finalized, library._get_module_for_linking
+    add, module = library.add_linking_library, library._get_module_for_linking
 
-    def ensure_finalized(part: Any) -> None:
-        if not part.name.startswith(WRAPPERS):
-            finalized(part)
+    def is_unfinished(part: Any) -> bool:
+        return part.name.startswith(WRAPPERS) and not part._finalized
+
+    def add_linking_library(self: Any, part: Any) -> None:
+        if is_unfinished(part):
+            self._linking_libraries.append(part)
+        else:
+            add(self, part)
 
     def module_for_linking(part: Any) -> Any:
-        if part.name.startswith(WRAPPERS) and not part._finalized:
+        if not is_unfinished(part):
+            return module(part)
+        if part._shared_module is None:
             for other in dict.fromkeys(part._linking_libraries):
                 part._reload_init.update(other._reload_init)
                 part._final_module.link_in(other._get_module_for_linking(), preserve=True)
-            part._finalized = True
-        return module(part)
+            part._finalized = True  # for numba would finish it else
+            try:
+                module(part)
+            finally:
+                part._finalized = False
+        return part._shared_module
 
-    library._ensure_finalized, library._get_module_for_linking = ensure_finalized, module_for_linking
+    library.add_linking_library, library._get_module_for_linking = add_linking_library, module_for_linking
 
 
 _locks = ByteLocks()

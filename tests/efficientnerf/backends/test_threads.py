@@ -4,8 +4,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from numba.core import codegen
+
+from efficientnerf.backends.numba.runtime import PRANGE, WRAPPERS, numba
 
 ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
@@ -63,3 +68,29 @@ def test_the_number_of_threads_changes_no_byte() -> None:
     assert len(alone) > 10
     assert alone == together == in_queue == crowded
     assert int(large) - int(small) < 64 * A_THREAD
+
+
+def test_wrappers_of_parallel_loops_are_compiled_within_their_function_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that are called themselves, as of a parallel ufunc of another program, are compiled all the same."""
+    finished: list[str] = []
+    finish = codegen.JITCodeLibrary.finalize
+
+    def finalize(library: Any) -> None:
+        finished.append(library.name)
+        finish(library)
+
+    monkeypatch.setattr(codegen.JITCodeLibrary, "finalize", finalize)
+
+    @numba.njit(parallel=PRANGE)
+    def add_numbers(x):  # type: ignore[no-untyped-def]
+        room = np.zeros(len(x))  # no parallel loop
+        for i in numba.prange(len(x)):
+            room[i] = x[i] + i
+        return room.sum()
+
+    assert add_numbers(np.ones(10)) == 55
+    assert not [name for name in finished if name.startswith(WRAPPERS)]
+    assert len([name for name in finished if name.startswith("__numba_parfor_gufunc")]) == 1
+    doubled = numba.vectorize(["float64(float64)"], target="parallel")(lambda a: 2 * a)
+    assert doubled(np.ones(1000)).sum() == 2000
+    assert [name for name in finished if name.startswith(WRAPPERS)]
