@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 EARLY_STOP = 1e-3  # transmittance at which a ray may end
 MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
 MAX_VISITS = 60000  # steps that met a voxel, counted up to here
+WINDOW, SSIM_C1, SSIM_C2 = 4, 0.01**2, 0.03**2  # pixels along a side of what SSIM is taken over (Wang et al. 2004), and its constants
 MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
 
 
@@ -48,6 +49,9 @@ class RayTargets(NamedTuple):
     """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
 
         sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
+
+    and a patch of WINDOW x WINDOW rays adds  structure (1 - SSIM)  for each of its rays and channels (Wang et al. 2004, over the patch alone) to what gradients
+    are of.
     """
 
     colour: Any  # (R, 3) of the photograph, less the colour of what lies in front of the box
@@ -55,6 +59,7 @@ class RayTargets(NamedTuple):
     transmittance: Any  # (R,)   of what lies in front of the box
     opacity: Any  # (R,)   of the photograph
     opacity_weight: float  # of the opacity's error
+    structure: float = 0.0  # weight of 1 - SSIM
 
 
 class Moments(NamedTuple):

@@ -1,8 +1,9 @@
 """Gaussians fitted to pictures: Adam on means, scales, rotations, opacities and harmonics.
 
-A step takes a picture, or rows of a large one with about PIXELS. It minimises the squared error; for a picture with alpha, over all
-backgrounds at once. Noise on the means and opacities that fade, after 3DGS-MCMC, keep few photographs from being overfitted. The order of the
-pictures, the rows and the noise are drawn by (seed, step). On the CPU the same pictures give the same bytes, on any number of threads.
+A step takes a picture, or rows of a large one with about PIXELS. It minimises the squared error, for a picture with alpha over all backgrounds
+at once, and 1 - SSIM of windows of 4 x 4 pixels, which begin at another corner in each step. Noise on the means and opacities that fade, after
+3DGS-MCMC, keep few photographs from being overfitted. The order of the pictures, the rows, the corner and the noise are drawn by (seed, step).
+On the CPU the same pictures give the same bytes, on any number of threads.
 """
 
 import functools
@@ -12,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.backends.dispatch import splats_on
-from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, LANES, OPACITY, ROTATION, SCALE, TILE, Picture, Rates, SplatState
+from efficientnerf.backends.layout import WINDOW
+from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, LANES, OPACITY, ROTATION, SCALE, TILE, Lens, Picture, Rates, SplatState
 from efficientnerf.geometry.cameras import Camera, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import LOG_SCALES, gaussians_from, lens_of, values_of
@@ -21,6 +23,7 @@ from efficientnerf.splats.rendering import LOG_SCALES, gaussians_from, lens_of, 
 MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
 # Of photographs that of the harmonics is lower the fewer there are, as that of the asset is: view dependence is overfitted. Share for each, least and most.
 HARMONICS_PER_VIEW, LEAST_HARMONICS, MOST_HARMONICS = 1 / 320, 0.25, 0.75
+STRUCTURE = 0.005  # of `Picture`
 PIXELS = 2**18  # of a step
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
@@ -91,7 +94,9 @@ def refitted(
             fit = begin(*_divided(fit.state(), most, relocated), gaussians.degree, device)
         whole = views[order.pop()]
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
-        fit.step(lens_of(view.camera, whole.camera), _picture(view, background), rates_of(max(number / max(steps - 1, 1), used), harmonics, fade, seed, number))
+        corner = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 9, number])).integers(WINDOW, size=2)
+        lens, picture = _moved(lens_of(view.camera, whole.camera), _picture(view, background), *corner.tolist())
+        fit.step(lens, picture, rates_of(max(number / max(steps - 1, 1), used), harmonics, fade, seed, number))
         if reached is not None:
             reached(number + 1)
     fitted = gaussians_from(fit.state().rows)
@@ -147,7 +152,16 @@ def _picture(view: View, background: tuple[float, float, float] | None) -> Pictu
     if pixels.shape[2] == 3:
         pixels = np.concatenate([pixels, np.full((*pixels.shape[:2], 1), 255, np.uint8)], axis=2)
     mask = np.ones(pixels.shape[:2], np.uint8) if view.mask is None else np.ascontiguousarray(view.mask).view(np.uint8)
-    return Picture(np.ascontiguousarray(pixels), mask, over_all, np.asarray(background or (0, 0, 0), np.float32))
+    return Picture(np.ascontiguousarray(pixels), mask, over_all, np.asarray(background or (0, 0, 0), np.float32), np.float32(STRUCTURE))
+
+
+def _moved(lens: Lens, picture: Picture, right: int, down: int) -> tuple[Lens, Picture]:
+    """With so many more columns and rows before the first, which do not count."""
+    numbers = lens.numbers.copy()
+    numbers[2:4] += right, down
+    margin = (down, 0), (right, 0)
+    moved = picture._replace(pixels=np.pad(picture.pixels, (*margin, (0, 0))), mask=np.pad(picture.mask, margin))
+    return lens._replace(numbers=numbers, width=lens.width + right, height=lens.height + down), moved
 
 
 def harmonics_rate(views: Sequence[View]) -> float:

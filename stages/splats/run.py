@@ -38,7 +38,7 @@ from stages.splats.memory import most_gaussians, needed, needed_on_device
 from stages.splats.pictures import photographs, render_cameras, renders
 from stages.splats.settings import SplatsSettings
 
-PASSES, FEWEST_STEPS, MOST_STEPS = 16, 900, 3600  # docs/experiments/splats.md
+PASSES, STEPS_A_VIEW, FEWEST_STEPS, MOST_STEPS = 16, 30, 900, 3600  # docs/experiments/splats.md
 MOST_TIMED_STEPS = 8000  # where a time budget may end them earlier
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
 
@@ -69,7 +69,8 @@ def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
     steps = resolved(settings.iterations)
     if steps is None:
         most = MOST_STEPS if settings.time_budget == "off" else MOST_TIMED_STEPS
-        steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, most))
+        usual = max(math.ceil(PASSES * sum(pixels) / PIXELS), STEPS_A_VIEW * len(pixels))
+        steps = int(np.clip(usual, FEWEST_STEPS, most))
     return Budget(most_gaussians(settings, pixels), settings.sh_degree, steps, settings.seed)
 
 

@@ -29,8 +29,8 @@ class SplatsSettings:
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
     iterations: Count | Auto = setting(
         "auto",
-        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: sixteen passes over all pixels, 900 to 3600"
-        " steps; with time_budget up to 8000, if they fit.",
+        "Number of training steps, each on an image or on rows of a large one; 0: none; auto: sixteen passes over all pixels and 30"
+        " steps an image at least, 900 to 3600; with time_budget up to 8000, if they fit.",
         advanced=True,
     )
     time_budget: Seconds | Off = setting(
@@ -49,5 +49,5 @@ class SplatsSettings:
 
 
 STAGE = Stage(
-    name="splats", version=11, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"), uses_device=True,
+    name="splats", version=12, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"), uses_device=True,
 )  # fmt: skip

@@ -39,22 +39,38 @@ def tensors(gaussians: Gaussians) -> list[Tensor]:
     return [torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in parts]
 
 
-def picture_of(seed: int, over_all: bool) -> Picture:
+def picture_of(seed: int, over_all: bool, structure: float = 0.0) -> Picture:
     rng = np.random.default_rng(seed)
-    mask = (rng.random((HEIGHT, WIDTH)) < 0.8).astype(np.uint8)
-    return Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32))
+    mask = (rng.random((HEIGHT, WIDTH)) < 0.97).astype(np.uint8)
+    return Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32), np.float32(structure))
 
 
 def reference_loss(image: Tensor, light: Tensor, picture: Picture) -> Tensor:
-    """Half of the squared error."""
+    """Half of the squared error, and of the structural dissimilarity."""
     pixels, mask = torch.tensor(picture.pixels / 255.0), torch.tensor(picture.mask != 0)
     if not picture.over_all:
-        off = image + light[..., None] * torch.tensor(picture.background, dtype=image.dtype) - pixels[..., :3]
-        return 0.5 * (off.square().sum(-1) * mask).sum()
-    alpha = pixels[..., 3:]
-    more = light[..., None] - (1 - alpha)
-    off = image - pixels[..., :3] * alpha + 0.5 * more
-    return 0.5 * ((off.square() + more.square() / 12).sum(-1) * mask).sum()
+        background = torch.tensor(picture.background, dtype=image.dtype)
+        off, wanted = image + light[..., None] * background - pixels[..., :3], pixels[..., :3]
+        squares = off.square()
+    else:
+        alpha = pixels[..., 3:]
+        more = light[..., None] - (1 - alpha)
+        off, wanted = image - pixels[..., :3] * alpha + 0.5 * more, pixels[..., :3] * alpha + 0.5 * (1 - alpha)
+        squares = off.square() + more.square() / 12
+    return 0.5 * ((squares.sum(-1) * mask).sum() + float(picture.structure) * structural_dissimilarity(wanted + off, wanted, mask))
+
+
+def structural_dissimilarity(image: Tensor, wanted: Tensor, mask: Tensor) -> Tensor:
+    """Sum of 1 - SSIM over pixels and channels, of windows of 4 x 4 pixels next to each other that all count."""
+    total = image.new_zeros(())
+    for i in range(0, image.shape[0] - 3, 4):
+        for j in range(0, image.shape[1] - 3, 4):
+            if mask[i : i + 4, j : j + 4].all():
+                x, y = (part[i : i + 4, j : j + 4].reshape(16, 3) for part in (image, wanted))
+                covariance = ((x - x.mean(0)) * (y - y.mean(0))).mean(0)
+                means = (2 * x.mean(0) * y.mean(0) + 0.01**2) / (x.mean(0) ** 2 + y.mean(0) ** 2 + 0.01**2)
+                total = total + 16 * (1 - means * (2 * covariance + 0.03**2) / (x.var(0, False) + y.var(0, False) + 0.03**2)).sum()
+    return total
 
 
 def rotations_of(quaternions: Tensor) -> Tensor:

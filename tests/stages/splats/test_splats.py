@@ -179,18 +179,18 @@ def test_an_asset_alone_is_fitted_to_its_own_renders(inputs: dict[str, Path]) ->
 @pytest.mark.parametrize(
     ("pixels", "count", "steps"),
     [
-        ([480 * 360] * 31, 480 * 360, 900),
+        ([480 * 360] * 31, 480 * 360, 930),
         ([640_000] * 100, 300_000, 3600),
         ([800 * 533] * 292, 300_000, 3600),
         ([1008 * 756] * 40, 300_000, 1861),
-        ([40_000] * 100, 40_000, 900),
+        ([40_000] * 100, 40_000, 3000),
         ([], 300_000, 900),
     ],
 )
 def test_more_pixels_take_more_steps_and_bear_more_gaussians(pixels: list[int], count: int, steps: int) -> None:
     found = budget_of(SplatsSettings(), pixels)
     assert (found.count, found.steps) == (count, steps)
-    assert steps <= budget_of(SplatsSettings(time_budget=90.0), pixels).steps <= max(steps, 16 * sum(pixels) / 2**18 + 1)
+    assert steps <= budget_of(SplatsSettings(time_budget=90.0), pixels).steps <= max(steps, 16 * sum(pixels) / 2**18 + 1, 30 * len(pixels))
     assert budget_of(SplatsSettings(count=50, iterations=7), pixels).steps == 7
     assert budget_of(SplatsSettings(count=50, iterations=7), pixels).count == 50
 

@@ -12,10 +12,11 @@ P pairs, N Gaussians, H x W pixels.
 
 import numpy as np
 
+from efficientnerf.backends import layout
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.pairs import BLOCK, Pairs
 from efficientnerf.backends.numba.splats.projection import LANES
-from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each
+from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each, sum_lanes
 from efficientnerf.backends.numba.vector.memory import fetch_add, load, pointer, store
 from efficientnerf.backends.splat_layout import (
     ALPHA,
@@ -35,6 +36,7 @@ from efficientnerf.backends.splat_layout import (
 )  # fmt: skip
 
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_C1, _C2 = np.float32(layout.SSIM_C1), np.float32(layout.SSIM_C2)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -116,13 +118,30 @@ def _render(begin, end, workers, task, records, pairs, longest, colour, transmit
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _add_structure(p, picture):  # type: ignore[no-untyped-def]
+    """Half of the derivatives of a block's structural dissimilarity, added to those of its squared error; p: pointer to the `slopes` of `_residual`."""
+    share, by_light = _ONE / np.float32(LANES), load(p, 48, LANES)
+    for channel in range(3):
+        difference, y = load(p, 16 * channel, LANES), load(p, 80 + 16 * channel, LANES)
+        x = y + difference
+        of_x, of_y = sum_lanes(x) * share, sum_lanes(y) * share
+        x, y = x - of_x, y - of_y
+        means, deviations = of_x * of_x + of_y * of_y + _C1, sum_lanes(x * x + y * y) * share + _C2
+        same_mean, together = (_TWO * of_x * of_y + _C1) / means, (_TWO * sum_lanes(x * y) * share + _C2) / deviations
+        change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
+        store(p, 16 * channel, difference - change * picture.structure)
+        by_light = by_light - change * (picture.structure * (_HALF if picture.over_all else picture.background[channel]))
+    store(p, 48, by_light)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _residual(left, top, place, picture, slopes):  # type: ignore[no-untyped-def]
-    """The squared error of a block, whose colours and transmittances are in `place`; half of its derivatives by them into the first 64 of `slopes`, and each
-    pixel's error into the last 16.
+    """The squared error of a block, whose colours and transmittances are in `place`. Half of the derivatives of the error, structure included, go into the
+    first 64 of `slopes`, each pixel's squared error into the next 16, and the colours wanted, over grey or the background, into the last 48.
 
     Over all backgrounds b from 0 to 1, d + t b has the mean square (d + t / 2)^2 + t^2 / 12: d a channel's difference, t that of the transmittances.
     """
-    total = 0.0
+    total, all_count = 0.0, True
     height, width = picture.mask.shape
     for lane in range(16):
         i, j = top + lane // BLOCK, left + lane % BLOCK
@@ -130,21 +149,26 @@ def _residual(left, top, place, picture, slopes):  # type: ignore[no-untyped-def
         counts = i < height and j < width and picture.mask[i, j] != 0
         alpha = np.float32(picture.pixels[i, j, 3]) * np.float32(1 / 255) if counts and picture.over_all else _ONE
         for channel in range(3):
-            slope = _NONE
+            slope, over_ground = _NONE, _NONE
             if counts:
                 wanted = np.float32(picture.pixels[i, j, channel]) * np.float32(1 / 255) * alpha
                 if picture.over_all:
                     more = place[48 + lane] - (_ONE - alpha)
                     slope = place[16 * channel + lane] - wanted + _HALF * more
+                    over_ground = wanted + _HALF * (_ONE - alpha)
                     by_light += _HALF * slope + more * np.float32(1 / 12)
                     error += slope * slope + more * more * np.float32(1 / 12)
                 else:
                     slope = place[16 * channel + lane] + place[48 + lane] * picture.background[channel] - wanted
+                    over_ground = wanted
                     by_light += slope * picture.background[channel]
                     error += slope * slope
-            slopes[16 * channel + lane] = slope
+            slopes[16 * channel + lane], slopes[80 + 16 * channel + lane] = slope, over_ground
         slopes[48 + lane], slopes[64 + lane] = by_light, error
         total += float(error)
+        all_count &= counts
+    if all_count and picture.structure > _NONE:
+        _add_structure(pointer(slopes), picture)
     return total
 
 
@@ -200,7 +224,7 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):  # typ
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
-        met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(80, np.float32)
+        met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(128, np.float32)
         xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
         tile = begin + fetch_add(pointer(task), 0, 1)
         while tile < end:
@@ -219,6 +243,7 @@ def render_tiles(tiles: slice, records: np.ndarray, pairs: Pairs, colour: np.nda
 
 
 def fit_tiles(tiles: slice, records: np.ndarray, pairs: Pairs, picture: Picture, sums: np.ndarray, errors: np.ndarray) -> None:
-    """The squared error of each of some tiles in `errors` (T,) float64, and sums of half of its derivatives by their pairs in `sums` (P, SUMS) float32."""
+    """The squared error of each of some tiles in `errors` (T,) float64, and sums of half of its derivatives by their pairs, structure included, in `sums`
+    (P, SUMS) float32."""
     workers = min(numba.get_num_threads(), tiles.stop - tiles.start)
     _fit(tiles.start, tiles.stop, workers, np.zeros(1, np.int64), records, pairs, _longest(pairs), picture, sums, errors)

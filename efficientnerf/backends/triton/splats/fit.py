@@ -71,9 +71,10 @@ class SplatFit:
         records, tiles, pairs = projected(self.values, lens, self._degree)
         pixels, mask = (to_device(torch.tensor(part), self.values.device) for part in (picture.pixels, picture.mask))
         sums = torch.zeros(len(records), layout.SUMS, device=self.values.device)
+        target = Target(pixels, mask, tuple(picture.background.tolist()), float(picture.structure))
         raster.fit_tiles[(len(pairs.begin) - 1, raster.BLOCKS)](
-            records, pairs, Target(pixels, mask, tuple(picture.background.tolist())), sums, lens.width, lens.height, OVER_ALL=picture.over_all, num_warps=1
-        )
+            records, pairs, target, sums, lens.width, lens.height, OVER_ALL=picture.over_all, num_warps=1
+        )  # fmt: skip
         numbers = rates.momentum, rates.decay, rates.epsilon, rates.fade, rates.noise, rates.least, rates.greatest
         if self._draws is None:
             self._draws = to_device(torch.from_numpy(rates.draws), self.values.device)

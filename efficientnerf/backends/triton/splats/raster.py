@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import triton
 import triton.language as tl
 
+from efficientnerf.backends import layout as agreed
 from efficientnerf.backends import splat_layout as layout
 from efficientnerf.backends.triton.launch import INTERPRETED
 from efficientnerf.backends.triton.splats.projection import ALPHA, CONIC_A, CONIC_B, CONIC_C, LEAST_ALPHA, RECORD, RED, TILE, X, Y
@@ -20,7 +21,7 @@ from efficientnerf.backends.triton.vectors import Vec3
 
 SUMS, ERROR = tl.constexpr(layout.SUMS), tl.constexpr(layout.ERROR)
 MOST_ALPHA, LEAST_TRANSMITTANCE = tl.constexpr(float(layout.MOST_ALPHA)), tl.constexpr(float(layout.LEAST_TRANSMITTANCE))
-SIDE = tl.constexpr(8)
+C1, C2, SIDE, WINDOW = tl.constexpr(agreed.SSIM_C1), tl.constexpr(agreed.SSIM_C2), tl.constexpr(8), tl.constexpr(agreed.WINDOW)
 CHUNK = tl.constexpr(16 if INTERPRETED else 4)
 BLOCKS = (layout.TILE // SIDE.value) ** 2  # of a tile
 
@@ -34,11 +35,12 @@ class Pairs(NamedTuple):
 
 
 class Target(NamedTuple):
-    """`splat_layout.Picture`: pixels (H, W, 4) and mask (H, W) uint8, background: three floats."""
+    """`splat_layout.Picture`: pixels (H, W, 4) and mask (H, W) uint8, background: three floats, structure: a float."""
 
     pixels: Any
     mask: Any
     background: Any
+    structure: Any
 
 
 class Block(NamedTuple):
@@ -128,17 +130,49 @@ def render_tiles(records, pairs, colour, transmittance, width, height):  # type:
 
 @triton.jit
 def _slope(found, light, at, counts, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Half of the error's derivative by a channel, what that adds to the one by the transmittance, and the error."""
+    """Half of the squared error's derivative by a channel, what that adds to the one by the transmittance, the error, and the colour wanted, over grey or the
+    background."""
     wanted = tl.load(picture.pixels + 4 * at + CHANNEL, counts, other=0).to(tl.float32) * (1 / 255)
     if OVER_ALL:
         alpha = tl.load(picture.pixels + 4 * at + 3, counts, other=255).to(tl.float32) * (1 / 255)
         more = light - (1 - alpha)
         slope = tl.where(counts, found - wanted * alpha + 0.5 * more, 0.0)
         spread = tl.where(counts, more * (1 / 12), 0.0)
-        return slope, 0.5 * slope + spread, slope * slope + more * spread
+        return slope, 0.5 * slope + spread, slope * slope + more * spread, wanted * alpha + 0.5 * (1 - alpha)
     else:
         slope = tl.where(counts, found + light * picture.background[CHANNEL] - wanted, 0.0)
-        return slope, slope * picture.background[CHANNEL], slope * slope
+        return slope, slope * picture.background[CHANNEL], slope * slope, wanted
+
+
+@triton.jit
+def _window_mean(x):  # type: ignore[no-untyped-def]
+    """The mean over each pixel's window."""
+    windows = tl.reshape(x, (SIDE // WINDOW, WINDOW, SIDE // WINDOW, WINDOW))
+    mean = tl.sum(tl.sum(windows, 3, keep_dims=True), 1, keep_dims=True) / (WINDOW * WINDOW)
+    return tl.reshape(tl.broadcast_to(mean, (SIDE // WINDOW, WINDOW, SIDE // WINDOW, WINDOW)), (SIDE * SIDE,))
+
+
+@triton.jit
+def _structure_slope(difference, y, whole, weight):  # type: ignore[no-untyped-def]
+    """Half of the derivative of structural dissimilarity by a channel of pixels whose window is `whole`."""
+    x = y + difference
+    of_x, of_y = _window_mean(x), _window_mean(y)
+    x, y = x - of_x, y - of_y
+    means, deviations = of_x * of_x + of_y * of_y + C1, _window_mean(x * x + y * y) + C2
+    same_mean, together = (2 * of_x * of_y + C1) / means, (2 * _window_mean(x * y) + C2) / deviations
+    change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
+    return tl.where(whole, -weight * change, 0.0)
+
+
+@triton.jit
+def _slopes(found, light, at, counts, whole, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):  # type: ignore[no-untyped-def]
+    """`_slope` with structure: half of the derivatives by a channel and by the transmittance, and the squared error."""
+    slope, by_light, error, wanted = _slope(found, light, at, counts, picture, CHANNEL, OVER_ALL)
+    change = _structure_slope(slope, wanted, whole, picture.structure)
+    if OVER_ALL:
+        return slope + change, by_light + 0.5 * change, error
+    else:
+        return slope + change, by_light + change * picture.background[CHANNEL], error
 
 
 @triton.jit
@@ -160,14 +194,15 @@ def _pull(c, by, error, sums, v):  # type: ignore[no-untyped-def]
 
 @triton.jit(do_not_specialize=["width", "height"])
 def fit_tiles(records, pairs, picture, sums, width, height, OVER_ALL: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Sums of half of the squared error's derivatives added to `sums` (N, SUMS)."""
+    """Sums of half of the error's derivatives added to `sums` (N, SUMS)."""
     block = _block(pairs, width, height)
     found, light, last = _blend(records, pairs, block)
     at = block.i * width + block.j
     counts = block.inside & (tl.load(picture.mask + at, block.inside, other=0) != 0)
-    by_red, light_red, red_error = _slope(found.x, light, at, counts, picture, 0, OVER_ALL)
-    by_green, light_green, green_error = _slope(found.y, light, at, counts, picture, 1, OVER_ALL)
-    by_blue, light_blue, blue_error = _slope(found.z, light, at, counts, picture, 2, OVER_ALL)
+    whole = _window_mean(counts.to(tl.float32)) > 0.99
+    by_red, light_red, red_error = _slopes(found.x, light, at, counts, whole, picture, 0, OVER_ALL)
+    by_green, light_green, green_error = _slopes(found.y, light, at, counts, whole, picture, 1, OVER_ALL)
+    by_blue, light_blue, blue_error = _slopes(found.z, light, at, counts, whole, picture, 2, OVER_ALL)
     error = red_error + green_error + blue_error
     behind = found.x * by_red + found.y * by_green + found.z * by_blue + light * (light_red + light_green + light_blue)
     through = tl.where(block.inside, 1.0, 0.0)
