@@ -1,7 +1,8 @@
 """Which Gaussians a tile of an image shows, nearest first (numba).
 
 A tile is TILE x TILE pixels, of sixteen blocks of 4 x 4. A pair is a Gaussian in a tile: its mask has a bit for each block, row by row, that the Gaussian may
-touch: those that its ellipse meets, by rows of blocks. The pairs of a tile follow each other by depth; Gaussians of one depth by number.
+touch: those that its ellipse meets, by rows of blocks. The pairs of a tile follow each other by depth; Gaussians of one depth by number. They are found by
+parts of the Gaussians, and sorted by tiles, on all cores.
 
 P pairs, N Gaussians, T tiles.
 """
@@ -14,8 +15,9 @@ from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.splat_layout import CONIC_A, CONIC_B, CONIC_C, DEPTH, HEIGHT, REACH, TILE, WIDTH, X, Y
 
 BLOCK = 4
-GAUSSIANS_A_TASK = 1024
-DIGITS, DIGIT = 3, 11  # of the depths' bits, that they are sorted by
+PARTS = 64  # of the Gaussians, whose pairs are found at the same time
+TILES_A_TASK = 8
+DIGIT = 8  # bits of depths that are sorted at a time
 
 
 class Pairs(NamedTuple):
@@ -29,50 +31,46 @@ class Pairs(NamedTuple):
     columns: int  # tiles along a row
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _by_depth(records, order, other, counts):  # type: ignore[no-untyped-def]
-    """Numbers of the Gaussians in the image by depth, in `order` or `other`: radix sort, which keeps the order of equals."""
-    count = 0
-    for n in range(len(records)):
-        if records[n, WIDTH] > 0:
-            order[count] = n
-            count += 1
-    bits, base = records.view(np.uint32), (1 << DIGIT) - 1
-    for digit in range(DIGITS):
-        counts[:] = 0
-        shift = np.uint32(digit * DIGIT)
-        for m in range(count):
-            counts[1 + ((bits[order[m], DEPTH] >> shift) & base)] += 1
-        for n in range(1, len(counts)):
-            counts[n] += counts[n - 1]
-        for m in range(count):
-            key = (bits[order[m], DEPTH] >> shift) & base
-            other[counts[key]] = order[m]
-            counts[key] += 1
-        order, other = other, order
-    return order[:count]
-
-
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _range(centre, reach, side, end):  # type: ignore[no-untyped-def]
     """First cell of `side` pixels that centre - reach to centre + reach meets, and the one after the last."""
     return max(0, int((centre - reach) / side)), min(end, int((centre + reach) / side) + 1)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _count(records, columns, rows, begin, first):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _tiles_of(record, columns, rows):  # type: ignore[no-untyped-def]
+    """Tiles that a Gaussian may touch: the first column, the one after the last, and rows as well; none of one that is not in the image."""
+    if not record[WIDTH] > 0:
+        return 0, 0, 0, 0
     side = np.float32(TILE)
-    for n in range(len(records)):
-        first[n + 1] = first[n]
-        if records[n, WIDTH] > 0:
-            left, right = _range(records[n, X], records[n, WIDTH], side, columns)
-            top, bottom = _range(records[n, Y], records[n, HEIGHT], side, rows)
-            first[n + 1] += max(0, right - left) * max(0, bottom - top)
+    return *_range(record[X], record[WIDTH], side, columns), *_range(record[Y], record[HEIGHT], side, rows)
+
+
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
+def _count(records, columns, rows, length, counts, first):  # type: ignore[no-untyped-def]
+    """Pairs of each part of the Gaussians and tile in `counts` (PARTS, T), and of each Gaussian in `first` from 1 on."""
+    for part in numba.prange(PARTS):
+        for n in range(part * length, min(len(records), (part + 1) * length)):
+            left, right, top, bottom = _tiles_of(records[n], columns, rows)
+            first[n + 1] = max(0, right - left) * max(0, bottom - top)
             for row in range(top, bottom):
                 for column in range(left, right):
-                    begin[row * columns + column + 1] += 1
-    for tile in range(1, len(begin)):
-        begin[tile] += begin[tile - 1]
+                    counts[part, row * columns + column] += 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sum_up(counts, begin, first):  # type: ignore[no-untyped-def]
+    """Counts become the first pair of each part in each tile, those of a tile in the order of the parts."""
+    total = 0
+    for tile in range(counts.shape[1]):
+        begin[tile] = total
+        for part in range(PARTS):
+            count = counts[part, tile]
+            counts[part, tile] = total
+            total += count
+    begin[counts.shape[1]] = total
+    for n in range(1, len(first)):
+        first[n] += first[n - 1]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -105,52 +103,88 @@ def _across(ellipse, row, begin, end):  # type: ignore[no-untyped-def]
     return begin, end
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _masks(record, tiles, columns, rows, masks):  # type: ignore[no-untyped-def]
+    """Blocks of the tiles of a Gaussian, row by row."""
+    left, right, tile_row, _bottom = tiles
+    begin, end = _range(record[X], record[WIDTH], np.float32(BLOCK), 4 * columns)
+    top, bottom = _range(record[Y], record[HEIGHT], np.float32(BLOCK), 4 * rows)
+    ellipse = _ellipse(record)
+    for n in range(len(masks)):
+        masks[n] = 0
+    for row in range(top, bottom):
+        low, high = _across(ellipse, row, begin, end)
+        slot = (row // 4 - tile_row) * (right - left)
+        for column in range(low // 4, (high + 3) // 4):
+            bits = ((1 << min(high - 4 * column, 4)) - 1) & ~((1 << max(low - 4 * column, 0)) - 1)
+            masks[slot + column - left] |= bits << 4 * (row % 4)
+
+
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _masks(records, columns, rows, first, masks):  # type: ignore[no-untyped-def]
-    """Blocks of each pair, (P,) by slot."""
-    for task in numba.prange((len(records) + GAUSSIANS_A_TASK - 1) // GAUSSIANS_A_TASK):
-        side, block = np.float32(TILE), np.float32(BLOCK)
-        for n in range(task * GAUSSIANS_A_TASK, min(len(records), (task + 1) * GAUSSIANS_A_TASK)):
+def _fill(records, columns, rows, length, counts, first, masks, keys, gaussian):  # type: ignore[no-untyped-def]
+    """Masks (P,) by slot; and of the pairs of each tile, by number, `keys`, their depth's bits above their slot, and their Gaussians (P,)."""
+    bits = records.view(np.uint32)
+    for part in numba.prange(PARTS):
+        for n in range(part * length, min(len(records), (part + 1) * length)):
             if first[n + 1] > first[n]:
-                masks[first[n] : first[n + 1]] = 0
-                left, right = _range(records[n, X], records[n, WIDTH], side, columns)
-                begin, end = _range(records[n, X], records[n, WIDTH], block, 4 * columns)
-                top, bottom = _range(records[n, Y], records[n, HEIGHT], block, 4 * rows)
-                ellipse = _ellipse(records[n])
-                for row in range(top, bottom):
-                    low, high = _across(ellipse, row, begin, end)
-                    slot = first[n] + (row // 4 - top // 4) * (right - left)
-                    for column in range(low // 4, (high + 3) // 4):
-                        bits = ((1 << min(high - 4 * column, 4)) - 1) & ~((1 << max(low - 4 * column, 0)) - 1)
-                        masks[slot + column - left] |= bits << 4 * (row % 4)
+                tiles, slot = _tiles_of(records[n], columns, rows), first[n]
+                _masks(records[n], tiles, columns, rows, masks[slot : first[n + 1]])
+                for row in range(tiles[2], tiles[3]):
+                    for tile in range(row * columns + tiles[0], row * columns + tiles[1]):
+                        at = counts[part, tile]
+                        counts[part, tile] = at + 1
+                        gaussian[at], keys[at] = n, np.uint64(bits[n, DEPTH]) << np.uint64(32) | np.uint64(slot)
+                        slot += 1
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _fill(records, order, columns, rows, begin, first, masks, gaussian, mask, slot):  # type: ignore[no-untyped-def]
-    next_of, side = begin.copy(), np.float32(TILE)
-    for m in range(len(order)):
-        n = order[m]
-        left, right = _range(records[n, X], records[n, WIDTH], side, columns)
-        top, bottom = _range(records[n, Y], records[n, HEIGHT], side, rows)
-        number = first[n]
-        for row in range(top, bottom):
-            for column in range(left, right):
-                at = next_of[row * columns + column]
-                next_of[row * columns + column] += 1
-                gaussian[at], slot[at], mask[at] = n, number, masks[number]
-                number += 1
+def _sort(keys, other, gaussian, other_gaussian, counts):  # type: ignore[no-untyped-def]
+    """Radix sort by the upper half of the keys, which keeps the order of equals; returns whether the result is in the other arrays."""
+    swapped = False
+    for digit in range(32, 64, DIGIT):
+        shift, base = np.uint64(digit), np.uint64((1 << DIGIT) - 1)
+        counts[:] = 0
+        for n in range(len(keys)):
+            counts[np.int64(keys[n] >> shift & base) + 1] += 1
+        if counts[np.int64(keys[0] >> shift & base) + 1] == len(keys):
+            continue
+        for n in range(1, len(counts)):
+            counts[n] += counts[n - 1]
+        for n in range(len(keys)):
+            key = np.int64(keys[n] >> shift & base)
+            other[counts[key]], other_gaussian[counts[key]] = keys[n], gaussian[n]
+            counts[key] += 1
+        keys, other, gaussian, other_gaussian, swapped = other, keys, other_gaussian, gaussian, not swapped
+    return swapped
+
+
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
+def _by_depth(begin, masks, keys, gaussian, other, other_gaussian, mask, slot):  # type: ignore[no-untyped-def]
+    """The pairs of each tile by depth, nearest first; from `keys` and `gaussian`, whose halves `other` are."""
+    tiles = len(begin) - 1
+    for task in numba.prange((tiles + TILES_A_TASK - 1) // TILES_A_TASK):
+        counts = np.empty((1 << DIGIT) + 1, np.int64)
+        for tile in range(task * TILES_A_TASK, min(tiles, (task + 1) * TILES_A_TASK)):
+            low, high = begin[tile], begin[tile + 1]
+            if high > low and _sort(keys[low:high], other[low:high], gaussian[low:high], other_gaussian[low:high], counts):
+                for n in range(low, high):
+                    keys[n], gaussian[n] = other[n], other_gaussian[n]
+            for n in range(low, high):
+                slot[n] = np.int32(keys[n] & np.uint64(0xFFFFFFFF))
+                mask[n] = masks[slot[n]]
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _pairs(records, columns, rows):  # type: ignore[no-untyped-def]
-    count = len(records)
-    begin, first = np.zeros(columns * rows + 1, np.int64), np.zeros(count + 1, np.int64)
-    _count(records, columns, rows, begin, first)
-    order = _by_depth(records, np.empty(count, np.int32), np.empty(count, np.int32), np.empty((1 << DIGIT) + 1, np.int64))
-    masks = np.empty(begin[-1], np.int32)
-    _masks(records, columns, rows, first, masks)
-    gaussian, mask, slot = np.empty(begin[-1], np.int32), np.empty(begin[-1], np.int32), np.empty(begin[-1], np.int32)
-    _fill(records, order, columns, rows, begin, first, masks, gaussian, mask, slot)
+    length, tiles = (len(records) + PARTS - 1) // PARTS, columns * rows
+    counts, begin, first = np.zeros((PARTS, tiles), np.int64), np.empty(tiles + 1, np.int64), np.zeros(len(records) + 1, np.int64)
+    _count(records, columns, rows, length, counts, first)
+    _sum_up(counts, begin, first)
+    count = begin[tiles]
+    masks, mask, slot = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
+    keys, gaussian = np.empty(count, np.uint64), np.empty(count, np.int32)
+    _fill(records, columns, rows, length, counts, first, masks, keys, gaussian)
+    _by_depth(begin, masks, keys, gaussian, np.empty(count, np.uint64), np.empty(count, np.int32), mask, slot)
     return begin, gaussian, mask, slot, first
 
 
