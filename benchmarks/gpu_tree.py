@@ -11,6 +11,7 @@ from gpu_kernels import copy_rate, milliseconds, orbit
 
 from efficientnerf.asset.refinement import device as refinement
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
+from efficientnerf.asset.refinement.targets import STRUCTURE
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import Hyperparameters, Moments, RayTargets
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
@@ -60,7 +61,8 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
     first = np.arange(0, count + 1, PATCH_SIDE**2)
     host = RayTargets(*(rng.random(shape).astype(np.float32) for shape in ((count, 3), (count, 3), count, count)), 0.25)
     there = [torch.from_numpy(a).to(device) for a in (origins, directions, *host[:4])]
-    sent, targets = refinement.rays_in_voxels(tree, there[0], there[1]), RayTargets(*there[2:], 0.25)
+    sent, targets = refinement.rays_in_voxels(tree, there[0], there[1]), RayTargets(*there[2:], 0.25, STRUCTURE)
+    windows = refinement.windows_of(first, torch.device(device))
     grid, density, sh = refinement.values_of(tree, torch.device(device))
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp, none = torch.zeros(len(density), dtype=torch.int32, device=device), torch.zeros(0, device=device)
@@ -69,7 +71,7 @@ def tree_rates(device: str, tree: NerfTree, side: int, views: int, patches: int,
 
     def loss_gradients() -> None:
         outputs = tree_gradients.forward(grid, sent, density, sh)
-        _, *by = tree_gradients.loss_and_gradients(*outputs, targets)
+        _, *by = tree_gradients.loss_and_gradients(*outputs, targets, windows)
         tree_gradients.backward(grid, sent, density, sh, outputs, (by[0], by[1]), sums, stamp, 1)
 
     def step() -> None:  # of no length, so that every repetition does the same

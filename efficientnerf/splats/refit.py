@@ -34,7 +34,7 @@ SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the err
 # Of so many steps and more: when that is done, and the share, of the most transparent, that is left out for it each time. 3DGS-MCMC relocates dead ones.
 MANY_STEPS = 1200
 TIMED = 8  # steps after which it is known how many fit into the time allowed
-RELOCATE_AT, RELOCATED = (0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.64), 0.05
+RELOCATE_AT, RELOCATED = (0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.64), 0.02
 SPLIT_APART, SPLIT_SHARE = 0.5, 0.7  # of the longest standard deviation: distance of the halves from the middle, and their own
 
 

@@ -120,7 +120,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=25,
+    version=26,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=ByName("stages.bake.run:run"),

@@ -33,11 +33,22 @@ def loss_by_torch(colour: torch.Tensor, opacity: torch.Tensor, seen: RayTargets)
     return (off**2).sum(dim=1) + seen.opacity_weight * (opacity - matte) ** 2
 
 
+def dissimilarity_by_torch(colour: torch.Tensor, opacity: torch.Tensor, seen: RayTargets) -> torch.Tensor:
+    """Sum of 1 - SSIM over rays and channels, of patches of 16 rays each."""
+    truth, behind, gain = (torch.from_numpy(a).double() for a in (seen.colour, seen.background, seen.transmittance))
+    x, y = (part[: len(part) // 16 * 16].reshape(-1, 16, 3) for part in (gain[:, None] * (colour + (1 - opacity)[:, None] * behind), truth))
+    of_x, of_y = x.mean(1, keepdim=True), y.mean(1, keepdim=True)
+    covariance, variances = ((x - of_x) * (y - of_y)).mean(1), ((x - of_x) ** 2 + (y - of_y) ** 2).mean(1)
+    means = (2 * of_x * of_y + 0.01**2) / (of_x**2 + of_y**2 + 0.01**2)
+    return 16 * (1 - means[:, 0] * (2 * covariance + 0.03**2) / (variances + 0.03**2)).sum()
+
+
 def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets) -> tuple[np.ndarray, ...]:
-    """What `gradients` gives, by torch's reference in float64."""
+    """What `gradients` gives, by torch's reference in float64; patches are of 16 rays each."""
     density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
-    loss = loss_by_torch(*render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
-    loss.sum().backward()
+    rendered = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh)
+    loss = loss_by_torch(*rendered, seen)
+    (loss.sum() + seen.structure * dissimilarity_by_torch(*rendered, seen)).backward()
     return loss.detach().numpy(), density.grad.numpy(), sh.grad.numpy()
 
 
@@ -84,14 +95,14 @@ def ball_tree(side: int = 20) -> NerfTree:
 
 def device_gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str) -> tuple[np.ndarray, ...]:
     """`gradients` by Triton's kernels, and the voxels that rays meet are stamped."""
-    from efficientnerf.asset.refinement.device import rays_in_voxels, values_of
+    from efficientnerf.asset.refinement.device import rays_in_voxels, values_of, windows_of
     from efficientnerf.backends.triton import tree_gradients
 
     rays = rays_in_voxels(tree, *(torch.from_numpy(a).to(device) for a in (origins, directions)))
     grid, density, sh = values_of(tree, torch.device(device))
     outputs = tree_gradients.forward(grid, rays, density, sh)
-    sent = RayTargets(*(torch.from_numpy(np.asarray(part, np.float32)).to(device) for part in targets[:4]), targets.opacity_weight)
-    loss, *by = tree_gradients.loss_and_gradients(*outputs, sent)
+    sent = RayTargets(*(torch.from_numpy(np.asarray(part, np.float32)).to(device) for part in targets[:4]), targets.opacity_weight, targets.structure)
+    loss, *by = tree_gradients.loss_and_gradients(*outputs, sent, windows_of(packets_of(len(origins), 16), torch.device(device)))
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp = torch.zeros(len(density), dtype=torch.int32, device=device)
     tree_gradients.backward(grid, rays, density, sh, outputs, (by[0], by[1]), sums, stamp, 3)

@@ -12,14 +12,15 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset.refinement.error_map import INTERVAL, Drawn, ErrorMap
+from efficientnerf.asset.refinement.host import MAX_PACKET_ANGLE
 from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import Hyperparameters, Moments
+from efficientnerf.backends.layout import WINDOW, Hyperparameters, Moments
 from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
-from efficientnerf.backends.transfer import constant, to_host_async
+from efficientnerf.backends.transfer import constant, to_device, to_host_async
 from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
 from efficientnerf.backends.triton.tree_steps import Neighbours, step
@@ -61,11 +62,11 @@ class DeviceArrays:
                 arrived.synchronize()
             self.error = self.error_map.record(drawn, loss.numpy()) / 3
 
-    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters) -> Tensor:
-        """Losses (R,) of the rays before the step."""
+    def step(self, number: int, rays: Rays, wanted: Any, windows: Tensor | None, hyperparameters: Hyperparameters) -> Tensor:
+        """Losses (R,) of the rays before the step; windows: see `loss_and_gradients`."""
         values, sums = (self.values["density"], self.values["sh"]), (self.by_thickness, self.by_sh)
         outputs = tree_gradients.forward(self.grid, rays, *values)
-        loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
+        loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted, windows)
         tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number)
         step(self.grid, values, sums, self.moments, self.stamp, hyperparameters, self.neighbours, number=number, rays=len(loss))
         return loss
@@ -83,6 +84,11 @@ def voxels_beside(tree: NerfTree) -> np.ndarray:
         beyond = np.take(joined, np.arange(b) + (1 if upper else b - 1), axis=axis)
         found[index[index >= 0], face] = beyond[index >= 0]
     return found
+
+
+def windows_of(first: np.ndarray, device: torch.device) -> Tensor:
+    """(W,) first rays of the patches of which no ray is missing; first: as in `Patches`."""
+    return to_device(torch.from_numpy(first[:-1][np.diff(first) == WINDOW**2]), device)
 
 
 def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
@@ -113,7 +119,8 @@ def optimise(
         origins, directions, wanted = targets.of(drawn.patches.pixels)
         factor = fall(number)
         hyperparameters = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, total_variation=total_variation)
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters)
+        windows = windows_of(drawn.patches.first, origins.device) if patch_side == WINDOW and patches.angle <= MAX_PACKET_ANGLE else None
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, windows, hyperparameters)
         arrays.pending.append((drawn, *to_host_async(loss)))
         state.step = number
         arrays.record(0 if number == begin + 1 else LAG)

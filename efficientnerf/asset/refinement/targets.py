@@ -14,6 +14,7 @@ from efficientnerf.rendering import environment
 from efficientnerf.training.device_pixels import DevicePixels, on_host
 from efficientnerf.training.pixels import Pixels
 
+STRUCTURE = 0.005  # weight of 1 - SSIM; docs/experiments/tree-training.md
 MEAN, VARIANCE = 0.5, 0.25  # of a random background: mean of a channel, and the three channels' variances summed; see `Targets`
 
 Bundle = tuple[Any, Any, RayTargets]  # see `Targets.of`
@@ -75,7 +76,7 @@ class Targets:
         if self.background is None:
             lookup = environment.lookup_on if self.on_device else environment.lookup
             behind = lookup(self.environment, directions)
-            return origins, directions, RayTargets(truth * 1, behind, ones, ones * 1, 0.0)
+            return origins, directions, RayTargets(truth * 1, behind, ones, ones * 1, 0.0, STRUCTURE)
         has_alpha = colour.shape[1] == 4
         random_background = (has_alpha or self.reaches_infinity) and not constant_background
         behind = colour[:, :3] * 0
@@ -86,7 +87,7 @@ class Targets:
         if has_alpha:
             opacity = colour[:, 3] * 1
             truth = truth * opacity[:, None] + behind * (1 - opacity[:, None])
-        return origins, directions, RayTargets(truth * 1, behind, ones, opacity, VARIANCE if random_background else 0.0)
+        return origins, directions, RayTargets(truth * 1, behind, ones, opacity, VARIANCE if random_background else 0.0, STRUCTURE)
 
 
 def step_rng(seed: int, step: int) -> np.random.Generator:

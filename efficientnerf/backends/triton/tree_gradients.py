@@ -23,7 +23,7 @@ from torch import Tensor
 
 from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import RayTargets
+from efficientnerf.backends.layout import SSIM_C1, SSIM_C2, WINDOW, RayTargets
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import brick_arrays, device_cascades
@@ -268,13 +268,30 @@ def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor) -> tuple[Ten
     return colour, transmittance
 
 
-def loss_and_gradients(colour: Tensor, transmittance: Tensor, targets: RayTargets) -> tuple[Tensor, Tensor, Tensor]:
-    """Loss (R,) of rays, see `RayTargets`, and its gradients by their colour (R, 3) and opacity (R,)."""
+def loss_and_gradients(colour: Tensor, transmittance: Tensor, targets: RayTargets, windows: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Loss (R,) of rays, see `RayTargets`, and its gradients by their colour (R, 3) and opacity (R,), with those of the structure of windows whose first rays
+    are (W,)."""
     error = targets.transmittance[:, None] * (colour + transmittance[:, None] * targets.background) - targets.colour
     missing = 1 - transmittance - targets.opacity
-    by_colour = 2 * error * targets.transmittance[:, None]
+    slope = error if windows is None else error + targets.structure * _structure_slopes(error, targets.colour, windows)
+    by_colour = 2 * slope * targets.transmittance[:, None]
     by_opacity = 2 * targets.opacity_weight * missing - (by_colour * targets.background).sum(dim=1)
     return (error * error).sum(dim=1) + targets.opacity_weight * missing * missing, by_colour, by_opacity
+
+
+def _structure_slopes(error: Tensor, wanted: Tensor, windows: Tensor) -> Tensor:
+    """(R, 3) half of the derivatives of 1 - SSIM, summed over the rays of the windows, by their colours."""
+    rays = windows[:, None] + torch.arange(WINDOW * WINDOW, device=windows.device)
+    y = wanted[rays]
+    x = y + error[rays]
+    of_x, of_y = x.mean(1, keepdim=True), y.mean(1, keepdim=True)
+    x, y = x - of_x, y - of_y
+    means, deviations = of_x**2 + of_y**2 + SSIM_C1, (x * x + y * y).mean(1, keepdim=True) + SSIM_C2
+    same_mean, together = (2 * of_x * of_y + SSIM_C1) / means, (2 * (x * y).mean(1, keepdim=True) + SSIM_C2) / deviations
+    change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
+    slopes = torch.zeros_like(error)
+    slopes[rays.reshape(-1)] = -change.reshape(-1, 3)
+    return slopes
 
 
 def backward(

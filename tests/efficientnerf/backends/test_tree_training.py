@@ -38,7 +38,7 @@ def parallel_rays(tree: NerfTree, count: int, packet: int) -> tuple[np.ndarray, 
 def test_packets_of_parallel_rays_have_the_gradients_of_autograd(brick: int, degree: int, lookup: str, *, whole: bool) -> None:
     tree = random_cascades(1, brick=brick, degree=degree, lookup=lookup) if whole else random_tree(2, brick=brick, degree=degree, lookup=lookup)
     origins, directions = parallel_rays(tree, 150, 16)
-    seen = seen_at_random(150, 0.7)
+    seen = seen_at_random(150, 0.7)._replace(structure=0.3 * brick)
     loss, *found = gradients(tree, origins, directions, seen, packet=16)
     wanted, *wanted_by = gradients_by_autograd(replace(tree, environment=None), origins, directions, seen)
     np.testing.assert_allclose(loss, wanted, atol=3e-6)

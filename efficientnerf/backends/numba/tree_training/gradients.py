@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from efficientnerf.backends.layout import EARLY_STOP, RayTargets
+from efficientnerf.backends.layout import EARLY_STOP, SSIM_C1, SSIM_C2, WINDOW, RayTargets
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.cells import Cells, tree_pointers
 from efficientnerf.backends.numba.tree_training.packets import (
@@ -71,6 +71,14 @@ class Limits(NamedTuple):
 
     stop: float
     capacity: int
+
+
+class RayScratch(NamedTuple):
+    """Of the rays of a packet: the end of each one's samples, the light left behind them, and half of the loss's derivatives by its colour."""
+
+    ends: np.ndarray
+    left: np.ndarray
+    slopes: np.ndarray
 
 
 class RecordBuffer:
@@ -139,8 +147,8 @@ def _shade(n, packet):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-untyped-def]
-    """Loss of a ray whose samples are `begin` to `end`, behind which so much light is left; adds its gradients to the slots."""
-    light, shade, kind = packet.light, packet.shade, targets.colour.dtype.type
+    """Differences of a ray's colour from its target; its samples are `begin` to `end`, behind which so much light is left."""
+    light = packet.light
     red, green, blue = 0.0, 0.0, 0.0
     for n in range(begin, end):
         r, g, b = _shade(n, packet)
@@ -148,14 +156,47 @@ def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-u
         red += weight * r
         green += weight * g
         blue += weight * b
+    arriving, behind = np.float64(targets.transmittance[ray]), targets.background[ray]
+    return (
+        arriving * (red + left * np.float64(behind[0])) - targets.colour[ray, 0],
+        arriving * (green + left * np.float64(behind[1])) - targets.colour[ray, 1],
+        arriving * (blue + left * np.float64(behind[2])) - targets.colour[ray, 2],
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_structure(begin, end, targets, slopes):  # type: ignore[no-untyped-def]
+    """Half of the derivatives of structural dissimilarity by the colours of a patch, added to their differences `slopes` (16, 3)."""
+    share = 1 / (end - begin)
+    for channel in range(3):
+        of_x, of_y = 0.0, 0.0
+        for ray in range(begin, end):
+            y = np.float64(targets.colour[ray, channel])
+            of_x += share * (y + slopes[ray - begin, channel])
+            of_y += share * y
+        squares, products = 0.0, 0.0
+        for ray in range(begin, end):
+            y = np.float64(targets.colour[ray, channel])
+            x, y = y + slopes[ray - begin, channel] - of_x, y - of_y
+            squares += share * (x * x + y * y)
+            products += share * x * y
+        means, deviations = of_x * of_x + of_y * of_y + SSIM_C1, squares + SSIM_C2
+        same_mean, together = (2 * of_x * of_y + SSIM_C1) / means, (2 * products + SSIM_C2) / deviations
+        for ray in range(begin, end):
+            y = np.float64(targets.colour[ray, channel])
+            x, y = y + slopes[ray - begin, channel] - of_x, y - of_y
+            change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
+            slopes[ray - begin, channel] -= targets.structure * change
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pull_ray(ray, begin, end, left, slopes, targets, packet):  # type: ignore[no-untyped-def]
+    """Adds a ray's gradients to the slots; slopes: half of the loss's derivatives by its colour."""
+    light, shade, kind = packet.light, packet.shade, targets.colour.dtype.type
     arriving = np.float64(targets.transmittance[ray])
     behind = np.float64(targets.background[ray, 0]), np.float64(targets.background[ray, 1]), np.float64(targets.background[ray, 2])
-    by_red = arriving * (red + left * behind[0]) - targets.colour[ray, 0]
-    by_green = arriving * (green + left * behind[1]) - targets.colour[ray, 1]
-    by_blue = arriving * (blue + left * behind[2]) - targets.colour[ray, 2]
     missing = 1 - left - np.float64(targets.opacity[ray])
-    loss = by_red * by_red + by_green * by_green + by_blue * by_blue + targets.opacity_weight * missing * missing
-    by_red, by_green, by_blue = 2 * arriving * by_red, 2 * arriving * by_green, 2 * arriving * by_blue
+    by_red, by_green, by_blue = 2 * arriving * slopes[0], 2 * arriving * slopes[1], 2 * arriving * slopes[2]
     by_left = (2 * targets.opacity_weight * missing - by_red * behind[0] - by_green * behind[1] - by_blue * behind[2]) * left
     # Back to front; red, green and blue become the colour behind the sample.
     red, green, blue = 0.0, 0.0, 0.0
@@ -169,18 +210,22 @@ def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-u
         scale = weight * inverse
         by_logits = kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)), kind(by_blue * scale * b * (1 - b))
         spread_corners(packet.gradient, packet.slots, packet.weights, 8 * n, 1, (*by_logits, kind(by_depth * light[3 * n + 2])))
-    return loss
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _trace_packet(number, packets, targets, limits, sh, tree, arrays, ends, left, loss):  # type: ignore[no-untyped-def]
+def _ray_scratch(count):  # type: ignore[no-untyped-def]
+    return RayScratch(np.empty(count, np.int64), np.empty(count, np.float64), np.empty((count, 3), np.float64))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _trace_packet(number, packets, targets, limits, sh, tree, arrays, rays, loss):  # type: ignore[no-untyped-def]
     """Losses of the rays of a packet and the gradients of its slots; returns how many voxels it met, or -1 where there is no room.
 
-    sh          pointer
-    ends, left  (rays of the packet,) scratch
+    sh    pointer
+    rays  RayScratch of as many as the packet has, or more
     """
     begin, end, origins, directions, basis = packets.first[number], packets.first[number + 1], packets.origins, packets.directions, packets.bases[number]
-    packet, terms = packet_pointers(arrays), len(basis)
+    packet, terms, (ends, left, slopes) = packet_pointers(arrays), len(basis), rays
     clear(packet, tree)
     way = clear_distance(begin, end, origins, directions, tree)
     for ray in range(begin, end):
@@ -191,8 +236,18 @@ def _trace_packet(number, packets, targets, limits, sh, tree, arrays, ends, left
     found = _fill_colours(basis, terms, sh, tree, packet)
     at = 0
     for ray in range(begin, end):
-        loss[ray] = _composite_ray(ray, at, ends[ray - begin], left[ray - begin], targets, packet)
-        at = ends[ray - begin]
+        n = ray - begin
+        slopes[n, 0], slopes[n, 1], slopes[n, 2] = _composite_ray(ray, at, ends[n], left[n], targets, packet)
+        missing = 1 - left[n] - np.float64(targets.opacity[ray])
+        loss[ray] = slopes[n, 0] * slopes[n, 0] + slopes[n, 1] * slopes[n, 1] + slopes[n, 2] * slopes[n, 2] + targets.opacity_weight * missing * missing
+        at = ends[n]
+    if targets.structure > 0 and end - begin == WINDOW * WINDOW:
+        _add_structure(begin, end, targets, slopes)
+    at = 0
+    for ray in range(begin, end):
+        n = ray - begin
+        _pull_ray(ray, at, ends[n], left[n], slopes[n], targets, packet)
+        at = ends[n]
     return found
 
 
@@ -242,7 +297,7 @@ def _work(task, cells, values, packets, targets, limits, numbers, gradient, begi
     first, density = packets.first, values.density
     tree, flat = tree_pointers(cells, density), pointer(values.sh)
     arrays = packet_arrays(np.int64(FIRST_BLOCKS), np.int64(FIRST_SAMPLES), tree.cube, density)
-    ends, left = np.empty(16, np.int64), np.empty(16, np.float64)
+    rays = _ray_scratch(WINDOW * WINDOW)
     own_numbers, own_gradient = np.empty((128 * CHUNK, 2), np.int32), np.empty((128 * CHUNK, 4), density.dtype)
     place = np.empty(begin.shape[1] - 1, np.int64)
     chunk = fetch_add(pointer(task), 0, 1)
@@ -250,13 +305,12 @@ def _work(task, cells, values, packets, targets, limits, numbers, gradient, begi
         written, bins = np.int64(0), begin[chunk]
         bins[:] = 0
         for number in range(chunk * CHUNK, min(len(first) - 1, (chunk + 1) * CHUNK)):
-            rays = first[number + 1] - first[number]
-            if rays > len(ends):
-                ends, left = np.empty(rays, np.int64), np.empty(rays, np.float64)
-            found = _trace_packet(number, packets, targets, limits, flat, tree, arrays, ends, left, loss)
+            if first[number + 1] - first[number] > len(rays.ends):
+                rays = _ray_scratch(first[number + 1] - first[number])
+            found = _trace_packet(number, packets, targets, limits, flat, tree, arrays, rays, loss)
             while found < 0:
                 arrays = packet_arrays(2 * arrays.most, 2 * arrays.samples, tree.cube, density)
-                found = _trace_packet(number, packets, targets, limits, flat, tree, arrays, ends, left, loss)
+                found = _trace_packet(number, packets, targets, limits, flat, tree, arrays, rays, loss)
             if written + found > len(own_numbers):
                 room = 2 * (written + found)
                 own_numbers, own_gradient = _enlarged(own_numbers, written, room), _enlarged(own_gradient, written, room)
@@ -277,7 +331,7 @@ def forward_backward(
     cells: Cells, first: np.ndarray, origins: np.ndarray, directions: np.ndarray, bases: np.ndarray, density: np.ndarray, sh: np.ndarray, targets: RayTargets,
     buffer: RecordBuffer, *, stop: float = EARLY_STOP,
 ) -> tuple[np.ndarray, Records]:  # fmt: skip
-    """Loss (R,) of rays, voxel coordinates of cascade 0, and the gradients of its sum, as records in `buffer`.
+    """Loss (R,) of rays, voxel coordinates of cascade 0, and the gradients of its sum and of their structure (`RayTargets`), as records in `buffer`.
 
     first                (P + 1,) int64: first ray of each packet, and the end
     origins, directions  (R, 3) float64
