@@ -38,7 +38,7 @@ from stages.splats.memory import most_gaussians, needed, needed_on_device
 from stages.splats.pictures import photographs, render_cameras, renders
 from stages.splats.settings import SplatsSettings
 
-PASSES, STEPS_A_VIEW, FEWEST_STEPS, MOST_STEPS = 16, 30, 900, 3600  # docs/experiments/splats.md
+PASSES, STEPS_A_VIEW, FEWEST_STEPS, MOST_STEPS = 16, 30, 1080, 3600  # docs/experiments/splats.md
 MOST_TIMED_STEPS = 8000  # where a time budget may end them earlier
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
 
