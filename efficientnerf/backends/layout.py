@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 EARLY_STOP = 1e-3  # transmittance at which a ray may end
 MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
 MAX_VISITS = 60000  # steps that met a voxel, counted up to here
-WINDOW, SSIM_C1, SSIM_C2 = 4, 0.01**2, 0.03**2  # pixels along a side of what SSIM is taken over (Wang et al. 2004), and its constants
+SSIM_WINDOW = 4  # pixels along a side of the windows of SSIM in losses
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # its constants; Wang et al. 2004
 MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
 
 
@@ -50,8 +51,7 @@ class RayTargets(NamedTuple):
 
         sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
 
-    and a patch of WINDOW x WINDOW rays adds  structure (1 - SSIM)  for each of its rays and channels (Wang et al. 2004, over the patch alone) to what gradients
-    are of.
+    Gradients are of this and, for each ray and channel of a full patch of SSIM_WINDOW x SSIM_WINDOW rays, of  structure (1 - SSIM)  of the patch.
     """
 
     colour: Any  # (R, 3) of the photograph, less the colour of what lies in front of the box

@@ -43,8 +43,8 @@ class Picture(NamedTuple):
     mask: np.ndarray
     over_all: bool  # whether it is compared over all backgrounds at once, as a picture with alpha; else over `background` (3,) float32, and alpha is not read
     background: np.ndarray
-    # weight of 1 - SSIM in the error of a pixel's channel, over grey or `background`; of windows of WINDOW x WINDOW pixels that all count, next to each other
-    # from the corner on (`efficientnerf.backends.layout`)
+    # weight of 1 - SSIM in the error of a pixel's channel, over grey or `background`; of windows of SSIM_WINDOW x SSIM_WINDOW pixels that all count, next to
+    # each other from the corner on (`efficientnerf.backends.layout`)
     structure: np.float32
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.backends.dispatch import splats_on
-from efficientnerf.backends.layout import WINDOW
+from efficientnerf.backends.layout import SSIM_WINDOW
 from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, LANES, OPACITY, ROTATION, SCALE, TILE, Lens, Picture, Rates, SplatState
 from efficientnerf.geometry.cameras import Camera, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
@@ -94,7 +94,7 @@ def refitted(
             fit = begin(*_divided(fit.state(), most, relocated), gaussians.degree, device)
         whole = views[order.pop()]
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
-        corner = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 9, number])).integers(WINDOW, size=2)
+        corner = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 9, number])).integers(SSIM_WINDOW, size=2)
         lens, picture = _moved(lens_of(view.camera, whole.camera), _picture(view, background), *corner.tolist())
         fit.step(lens, picture, rates_of(max(number / max(steps - 1, 1), used), harmonics, fade, seed, number))
         if reached is not None:

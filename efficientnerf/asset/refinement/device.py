@@ -17,7 +17,7 @@ from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import WINDOW, Hyperparameters, Moments
+from efficientnerf.backends.layout import SSIM_WINDOW, Hyperparameters, Moments
 from efficientnerf.backends.numba.tree.cells import cells_of
 from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
 from efficientnerf.backends.transfer import constant, to_device, to_host_async
@@ -88,7 +88,7 @@ def voxels_beside(tree: NerfTree) -> np.ndarray:
 
 def windows_of(first: np.ndarray, device: torch.device) -> Tensor:
     """(W,) first rays of the patches of which no ray is missing; first: as in `Patches`."""
-    return to_device(torch.from_numpy(first[:-1][np.diff(first) == WINDOW**2]), device)
+    return to_device(torch.from_numpy(first[:-1][np.diff(first) == SSIM_WINDOW**2]), device)
 
 
 def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
@@ -119,7 +119,7 @@ def optimise(
         origins, directions, wanted = targets.of(drawn.patches.pixels)
         factor = fall(number)
         hyperparameters = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, total_variation=total_variation)
-        windows = windows_of(drawn.patches.first, origins.device) if patch_side == WINDOW and patches.angle <= MAX_PACKET_ANGLE else None
+        windows = windows_of(drawn.patches.first, origins.device) if patch_side == SSIM_WINDOW and patches.angle <= MAX_PACKET_ANGLE else None
         loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, windows, hyperparameters)
         arrays.pending.append((drawn, *to_host_async(loss)))
         state.step = number

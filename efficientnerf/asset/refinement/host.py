@@ -12,7 +12,7 @@ from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import WINDOW, Hyperparameters, Moments
+from efficientnerf.backends.layout import SSIM_WINDOW, Hyperparameters, Moments
 from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients
@@ -57,7 +57,7 @@ def optimise(
             errors.set_chances()
         drawn = errors.draw(rays, step_rng(seed, number))
         origins, directions, wanted = targets.of(drawn.patches.pixels)
-        if patch_side != WINDOW:
+        if patch_side != SSIM_WINDOW:
             wanted = wanted._replace(structure=0.0)
         start, along, bases = in_voxels(state.tree, origins, directions)
         first = drawn.patches.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import SSIM_C1, SSIM_C2, WINDOW, RayTargets
+from efficientnerf.backends.layout import SSIM_C1, SSIM_C2, SSIM_WINDOW, RayTargets
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import brick_arrays, device_cascades
@@ -281,7 +281,7 @@ def loss_and_gradients(colour: Tensor, transmittance: Tensor, targets: RayTarget
 
 def _structure_slopes(error: Tensor, wanted: Tensor, windows: Tensor) -> Tensor:
     """(R, 3) half of the derivatives of 1 - SSIM, summed over the rays of the windows, by their colours."""
-    rays = windows[:, None] + torch.arange(WINDOW * WINDOW, device=windows.device)
+    rays = windows[:, None] + torch.arange(SSIM_WINDOW * SSIM_WINDOW, device=windows.device)
     y = wanted[rays]
     x = y + error[rays]
     of_x, of_y = x.mean(1, keepdim=True), y.mean(1, keepdim=True)

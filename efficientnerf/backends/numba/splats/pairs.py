@@ -160,7 +160,7 @@ def _sort(keys, other, gaussian, other_gaussian, counts):  # type: ignore[no-unt
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _by_depth(begin, masks, keys, gaussian, other, other_gaussian, mask, slot):  # type: ignore[no-untyped-def]
-    """The pairs of each tile by depth, nearest first; from `keys` and `gaussian`, whose halves `other` are."""
+    """The pairs of each tile by depth, nearest first; of `keys` and `gaussian` as `_fill` leaves them. The arrays `other` are scratch."""
     tiles = len(begin) - 1
     for task in numba.prange((tiles + TILES_A_TASK - 1) // TILES_A_TASK):
         counts = np.empty((1 << DIGIT) + 1, np.int64)

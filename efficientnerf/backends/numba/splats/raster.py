@@ -119,7 +119,7 @@ def _render(begin, end, workers, task, records, pairs, longest, colour, transmit
 
 @numba.njit(cache=True, error_model="numpy")
 def _add_structure(p, picture):  # type: ignore[no-untyped-def]
-    """Half of the derivatives of a block's structural dissimilarity, added to those of its squared error; p: pointer to the `slopes` of `_residual`."""
+    """Half of the derivatives of 1 - SSIM of a block, which is a window of it, added to those of its squared error; p: pointer to `slopes`."""
     share, by_light = _ONE / np.float32(LANES), load(p, 48, LANES)
     for channel in range(3):
         difference, y = load(p, 16 * channel, LANES), load(p, 80 + 16 * channel, LANES)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from efficientnerf.backends.layout import EARLY_STOP, SSIM_C1, SSIM_C2, WINDOW, RayTargets
+from efficientnerf.backends.layout import EARLY_STOP, SSIM_C1, SSIM_C2, SSIM_WINDOW, RayTargets
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.cells import Cells, tree_pointers
 from efficientnerf.backends.numba.tree_training.packets import (
@@ -241,7 +241,7 @@ def _trace_packet(number, packets, targets, limits, sh, tree, arrays, rays, loss
         missing = 1 - left[n] - np.float64(targets.opacity[ray])
         loss[ray] = slopes[n, 0] * slopes[n, 0] + slopes[n, 1] * slopes[n, 1] + slopes[n, 2] * slopes[n, 2] + targets.opacity_weight * missing * missing
         at = ends[n]
-    if targets.structure > 0 and end - begin == WINDOW * WINDOW:
+    if targets.structure > 0 and end - begin == SSIM_WINDOW * SSIM_WINDOW:
         _add_structure(begin, end, targets, slopes)
     at = 0
     for ray in range(begin, end):
@@ -297,7 +297,7 @@ def _work(task, cells, values, packets, targets, limits, numbers, gradient, begi
     first, density = packets.first, values.density
     tree, flat = tree_pointers(cells, density), pointer(values.sh)
     arrays = packet_arrays(np.int64(FIRST_BLOCKS), np.int64(FIRST_SAMPLES), tree.cube, density)
-    rays = _ray_scratch(WINDOW * WINDOW)
+    rays = _ray_scratch(SSIM_WINDOW * SSIM_WINDOW)
     own_numbers, own_gradient = np.empty((128 * CHUNK, 2), np.int32), np.empty((128 * CHUNK, 4), density.dtype)
     place = np.empty(begin.shape[1] - 1, np.int64)
     chunk = fetch_add(pointer(task), 0, 1)

@@ -21,7 +21,7 @@ from efficientnerf.backends.triton.vectors import Vec3
 
 SUMS, ERROR = tl.constexpr(layout.SUMS), tl.constexpr(layout.ERROR)
 MOST_ALPHA, LEAST_TRANSMITTANCE = tl.constexpr(float(layout.MOST_ALPHA)), tl.constexpr(float(layout.LEAST_TRANSMITTANCE))
-C1, C2, SIDE, WINDOW = tl.constexpr(agreed.SSIM_C1), tl.constexpr(agreed.SSIM_C2), tl.constexpr(8), tl.constexpr(agreed.WINDOW)
+C1, C2, SIDE, WINDOW = tl.constexpr(agreed.SSIM_C1), tl.constexpr(agreed.SSIM_C2), tl.constexpr(8), tl.constexpr(agreed.SSIM_WINDOW)
 CHUNK = tl.constexpr(16 if INTERPRETED else 4)
 BLOCKS = (layout.TILE // SIDE.value) ** 2  # of a tile
 
