@@ -98,7 +98,7 @@ def test_a_signal_stops_all_of_them_and_the_run_goes_on_later(tmp_path: Path) ->
     run = make_run(tmp_path / "run", place=place, does={"left": "waits", "right": "waits"})
 
     def interrupt() -> None:
-        while not all((place / name).exists() for name in ("left", "right")):
+        while not all(path.exists() for path in (place / "left", place / "right", run.folder("centre"))):
             time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGTERM)
 
