@@ -92,16 +92,16 @@ def disk_full(folder: Path, what: str) -> DiskFull:
 
 def cannot_write(path: Path, error: OSError) -> BadInput | StageFailed:
     """For a file of a run that could not be written: DiskFull, StageFailed for a failing disk or system, else BadInput."""
-    if is_disk_full(error):
-        return disk_full(path, str(path))
-    text = f"{path}: cannot be written ({printable(error.strerror or error, 200)})."
-    return BadInput(text) if is_of_the_path(error) else StageFailed(text)
+    return _of_the_system(path, error, f"cannot be written ({printable(error.strerror or error, 200)}).")
 
 
 def failed(path: Path, error: OSError) -> BadInput | StageFailed:
     """For a failure outside of a stage, while a run was read or put right: as `cannot_write`, naming the file."""
+    where = f" at {printable(error.filename, 300)}" if isinstance(error.filename, str | bytes) else ""
+    return _of_the_system(path, error, f"{printable(error.strerror or error, 200)}{where}. What was published before is not lost.")
+
+
+def _of_the_system(path: Path, error: OSError, text: str) -> BadInput | StageFailed:
     if is_disk_full(error):
         return disk_full(path, str(path))
-    where = f" at {printable(error.filename, 300)}" if isinstance(error.filename, str | bytes) else ""
-    text = f"{path}: {printable(error.strerror or error, 200)}{where}. What was published before is not lost."
-    return BadInput(text) if is_of_the_path(error) else StageFailed(text)
+    return BadInput(f"{path}: {text}") if is_of_the_path(error) else StageFailed(f"{path}: {text}")

@@ -7,7 +7,6 @@ the rest  seconds, processor time, peak memory, tool versions: for people, outsi
 checksum  of all of the above, so that a damaged manifest is known as such
 """
 
-import dataclasses
 import hashlib
 import importlib.metadata
 import platform
@@ -85,17 +84,17 @@ def tool_versions() -> tuple[tuple[str, str], ...]:
 
 @dataclass(frozen=True)
 class Manifest:
-    """See the module."""
+    """See the module. One that is read is untrusted: types state what is checked."""
 
     request: Request
     outputs: dict[str, Output]
-    seconds: float = 0.0  # wall clock of the process that finished it
-    peak_memory: int = 0  # bytes, of that process during the stage
+    seconds: _Seconds = 0.0  # wall clock of the process that finished it
+    peak_memory: _Count = 0  # bytes, of that process during the stage
     resumed: bool = False  # whether it went on from the scratch of an earlier process
-    made: float = field(default_factory=time.time)  # seconds since 1970
+    made: _Seconds = field(default_factory=time.time)  # since 1970
     versions: dict[str, str] = field(default_factory=lambda: dict(tool_versions()))
-    cpu_seconds: float = 0.0  # processor time of that process and its children during the stage; 0 where it is not known
-    cores: int = 0  # that the process might use; 0 where it is not known
+    cpu_seconds: _Seconds = 0.0  # processor time of that process and its children during the stage; 0 where it is not known
+    cores: _Count = 0  # that the process might use; 0 where it is not known
     facts: dict[str, Any] = field(default_factory=dict)  # what the stage recorded (`Job.record`), as JSON holds it
 
     @property
@@ -159,23 +158,6 @@ def _plain_output(output: Output) -> dict[str, Any]:
     return {**plain, "volatile": True} if output.volatile else plain
 
 
-class _Document(msgspec.Struct):
-    """manifest.json, untrusted. Those of 2026 before release 0.1.0 have no cpu_seconds, cores and facts."""
-
-    request: Request
-    request_digest: Sha256
-    outputs: dict[str, Output]
-    digest: Sha256
-    seconds: _Seconds
-    peak_memory: _Count
-    resumed: bool
-    made: _Seconds
-    versions: dict[str, str]
-    cpu_seconds: _Seconds = 0.0
-    cores: _Count = 0
-    facts: dict[str, Any] = {}
-
-
 def _parsed(value: Any) -> Manifest:
     if not isinstance(value, dict):
         raise ValueError(f"found {type(value).__name__}, expected an object")
@@ -186,11 +168,10 @@ def _parsed(value: Any) -> Manifest:
     rest = {key: item for key, item in value.items() if key != "checksum"}
     if value.get("checksum") != hashlib.sha256(files.canonical_json(rest)).hexdigest():
         raise ValueError("its checksum is not that of its content: it was altered or damaged")
-    document = msgspec.convert(value, _Document)
-    for name in document.outputs:
+    manifest = msgspec.convert(value, Manifest)
+    for name in manifest.outputs:
         if not files.is_safe_name(name) or name == NAME:
             raise ValueError(f"output {name!r:.80} is no name of a file in its folder")
-    manifest = Manifest(**{each.name: getattr(document, each.name) for each in dataclasses.fields(Manifest)})
-    if document.digest != manifest.digest or document.request_digest != manifest.request.digest:
+    if (value.get("digest"), value.get("request_digest")) != (manifest.digest, manifest.request.digest):
         raise ValueError("its digests are not those of what it lists")
     return manifest

@@ -15,11 +15,11 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import msgspec
 
@@ -29,14 +29,13 @@ from pipeline.executors.memory import NO_LIMIT
 from pipeline.failures import cannot_write, failed
 from pipeline.links import CACHE, HOLDER, LEASE, LOCK, RUN, refuse_links
 from pipeline.locks.lease import Lease
-from pipeline.locks.lock import Holder, holder_of, lock
+from pipeline.locks.lock import lock
 from pipeline.text import printable
 
 NAME = RUN
 FORMAT = "enerf-run"
 VERSION = 1
 MOST_SOURCES = 100
-_CHANGEABLE = ("source", "also", "settings", "preset", "seed", "device", "memory", "viewer")
 _ABANDONED = 24 * 3600.0  # seconds after which no process still writes to a temporary file, such as that of a report
 # The fields of an untrusted run.json. Settings are checked by the stages that have them.
 _Path = Annotated[str, msgspec.Meta(max_length=4096)]
@@ -53,27 +52,25 @@ _FIELDS: dict[str, Any] = {
 }
 
 
-class ResumeText(Protocol):
-    """How to resume a run, for messages: a workflow gives the command, the engine knows none.
+@dataclass(frozen=True)
+class Resumption:
+    """How a run is resumed."""
 
-    until        the last stage to run; None: all
-    start        the first stage to run even if it is up to date; None: none
-    only         the one stage to run
-    force        whether that one is to run even if it is up to date
-    with_source  whether the source has to be given
-    """
-
-    def __call__(
-        self, run: Path, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
-    ) -> str: ...
+    until: str | None = None  # the last stage to run; None: all
+    start: str | None = None  # the first stage to run even if it is up to date; None: none
+    only: str | None = None  # the one stage to run
+    force: bool = False  # whether that one is to run even if it is up to date
+    with_source: bool = False  # whether the source has to be given
 
 
-def resume_in_words(
-    run: Path, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
-) -> str:
+ResumeText = Callable[[Path, Resumption], str]  # how to resume the run in a folder, for messages: a workflow gives the command, the engine knows none
+
+
+def resume_in_words(run: Path, how: Resumption) -> str:
     """The ResumeText of a run that was given none."""
-    what = f"the stage {only}" if only is not None else "the stages" + (f" from {start}" if start else "") + (f" until {until}" if until else "")
-    return f"run {what} of {run}" + (", forced" if force else "") + (" with a source" if with_source else "")
+    some = (f" from {how.start}" if how.start else "") + (f" until {how.until}" if how.until else "")
+    what = f"the stages{some}" if how.only is None else f"the stage {how.only}"
+    return f"run {what} of {run}" + (", forced" if how.force else "") + (" with a source" if how.with_source else "")
 
 
 @dataclass
@@ -142,9 +139,6 @@ class Run:
 
         What is not changed is as another process may have left it. What is read first, and changed for that, is read in `locked`.
         """
-        unknown = sorted(changes.keys() - set(_CHANGEABLE))
-        if unknown:
-            raise TypeError(f"a run has no {unknown[0]!r} to change")
         with self.locked():
             former = {name: getattr(self, name) for name in changes}
             before = self.plain()
@@ -170,15 +164,9 @@ class Run:
         """The file that remembers digests."""
         return self.path / CACHE / "hashes.json"
 
-    def how_to_resume(
-        self, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
-    ) -> str:
-        """How to go on with this run; see ResumeText."""
-        return self.resume_text(self.path, until=until, start=start, only=only, force=force, with_source=with_source)
-
-    def holder(self) -> Holder | None:
-        """Who is writing the run, for messages; takes no lock."""
-        return holder_of(self.path)
+    def how_to_resume(self, **how: Any) -> str:
+        """How to go on with this run, for messages; `how` has the fields of Resumption."""
+        return self.resume_text(self.path, Resumption(**how))
 
     @contextmanager
     def locked(self) -> Iterator[None]:

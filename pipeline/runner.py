@@ -22,7 +22,7 @@ from pipeline.hashes import Hashes
 from pipeline.interrupt import Stop, stopping
 from pipeline.manifest import Manifest, Request
 from pipeline.run import Run
-from pipeline.stage import Job, Report, Stage, settings_from
+from pipeline.stage import Job, Report, Stage, settings_of
 
 Executor = Callable[[Stage, Job], Usage]
 
@@ -87,24 +87,24 @@ def run_stages(
         return _Runner(run, stages, device, memory, report, stop, execute, side_by_side).all(chosen, forced, only, go_on)
 
 
+@dataclass
 class _Runner:
     """One call of run_stages."""
 
-    def __init__(
-        self, run: Run, stages: Sequence[Stage], device: str, memory: Limit | None, report: Report | None, stop: Stop, execute: Executor,
-        side_by_side: SideBySide | None,
-    ) -> None:  # fmt: skip
-        self.run = run
-        self.stages = stages
-        self.work = run.path / artifact.WORK
-        self.device = device
-        self.memory = memory
-        self.stop = stop
-        self.execute = execute
-        self.side_by_side = side_by_side
-        self._report = None if report is None else _one_at_a_time(report)
+    run: Run
+    stages: Sequence[Stage]
+    device: str
+    memory: Limit | None
+    report: Report | None
+    stop: Stop
+    execute: Executor
+    side_by_side: SideBySide | None
+
+    def __post_init__(self) -> None:
+        self.work = self.run.path / artifact.WORK
+        self._report = None if self.report is None else _one_at_a_time(self.report)
         self._lock = threading.Lock()  # of everything but the work of a stage
-        self.hashes = Hashes(run.cache, safe_point=self.safe_point)
+        self.hashes = Hashes(self.run.cache, safe_point=self.safe_point)
 
     def all(self, chosen: Sequence[Stage], forced: frozenset[str], only: str | None, go_on: Callable[[str], str]) -> list[Outcome]:
         outcomes: list[Outcome] = []
@@ -216,7 +216,7 @@ class _Runner:
         resumed = artifact.prepare(place, self.work)
         self.emit("stage_started", stage.name, reason=reason, resumed=resumed)
         job = Job(
-            settings=settings_from(stage.settings, self.run.settings.get(stage.name, {}), where=stage.name),
+            settings=settings_of([stage], self.run.settings)[stage.name],
             inputs={need: self.run.folder(need) for need in stage.needs},
             source=self.run.source if stage.reads_source else None,
             also=self.run.also if stage.reads_source else (),
@@ -298,13 +298,13 @@ class _Runner:
 
     def _is_to_stop(self) -> bool:
         try:
-            return self.stopped() is not None
-        except PipelineError:  # the run is no longer ours: `safe_point` says so once all have ended
+            self.safe_point()
+        except PipelineError:  # it is raised once all have ended
             return True
+        return False
 
     def safe_point(self) -> None:
-        number = self.stopped()
-        if number is not None:
+        if (number := self.stopped()) is not None:
             raise Interrupted(number)
 
     def emit(self, event: str, stage: str, **facts: Any) -> None:
@@ -368,7 +368,7 @@ def refuse_what_cannot_work(stages: Sequence[Stage], run: Run, forced: Collectio
     """Raise the UsageError of a stage that cannot work with the settings of the run (`Stage.check`), unless it does not have to run."""
     if all(stage.check is None for stage in stages):
         return
-    settings: dict[str, Any] = {stage.name: settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name) for stage in stages}
+    settings = settings_of(stages, run.settings)
     for stage in stages:
         try:
             if stage.check is not None:

@@ -9,8 +9,8 @@ import math
 import time
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -67,59 +67,39 @@ class Stage:
             raise TypeError(f"stage {self.name}: settings must be a dataclass, found {self.settings!r}")
 
 
+@dataclass(kw_only=True, eq=False)
 class Job:
-    """What a stage sees while it runs. Tests make one by hand: Job(settings=..., inputs=..., out=..., work=...).
+    """What a stage sees while it runs. Tests make one by hand: Job(settings=..., inputs=..., out=..., work=...)."""
 
-    settings  an instance of the stage's settings
-    inputs    need -> the folder of its artifact, to be read only
-    source    the user's source for a stage with reads_source, else None
-    sources   all of them by name, where there are several; see `pipeline.run.named`
-    out       an empty folder; what is in it when the stage returns is the artifact
-    work      scratch of this very request that survives a kill: checkpoints. Removed once the artifact is published
-    device    "cpu" or "cuda"; not part of the request
-    memory    what the stage may take; not part of the request: no bytes of an artifact may depend on it. None: no limit is known
-    report    takes each event, a dict; None: nobody listens
-    stop      returns the number of the signal that arrived, or None
-    """
+    settings: Any  # an instance of the stage's settings
+    out: Path  # an empty folder; what is in it when the stage returns is the artifact
+    work: Path  # scratch of this very request that survives a kill: checkpoints. Removed once the artifact is published
+    inputs: Mapping[str, Path] = field(default_factory=dict)  # need -> the folder of its artifact, to be read only
+    source: Path | None = None  # the user's source for a stage with reads_source, else None
+    also: Sequence[Path] = ()  # further sources
+    device: str = "cpu"  # "cpu" or "cuda"; not part of the request
+    memory: Limit | None = None  # what the stage may take; not part of the request: no bytes of an artifact may depend on it. None: no limit is known
+    stage: str = ""
+    report: Report | None = None  # takes each event, a dict; None: nobody listens
+    stop: Callable[[], int | None] | None = None  # returns the number of the signal that arrived, or None
+    facts: dict[str, Any] = field(default_factory=dict, init=False)
+    _last: tuple[float, str | None] = field(default=(-math.inf, None), init=False)  # when progress was reported last, and its text
 
-    def __init__(
-        self,
-        *,
-        settings: Any,
-        out: Path,
-        work: Path,
-        inputs: Mapping[str, Path] | None = None,
-        source: Path | None = None,
-        also: Sequence[Path] = (),
-        device: str = "cpu",
-        memory: Limit | None = None,
-        stage: str = "",
-        report: Report | None = None,
-        stop: Callable[[], int | None] | None = None,
-    ) -> None:
-        self.settings = settings
-        self.inputs = {need: Path(folder) for need, folder in (inputs or {}).items()}
-        self.source = None if source is None else Path(source)
-        self.sources = {} if source is None else named([Path(source), *map(Path, also)])
-        self.out = Path(out)
-        self.work = Path(work)
-        self.device = device
-        self.memory = memory
-        self.stage = stage
-        self._report = report
-        self._stop = stop
-        self._last_progress = -math.inf
-        self._last_text: str | None = None
-        self.facts: dict[str, Any] = {}
+    def __post_init__(self) -> None:
         self.out.mkdir(parents=True, exist_ok=True)
         self.work.mkdir(parents=True, exist_ok=True)
 
+    @property
+    def sources(self) -> dict[str, Path]:
+        """All of them by name, where there are several; see `pipeline.run.named`."""
+        return {} if self.source is None else named([self.source, *self.also])
+
     def progress(self, done: float, total: float, text: str = "", **facts: Any) -> None:
         """Report progress. May be called often: at most one report in 0.1 s is passed on, and the first and the last."""
-        now = time.monotonic()
-        if done < total and text == self._last_text and now - self._last_progress < PROGRESS_SECONDS:
+        now, (last, last_text) = time.monotonic(), self._last
+        if done < total and text == last_text and now - last < PROGRESS_SECONDS:
             return
-        self._last_progress, self._last_text = now, text
+        self._last = now, text
         self._emit("progress", done=done, total=total, text=text, **facts)
 
     def reached(self, done: float, total: float, text: str = "") -> None:
@@ -141,27 +121,22 @@ class Job:
 
     def pass_on(self, event: dict[str, Any]) -> None:
         """An event of the process that does this job."""
-        if self._report is not None:
-            self._report(event)
+        if self.report is not None:
+            self.report(event)
 
     def safe_point(self) -> None:
         """Raise Interrupted if a signal has arrived. Call it where `work` holds all that is needed to resume."""
-        number = self._stop() if self._stop is not None else None
+        number = self.stop() if self.stop is not None else None
         if number is not None:
             raise Interrupted(number)
 
     def _emit(self, event: str, **facts: Any) -> None:
-        if self._report is not None:
-            self._report({**facts, "event": event, "stage": self.stage, "time": time.time()})
-
-
-def hints_of(cls: type) -> dict[str, Any]:
-    """The types of a class's fields by name, with their limits: evaluated once, for that takes milliseconds."""
-    return _hints(cls)
+        self.pass_on({**facts, "event": event, "stage": self.stage, "time": time.time()})
 
 
 @functools.cache
-def _hints(cls: type) -> dict[str, Any]:
+def hints_of(cls: type) -> dict[str, Any]:
+    """The types of a class's fields by name, with their limits: evaluated once, for that takes milliseconds."""
     return typing.get_type_hints(cls, include_extras=True)
 
 
@@ -192,6 +167,11 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
         if not all(math.isfinite(number) for number in _numbers(values[name])):
             raise UsageError(f"{prefix}{name}: found {_shown(value)}, expected a finite number.")
     return cls(**values)
+
+
+def settings_of(stages: Iterable[Stage], table: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Stage -> an instance of its settings, from plain values by stage and name. Raises as `settings_from`."""
+    return {stage.name: settings_from(stage.settings, table.get(stage.name, {}), where=stage.name) for stage in stages}
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:

@@ -36,13 +36,13 @@ def test_a_second_writer_is_told_the_holder_and_a_dead_one_blocks_nobody(tmp_pat
         assert caught.value.exit_code == 5
         with pytest.raises(RunLocked):
             run.update(preset="high")
-        holder = run.holder()
+        holder = holder_of(run.path)
         assert holder is not None
         assert holder.pid == process.pid
         assert Run.open(run.path).preset is None  # reading needs no lock
         os.kill(process.pid, signal.SIGKILL)
     assert (run.path / ".lock.json").exists()
-    assert run.holder() is None
+    assert holder_of(run.path) is None
     with run.locked():
         pass
     assert not (run.path / ".lock.json").exists()

@@ -21,8 +21,6 @@ def test_there_and_back(tmp_path: Path) -> None:
     before = os.stat(made.path / "run.json").st_ino
     made.update(preset="high", source=tmp_path)
     assert os.stat(made.path / "run.json").st_ino == before, "nothing has changed"
-    with pytest.raises(TypeError, match="colour"):
-        made.update(colour="red")
 
 
 def test_an_empty_folder_will_do_and_so_will_what_a_kill_left(tmp_path: Path) -> None:

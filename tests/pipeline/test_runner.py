@@ -248,7 +248,7 @@ def test_a_failed_stage_keeps_its_checkpoint_and_goes_on(run: Run) -> None:
 
 def _count_until(step: int) -> object:
     def count(job: Job) -> None:
-        job._stop = lambda: 2 if (job.work / "state.txt").read_text().count("\n") >= step - 1 else None
+        job.stop = lambda: 2 if (job.work / "state.txt").read_text().count("\n") >= step - 1 else None
         COUNT.run(job)
 
     return count

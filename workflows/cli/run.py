@@ -14,7 +14,7 @@ from pipeline.executors.side_by_side import SideBySide
 from pipeline.library_output import kept_in, warnings_for_users
 from pipeline.run import Run
 from pipeline.runner import run_stages
-from pipeline.stage import Stage, settings_from
+from pipeline.stage import Stage, settings_of
 from stages.cores import count_cores
 from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
@@ -143,7 +143,7 @@ def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextMan
     jobs = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     if jobs < 2 or device != "cpu":
         return nullcontext()
-    settings: dict[str, Any] = {stage.name: settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name) for stage in workflow().stages}
+    settings = settings_of(workflow().stages, run.settings)
 
     def need(stage: Stage) -> int | None:
         with contextlib.suppress(PipelineError, OSError, ValueError):  # the stage itself says what is wrong

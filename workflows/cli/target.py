@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pipeline.errors import BadInput
 from pipeline.links import refuse_links
-from pipeline.run import NAME, Run
+from pipeline.run import NAME, Resumption, Run
 from stages.artifacts import BakeOutputs
 from workflows.cli.options import workflow
 from workflows.cli.resolve import Settings, table_of
@@ -13,15 +13,13 @@ from workflows.cli.resolve import Settings, table_of
 ASSET = BakeOutputs.asset  # the file's name
 
 
-def resume_command(
-    run: Path, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
-) -> str:
-    """The command that resumes a run; see `pipeline.run.ResumeText`."""
+def resume_command(run: Path, how: Resumption) -> str:
+    """The command that resumes a run."""
     folder = shlex.quote(str(run))
-    if only is not None:
-        return f"enerf stage {only} {folder}" + (" --force" if force else "")
-    options = "".join(f" --{option} {stage}" for option, stage in (("from", start), ("until", until)) if stage is not None)
-    return f"enerf run{' SOURCE' if with_source else ''} --out {folder}{options}"
+    if how.only is not None:
+        return f"enerf stage {how.only} {folder}" + (" --force" if how.force else "")
+    options = "".join(f" --{option} {stage}" for option, stage in (("from", how.start), ("until", how.until)) if stage is not None)
+    return f"enerf run{' SOURCE' if how.with_source else ''} --out {folder}{options}"
 
 
 def recorded_run(path: Path) -> Run:

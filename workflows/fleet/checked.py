@@ -11,7 +11,7 @@ from pipeline.errors import Mistakes, UsageError
 from pipeline.files import canonical_json
 from pipeline.fleet.state import Scene
 from pipeline.run import NAME as RUN_NAME
-from pipeline.stage import Stage, plain, settings_from
+from pipeline.stage import Stage, plain, settings_from, settings_of
 from pipeline.text import printable
 from workflows.budget import share_budget, train_share
 from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, seconds_of
@@ -190,9 +190,7 @@ def refuse_what_cannot_work(scenes: Sequence[Scene], workflow: Workflow, fleet: 
 
 
 def _why_refused(given: Mapping[str, Mapping[str, Any]], preset: Mapping[str, Any], stages: Sequence[Stage]) -> str | None:
-    settings: dict[str, Any] = {
-        stage.name: settings_from(stage.settings, {**preset.get(stage.name, {}), **given.get(stage.name, {})}, where=stage.name) for stage in stages
-    }
+    settings = settings_of(stages, {stage.name: {**preset.get(stage.name, {}), **given.get(stage.name, {})} for stage in stages})
     try:
         for stage in stages:
             if stage.check is not None:

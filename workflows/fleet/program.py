@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.run import NAME, Run
 from pipeline.runner import refuse_what_cannot_work
-from pipeline.stage import Stage, settings_from
+from pipeline.stage import Stage, settings_of
 from stages.artifacts import BakeOutputs
 from workflows.cli.request import Options, plan_run
 from workflows.cli.target import resume_command
@@ -64,8 +64,7 @@ class WorkflowProgram:
     def _opened(self, run: Path) -> tuple[Run, dict[str, Any]]:
         """A run, and the settings of its stages by their names."""
         opened = self._open(run)
-        kinds = {each.name: each.settings for each in self.stages}
-        return opened, {name: settings_from(kind, opened.settings.get(name, {}), where=name) for name, kind in kinds.items()}
+        return opened, settings_of(self.stages, opened.settings)
 
     def is_finished(self, run: Path) -> bool:
         return has_pages(self._open(run), self.stages)

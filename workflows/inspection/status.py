@@ -6,13 +6,14 @@ from typing import Any
 
 from pipeline import files
 from pipeline.decide import Decision
+from pipeline.locks.lock import holder_of
 from pipeline.run import Run
 from stages.artifacts import EvaluateOutputs, PosesOutputs
 
 
 def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
     """A run, who is writing it, and its stages."""
-    holder = run.holder()
+    holder = holder_of(run.path)
     facts: dict[str, Any] = {"run": str(run.path), "source": run.source, "also": run.also, "preset": run.preset, "seed": run.seed, "device": run.device}
     facts |= {"verdict": camera_verdict(run.path), "result": result_verdict(run.path), "written_by": None if holder is None else holder.text()}
     return {**facts, "stages": [_stage(each) for each in decisions]}

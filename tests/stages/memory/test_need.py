@@ -48,7 +48,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def limited(made: Job, size: int, events: list[dict[str, Any]] | None = None) -> Job:
     made.stage, made.memory = "toy", Limit(size, "--memory")
     if events is not None:
-        made._report = events.append
+        made.report = events.append
     return made
 
 

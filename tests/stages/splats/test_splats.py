@@ -206,7 +206,7 @@ def test_a_run_goes_on_without_them_unless_they_are_asked_for(
     told: list[str] = []
     for name, make in (("auto", "auto"), ("on", "on")):
         job = Job(settings=replace(QUICK, make=make), inputs=inputs, out=tmp_path / name / "out", work=tmp_path / name / "work")
-        job._report = lambda event: told.append(event.get("text", ""))
+        job.report = lambda event: told.append(event.get("text", ""))
         if make == "on":
             with pytest.raises((StageFailed, UsageError), match=why):
                 splats.run(job)
