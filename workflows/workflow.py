@@ -19,3 +19,8 @@ class Workflow:
     space: Callable[[str, Path, Sequence[Path], Mapping[str, Any], int | None], int] = lambda *_: 0
     # (stage, run, its sources, settings by stage, device) -> bytes that the stage takes; None: not known, it has a share of its worker's
     memory: Callable[[str, Path, Sequence[Path], Mapping[str, Any], str], int | None] = lambda *_: None
+
+    @property
+    def settings(self) -> dict[str, type]:
+        """Stage -> its settings' type."""
+        return {stage.name: stage.settings for stage in self.stages}

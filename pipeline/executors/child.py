@@ -11,7 +11,6 @@ Each child leads a group of processes. It ends with its parent, and whatever it 
 """
 
 import contextlib
-import itertools
 import json
 import os
 import signal
@@ -34,7 +33,6 @@ LONGEST_LINE = 500
 IDLE_SECONDS = 5.0  # seconds that a child without work is kept
 MAX_KEPT_BYTES = 2**30  # bytes that the child of a finished run may hold and be used again: for small scenes starting another takes a large part of the time
 GRACE = 20.0  # seconds that a child has to reach a safe point once it is asked to stop
-PREPARES = "prepares runs "
 
 
 class _Child(Child):
@@ -43,7 +41,8 @@ class _Child(Child):
     def __init__(self, module: str, kind: Kind) -> None:
         super().__init__(module, group=True, env=_environment(*kind))
         self.kind = kind  # cores that it computes on, and CUDA devices that it sees
-        self.idle_since: float | None = None
+        self.run: str | None = None  # that it works for or is kept for; None: any
+        self.idle_since: float | None = None  # None while it works
         self.stopping = False
         self.write({"parent": os.getpid()})
 
@@ -125,79 +124,56 @@ class _Child(Child):
 
 
 class Children:
-    """The children of a worker, by run. Used from any number of threads; one works for a run at a time."""
+    """The children of a worker. Used from any number of threads; one works for a run at a time."""
 
     def __init__(self, module: str, most: int) -> None:
         self.module = module  # what a child runs: it calls `serving.serve`
         self.most = most  # children with a run that are kept at a time, with those that have no work
-        self._children: dict[str, _Child] = {}
-        self._working: set[str] = set()
-        self._stopped: set[str] = set()
+        self._children: list[_Child] = []
         self._lock = threading.Lock()
         # A child dies with the thread that started it (prctl): one that lives as long as this process starts all of them.
         self._starter = ThreadPoolExecutor(1, thread_name_prefix="starter of stages")
         self._closed = False
 
     def work(self, request: Mapping[str, Any], report: Report, *, cores: int, gpus: Sequence[int] = ()) -> Event:
-        """What the child of a run answers to a request; never raises.
+        """What a child answers to a request; never raises.
 
         request  {"kind": "prepare" | "stage" | "finish", "run": path, ...}; "prepare" with "scene" and "memory" (bytes or None), "stage" with "stage",
                  "device" and "memory"; or {"kind": "job", ...}, see `side_by_side`: "run" is any name of the child then
         """
-        run = self._name(request)
         try:
-            child = self._child(run, (cores, tuple(gpus)))
-            if child is None:
-                return _stopped_result()
-            answer = child.work(request, report)
-            if child.stopping and answer.get("kind") != "died" and not answer["ok"]:
-                answer["kind"] = "stopped"
-            elif child.stopping and not answer["ok"]:
-                answer = {**_stopped_result(), "lines": answer["lines"]}
-            held = answer.pop("resident", None)
-            if child.stopping or child.process.returncode is not None or answer.get("kind") == "memory":  # a new one has all of its memory
-                self._drop(run)
-            elif held is not None and held <= MAX_KEPT_BYTES and not gpus:
-                self._release(run)
-            return answer
-        except OSError as error:  # no process could be started
+            child = self._child(None if request["kind"] == "prepare" else str(request["run"]), (cores, tuple(gpus)))
+        except OSError as error:
             return {"event": "result", "ok": False, "kind": "died", "signal": None, "text": f"no process could be started: {error.strerror}.", "lines": []}
-        finally:
-            with self._lock:
-                self._working.discard(run)
-                self._stopped.discard(run)
-                finished = request["kind"] == "finish" and run in self._children  # with much memory, which it needs no more
-                if run in self._children:
-                    self._children[run].idle_since = time.monotonic() - (IDLE_SECONDS if finished else 0.0)
-            timer = threading.Timer(0.0 if finished else IDLE_SECONDS, self.tidy)
-            timer.daemon = True
-            timer.start()
-
-    def _name(self, request: Mapping[str, Any]) -> str:
-        """Under which a child is kept: its run, which nothing else works for; any that prepares runs goes on with the next."""
-        with self._lock:
-            name, number = str(request["run"]), 0
-            if request["kind"] == "prepare":
-                while (name := f"{PREPARES}{number}") in self._working:
-                    number += 1
-            self._working.add(name)
-        return name
+        if child is None:
+            return _stopped_result()
+        try:
+            answer = child.work(request, report)
+        except BaseException:  # of `report`: the child has not come to an end
+            child.kill()
+            self._give_back(child, drop=True, free=False)
+            raise
+        if child.stopping and not answer["ok"]:
+            answer = {**_stopped_result(), "lines": answer["lines"]} if answer.get("kind") == "died" else {**answer, "kind": "stopped"}
+        held = answer.pop("resident", None)
+        is_used_up = child.stopping or child.process.returncode is not None or answer.get("kind") == "memory"  # a new one has all of its memory
+        is_free = held is not None and held <= MAX_KEPT_BYTES and not gpus  # its run is done, and it holds little memory: other runs may use it
+        self._give_back(child, drop=is_used_up or (request["kind"] == "finish" and not is_free), free=is_free)
+        return answer
 
     def stop(self, run: str) -> None:
         """Ask what works for this run to stop at its next safe point."""
         with self._lock:
-            if run in self._working:
-                self._stopped.add(run)
-            child = self._children.get(run)
-            if child is not None and run in self._working:
-                child.stop()
+            for child in self._children:
+                if child.run == run and child.idle_since is None:
+                    child.stop()
 
     def tidy(self, kept: float = IDLE_SECONDS) -> None:
         """End the children that have had no work for so many seconds."""
         now = time.monotonic()
         with self._lock:
-            idle = [run for run, child in self._children.items() if run not in self._working and now - (child.idle_since or now) >= kept - 0.1]
-            doomed = [self._children.pop(run) for run in idle]
+            doomed = [child for child in self._children if child.idle_since is not None and now - child.idle_since >= kept - 0.1]
+            self._remove(doomed)
         for child in doomed:
             child.end()
 
@@ -205,62 +181,52 @@ class Children:
         """Kill all of them."""
         with self._lock:
             self._closed = True
-            doomed = list(self._children.values())
-        for child in doomed:
-            child.kill()
+            for child in self._children:
+                child.kill()
         self.tidy(0.0)
 
-    def _child(self, run: str, kind: Kind) -> _Child | None:
-        """The child of the run, with these cores and devices; None where it was asked to stop meanwhile."""
+    def _child(self, run: str | None, kind: Kind) -> _Child | None:
+        """A child for this run, or for the preparation of any, with these cores and devices: the run's own, else a free one, for starting another costs a
+        second; else a new one. None once all are closed."""
         with self._lock:
-            found = self._children.pop(run, None)
-            doomed: list[_Child] = []
-            if found is not None and found.kind != kind:
-                doomed.append(found)
-                found = None
+            if self._closed:
+                return None
+            idle = [child for child in self._children if child.idle_since is not None]
+            doomed = [child for child in idle if child.run is not None and child.run == run and child.kind != kind]
+            found = next((child for child in idle if child.run == run and child.kind == kind), None)
             if found is None:
-                doomed += self._excess()
-                found = self._spare(run, kind)
-            if found is not None:
-                found.idle_since = None
-                self._children[run] = found
+                doomed += [child for child in self._excess(idle) if child not in doomed]
+                found = next((child for child in idle if child.run is None and child.kind == kind), None)
+            self._remove(doomed)
+            if found is None:
+                found = self._starter.submit(_Child, self.module, kind).result()
+                self._children.append(found)
+            found.run, found.idle_since = run, None
         for child in doomed:
             child.end()
-        if found is None:
-            found = self._starter.submit(_Child, self.module, kind).result()
-            with self._lock:
-                self._children[run] = found
+        return found
+
+    def _excess(self, idle: Sequence[_Child]) -> list[_Child]:
+        """The idle children of runs that exceed `most` once another is added, longest idle first."""
+        kept = [child for child in self._children if child.run is not None]
+        ordered = sorted((child for child in idle if child.run is not None), key=lambda child: child.idle_since or 0.0)
+        return ordered[: max(0, len(kept) + 1 - self.most)]
+
+    def _give_back(self, child: _Child, *, drop: bool, free: bool) -> None:
+        """After its work: it ends, or waits for its run's next stage, or for that of any run."""
         with self._lock:
-            return None if run in self._stopped or self._closed else found
+            child.idle_since = time.monotonic()
+            child.run = None if free else child.run
+            if drop:
+                self._remove([child])
+        if drop and child.process.returncode is None:
+            child.end()
+        timer = threading.Timer(IDLE_SECONDS, self.tidy)
+        timer.daemon = True
+        timer.start()
 
-    def _excess(self) -> list[_Child]:
-        """Remove and return the idle children that exceed `most` once another is added, longest idle first."""
-        kept = [each for each in self._children if not each.startswith(PREPARES)]
-        idle = sorted((each for each in kept if each not in self._working), key=lambda each: self._children[each].idle_since or 0.0)
-        return [self._children.pop(each) for each in idle[: max(0, len(kept) + 1 - self.most)]]
-
-    def _spare(self, run: str, kind: Kind) -> _Child | None:
-        """A child that prepared runs and has nothing to do becomes this run's: starting another costs a second."""
-        if run.startswith(PREPARES):
-            return None
-        spare = (each for each, child in self._children.items() if each.startswith(PREPARES) and each not in self._working and child.kind == kind)
-        name = next(spare, None)
-        return None if name is None else self._children.pop(name)
-
-    def _release(self, run: str) -> None:
-        """The child of a finished run may be used by other runs."""
-        with self._lock:
-            if run in self._children:
-                taken = {*self._children, *self._working}
-                name = next(name for number in itertools.count() if (name := f"{PREPARES}{number}") not in taken)
-                self._children[name] = self._children.pop(run)
-                self._children[name].idle_since = time.monotonic()
-
-    def _drop(self, run: str) -> None:
-        with self._lock:
-            found = self._children.pop(run, None)
-        if found is not None and found.process.returncode is None:
-            found.end()
+    def _remove(self, doomed: Sequence[_Child]) -> None:
+        self._children = [child for child in self._children if child not in doomed]
 
 
 def _stopped_result() -> Event:

@@ -6,7 +6,6 @@ A scene's run is authoritative: published stages are never done again, whatever 
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from pipeline.fleet.forecast import forecast_seconds
 from pipeline.fleet.progress import Progress
 from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, FleetState, FleetWord, Scene, SceneState, StageState, Totals, write_fleet
 from pipeline.fleet.workers import Demand, Message, Task, Worker, Workers
+from pipeline.stage import Stage
 from pipeline.text import printable
 
 Report = Callable[[dict[str, Any]], None]
@@ -27,14 +27,6 @@ Report = Callable[[dict[str, Any]], None]
 WRITE_SECONDS = 1.0  # between two writings of fleet.json, and WRITE_INTERVAL_RATIO as long as one takes
 WRITE_INTERVAL_RATIO = 20.0
 LOOK_SECONDS = 1.0  # between two checks for requests, and for workers that came or went
-
-
-@dataclass(frozen=True)
-class StageOf:
-    """A stage of the workflow, as far as it is scheduled."""
-
-    name: str
-    uses_device: bool = False
 
 
 class Scheduler:
@@ -51,7 +43,7 @@ class Scheduler:
     """
 
     def __init__(
-        self, fleet: Path, states: Sequence[SceneState], stages: Sequence[StageOf], workers: Workers, *, device: str = "cpu", report: Report | None = None,
+        self, fleet: Path, states: Sequence[SceneState], stages: Sequence[Stage], workers: Workers, *, device: str = "cpu", report: Report | None = None,
         written: Callable[[FleetState], None] | None = None, stop: Callable[[], int | None] = lambda: None, lost: Callable[[], str | None] = lambda: None,
     ) -> None:  # fmt: skip
         self.fleet = fleet

@@ -62,7 +62,7 @@ def test_compiled_or_loaded_the_artifacts_are_the_same(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     environment = {**os.environ, "ENERF_CACHE_DIR": str(cache), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
-    built = Settings({stage.name: stage.settings for stage in WORKFLOW.stages})
+    built = Settings(WORKFLOW.settings)
     for setting in sources.SETTINGS:
         built.put_option(setting)
     small = json.dumps(small_settings(table_of(built.resolved())))

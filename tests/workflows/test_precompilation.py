@@ -16,7 +16,7 @@ from workflows.precompilation import start
 
 
 def settings(*sets: str) -> dict[str, dict[str, Any]]:
-    built = Settings({stage.name: stage.settings for stage in WORKFLOW.stages})
+    built = Settings(WORKFLOW.settings)
     built.put_table(read_preset("preview", WORKFLOW.presets).table, "preset preview")
     for text in sets:
         built.put_option(text)

@@ -7,7 +7,7 @@ import click
 from efficientnerf.asset.format import describe
 from pipeline.errors import UsageError
 from workflows.cli.options import folder_type, force_option, output_options, workflow
-from workflows.cli.output import closing, listing, write_json
+from workflows.cli.output import closing, conclude, listing, write_json
 from workflows.cli.progress import size
 from workflows.cli.target import asset_of
 from workflows.destination import check_files, writing
@@ -33,11 +33,9 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
     """
     found = compare(first, second, views, size)
     code = 0 if found["equal"] else DIFFERENT
-    if as_json:
-        write_json({"event": "summary", "ok": True, "first": str(first), "second": str(second), **found, "exit_code": code})
-    elif not quiet:
+    if not as_json and not quiet:
         listing(*in_words(found))
-    return code
+    return conclude(as_json=as_json, quiet=True, code=code, ok=True, first=str(first), second=str(second), **found)
 
 
 @click.command()
@@ -62,10 +60,8 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
         convert_asset(what, out, layout, degree, resolution)
     about = describe(out)
     facts = {key: about[key] for key in ("layout", "resolution", "voxels", "sh_degree", "bytes", "bytes_per_voxel")}
-    if as_json:
-        write_json({"event": "summary", "ok": True, "written": [{"path": str(out.absolute()), **facts}], "exit_code": 0})
-    elif not quiet:
-        closing(f"{out}: {about['layout']}, {about['voxels']} voxels, degree {about['sh_degree']}, {size(about['bytes'])}")
+    words = f"{out}: {about['layout']}, {about['voxels']} voxels, degree {about['sh_degree']}, {size(about['bytes'])}"
+    conclude(words, as_json=as_json, quiet=quiet, written=[{"path": str(out.absolute()), **facts}])
 
 
 @click.command()
@@ -87,10 +83,8 @@ def view(what: Path, no_browser: bool, port: int | None, address: str | None, fo
     if port is None:
         page, made = page_of(what, force=force)
         opened = not no_browser and open_in_browser(page.absolute().as_uri())
-        if as_json:
-            write_json({"event": "summary", "ok": True, "page": str(page.absolute()), "made": made, "opened": opened, "exit_code": 0})
-        elif not quiet:
-            closing(str(page.absolute()) + ("" if opened or no_browser else "  (open it in a browser)"))
+        words = str(page.absolute()) + ("" if opened or no_browser else "  (open it in a browser)")
+        conclude(words, as_json=as_json, quiet=quiet, page=str(page.absolute()), made=made, opened=opened)
         return
 
     def ready(url: str) -> None:
@@ -102,5 +96,4 @@ def view(what: Path, no_browser: bool, port: int | None, address: str | None, fo
             open_in_browser(url)
 
     serve(what, workflow().stages, address, port, ready)
-    if as_json:
-        write_json({"event": "summary", "ok": True, "exit_code": 0})
+    conclude(as_json=as_json, quiet=True)

@@ -27,7 +27,7 @@ from stages.turntable.run import cameras_of
 from stages.turntable.settings import TurntableSettings
 from workflows import exporting, exporting_splats
 from workflows.cli.options import common_options, crop_option, folder_type, force_option, json_option, memory_limit, memory_option, output_options, set_option
-from workflows.cli.output import closing, listing, write_json
+from workflows.cli.output import conclude, listing, write_json
 from workflows.cli.progress import display
 from workflows.cli.resolve import Settings
 from workflows.cli.target import is_run
@@ -82,10 +82,9 @@ def export(
 ) -> None:
     if as_list:
         rows = exporting.formats()
-        if as_json:
-            write_json({"event": "summary", "ok": True, "formats": rows, "exit_code": 0})
-        else:
+        if not as_json:
             listing(*exporting.formats_in_words(rows))
+        conclude(as_json=as_json, quiet=True, formats=rows)
         return
     if what is None or first is None:
         raise UsageError("Give a run or an asset, and --to FILE. 'enerf export --list' names the formats.")
@@ -101,12 +100,11 @@ def export(
         written += exporting.export_volumes(asked, settings)
         written += exporting_splats.export_splats(asked, settings, _progress("export", show))
         written += exporting.export_surface(asked, settings, _progress("export", show))
-    if as_json:
-        write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
-    elif not quiet:
-        for entry in written:
-            facts = ", ".join(f"{value} {name}" for name, value in entry.items() if name not in ("path", "beside"))
-            closing(f"{entry['path']}  ({facts})", *(f"{each}  (belongs to it)" for each in entry.get("beside", ())))
+    words = []
+    for entry in written:
+        facts = ", ".join(f"{value} {name}" for name, value in entry.items() if name not in ("path", "beside"))
+        words += [f"{entry['path']}  ({facts})", *(f"{each}  (belongs to it)" for each in entry.get("beside", ()))]
+    conclude(*words, as_json=as_json, quiet=quiet, written=written)
 
 
 def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> Settings:
@@ -179,10 +177,8 @@ def render(
             with writing(video, force=force):
                 encode_frames([each for each in written if each.suffix == ".png"], video, options)
             written.append(video)
-    if as_json:
-        write_json({"event": "summary", "ok": True, "written": [str(each.absolute()) for each in written], "exit_code": 0})
-    elif not quiet:
-        closing(f"{len(cameras)} frames in {out}" + (f", {video}" if video is not None else ""))
+    words = f"{len(cameras)} frames in {out}" + (f", {video}" if video is not None else "")
+    conclude(words, as_json=as_json, quiet=quiet, written=[str(each.absolute()) for each in written])
 
 
 def _restricted_with_cameras(

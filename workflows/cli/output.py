@@ -156,6 +156,15 @@ def closing(*lines: str) -> None:
         listing(*lines)
 
 
+def conclude(*lines: str, as_json: bool, quiet: bool = False, code: int = 0, **facts: Any) -> int:
+    """End a command: with --json by its summary, the last line; else by what it did, in words. Returns the exit code."""
+    if as_json:
+        write_json({"event": "summary", "ok": code == 0, **facts, "exit_code": code})
+    elif not quiet:
+        closing(*lines)
+    return code
+
+
 def write_json(value: Any, *, indent: int | None = None) -> None:
     """One JSON object on standard output, in ASCII: names keep every byte, as escapes."""
     print(json.dumps(plain(value), indent=indent, ensure_ascii=True, allow_nan=False), flush=True)

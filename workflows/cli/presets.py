@@ -4,11 +4,10 @@ from typing import Any
 
 import click
 
-from pipeline.errors import UsageError
 from stages.settings import SettingInfo, describe_settings
 from workflows.cli.options import common_options, json_option, workflow
 from workflows.cli.output import listing, write_json
-from workflows.cli.resolve import Settings, meaning, nearest, preset_names, read_preset, shown, table_of
+from workflows.cli.resolve import Settings, check_stage, meaning, preset_names, read_preset, shown, table_of
 
 
 @click.command()
@@ -19,10 +18,9 @@ from workflows.cli.resolve import Settings, meaning, nearest, preset_names, read
 def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
     """List the presets and the main settings with their defaults and meaning, or all settings of the given stages."""
     folder = workflow().presets
-    types = {stage.name: stage.settings for stage in workflow().stages}
+    types = workflow().settings
     for name in stages:
-        if name not in types:
-            raise UsageError(f"{name}: no such stage.{nearest(name, types)} Stages: {', '.join(types)}.")
+        check_stage(name, types)
     settings = Settings(types)
     if preset is not None:
         settings.put_table(read_preset(preset, folder).table, f"preset {preset}")

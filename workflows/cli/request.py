@@ -99,7 +99,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         if preset is None:
             preset = "standard" if device != "cpu" and has_cuda() else "preview"
     warnings: list[str] = []
-    settings = Settings({stage.name: stage.settings for stage in workflow.stages})
+    settings = Settings(workflow.settings)
     if preset is not None:
         settings.put_table(read_preset(preset, workflow.presets).table, f"preset {preset}")
     elif standing is not None:

@@ -7,7 +7,7 @@ mapping `{stage: {setting: value}}`.
 import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """` Nearest: x.` or nothing, for the end of an error message."""
     found = difflib.get_close_matches(name[:MAX_SHOWN], list(known), n=1, cutoff=0.5)
     return f" Nearest: {found[0]}." if found else ""
+
+
+def check_stage(name: str | None, known: Collection[str], option: str = "") -> None:
+    """Raise UsageError for a stage that does not exist; None is none."""
+    if name is not None and name not in known:
+        raise UsageError(f"{option}{name}: no such stage.{nearest(name, known)} Stages: {', '.join(known)}.")
 
 
 def preset_names(folder: Path = WORKFLOW.presets) -> list[str]:

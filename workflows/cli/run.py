@@ -19,10 +19,10 @@ from stages.cores import count_cores
 from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
 from workflows.cli.options import device_option, folder_type, memory_option, output_options, set_option, workflow
-from workflows.cli.output import closing, write_json
+from workflows.cli.output import conclude
 from workflows.cli.progress import display, warning
 from workflows.cli.request import Options, Plan, plan_run
-from workflows.cli.resolve import nearest
+from workflows.cli.resolve import check_stage
 from workflows.cli.target import open_run
 from workflows.precompilation.start import precompiling
 from workflows.report.pages import has_pages, write_pages
@@ -96,11 +96,9 @@ def run(
 @output_options
 def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Run the stage NAME of RUN on the artifacts of earlier stages. Those are not rerun; stale ones are listed."""
-    names = [each.name for each in workflow().stages]
-    if name not in names:
-        raise UsageError(f"{name}: no such stage.{nearest(name, names)} Stages: {', '.join(names)}.")
+    check_stage(name, workflow().settings)
     for text in options["sets"]:
-        if text.partition(".")[0].strip() in {*names} - {name}:
+        if text.partition(".")[0].strip() in workflow().settings.keys() - {name}:
             raise UsageError(f"--set {text}: not a setting of {name}, the only stage that runs here. Use: enerf run --out {run_folder} --set {text}")
     open_run(run_folder)  # says so where it is none
     plan = plan_run(run_folder, workflow(), Options(**options))
@@ -110,7 +108,8 @@ def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool
 def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str | None = None, jobs: int | None = 1, **selection: Any) -> int:
     """Run a plan, display its progress, and print the summary; returns the exit code."""
     device = resolve_device(plan.device)
-    _check_stages(selection)
+    for option in ("until", "start"):  # before a run is created
+        check_stage(selection.get(option), workflow().settings, f"--{'from' if option == 'start' else option} ")
     started = time.monotonic()
     run: Run = plan.run
     try:
@@ -130,11 +129,8 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str
     facts, elapsed = summary(run.path, outcomes), time.monotonic() - started
     found = None if dry_run or fail_on is None else graded(run.path, outcomes)
     code = GRADED if found is not None and found.is_as_bad_as(str(fail_on)) else 0
-    if as_json:
-        write_json({"event": "summary", "ok": code == 0, **facts, "elapsed": elapsed, "device": device, "exit_code": code})
-    elif not quiet and not dry_run:
-        closing(*in_words(run.path, outcomes, elapsed))
-    return code
+    words = [] if as_json or dry_run else in_words(run.path, outcomes, elapsed)
+    return conclude(*words, as_json=as_json, quiet=quiet or dry_run, code=code, **facts, elapsed=elapsed, device=device)
 
 
 def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextManager[SideBySide | None]:
@@ -151,12 +147,3 @@ def _side_by_side(run: Run, device: str, jobs: int | None) -> AbstractContextMan
         return None
 
     return SideBySide(workflow().child, jobs, count_cores(), need, least)
-
-
-def _check_stages(selection: dict[str, Any]) -> None:
-    """UsageError for a stage that does not exist, before a run is created."""
-    names = [stage.name for stage in workflow().stages]
-    for option in ("until", "start"):
-        name = selection.get(option)
-        if name is not None and name not in names:
-            raise UsageError(f"--{'from' if option == 'start' else option} {name}: no such stage.{nearest(name, names)} Stages: {', '.join(names)}.")

@@ -30,7 +30,7 @@ def recorded_run(path: Path) -> Run:
 def open_run(path: Path) -> Run:
     """The same without settings that this version does not have."""
     run = recorded_run(path)
-    settings = Settings({stage.name: stage.settings for stage in workflow().stages})
+    settings = Settings(workflow().settings)
     if settings.put_recorded(run.settings):
         run.settings = table_of(settings.resolved())
     return run

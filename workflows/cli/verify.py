@@ -8,7 +8,7 @@ from pipeline.errors import CorruptArtifact
 from pipeline.runner import verify as verify_run
 from workflows.cli.failures import Reported
 from workflows.cli.options import folder_type, output_options, workflow
-from workflows.cli.output import closing, write_json
+from workflows.cli.output import conclude
 from workflows.cli.progress import display, size
 from workflows.cli.target import open_run
 from workflows.report.signature import altered_pages
@@ -35,11 +35,9 @@ def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
     except CorruptArtifact as error:
         raise Reported(error, {"asset": str(path), "damaged": list(error.files)}) from error
     about = describe_asset(path)
-    if as_json:
-        facts = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
-        write_json({"event": "summary", "ok": True, "asset": str(path), **facts, "damaged": [], "exit_code": 0})
-    elif not quiet:
-        closing(f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(path.stat().st_size)}, all as written")
+    facts = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
+    words = f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(path.stat().st_size)}, all as written"
+    conclude(words, as_json=as_json, quiet=quiet, asset=str(path), **facts, damaged=[])
 
 
 def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
@@ -49,8 +47,5 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
             outcomes = verify_run(run, workflow().stages, show, altered=altered_pages(run.path))
     except CorruptArtifact as error:
         raise Reported(error, {"run": str(run.path), "damaged": list(error.files)}) from error
-    if as_json:
-        write_json({"event": "summary", "ok": True, "run": str(run.path), "stages": [each.stage for each in outcomes], "damaged": [], "exit_code": 0})
-    elif not quiet:
-        total = sum(each.size for each in outcomes)
-        closing(f"{run.path}: {len(outcomes)} stages, {size(total)}, all as written")
+    words = f"{run.path}: {len(outcomes)} stages, {size(sum(each.size for each in outcomes))}, all as written"
+    conclude(words, as_json=as_json, quiet=quiet, run=str(run.path), stages=[each.stage for each in outcomes], damaged=[])

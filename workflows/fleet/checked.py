@@ -68,7 +68,7 @@ class Checker:
         self.workflow = workflow
         self.what = what
         self.mistakes: list[tuple[int, str]] = []
-        self._settings = Settings({stage.name: stage.settings for stage in workflow.stages})
+        self._settings = Settings(workflow.settings)
         self._known: dict[tuple[str, str, str], Any] = {}
 
     def mistake(self, text: str, *, line: int | None = None, scene: str | None = None) -> None:
@@ -157,7 +157,7 @@ class Checker:
 
 def table_of_options(texts: Sequence[str], workflow: Workflow) -> Table:
     """The settings of `--set stage.name=value` for all scenes; each value is still Text, and checked. Raises UsageError."""
-    checked = Settings({stage.name: stage.settings for stage in workflow.stages})
+    checked = Settings(workflow.settings)
     found: Table = {}
     for text in texts:
         checked.put_option(text)

@@ -15,14 +15,14 @@ from pipeline.text import printable
 from workflows.cli.device import resolve_device
 from workflows.cli.failures import Reported
 from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_limit, memory_option, output_options, set_option, workflow
-from workflows.cli.output import closing, listing, write_json
+from workflows.cli.output import closing, conclude, listing, write_json
 from workflows.cli.progress import duration, size
 from workflows.cli.resolve import read_preset, read_toml
 from workflows.fleet.checked import Choice, refuse_what_cannot_work, table_of_options
 from workflows.fleet.display import display
 from workflows.fleet.manifest import read_manifest
 from workflows.fleet.pages.index import quality_of
-from workflows.fleet.running import Placement, check_fleet_folder, is_running, run_fleet, scenes_to_retry
+from workflows.fleet.running import Placement, check_fleet_folder, check_known, is_running, run_fleet, scenes_to_retry
 from workflows.fleet.sweeps import read_sweeps, swept
 from workflows.fleet.table import BAD_GRADES, overview
 
@@ -136,10 +136,7 @@ def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **op
 @common_options
 def cancel(folder: Path, names: tuple[str, ...]) -> None:
     """Stop FLEET, or only the given scenes, at the next safe point, on whichever machine it runs. Finished work is kept."""
-    known = {scene.name for scene in read_fleet(folder).scenes}
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise BadInput(f"{unknown[0]}: the fleet has no such scene. 'enerf fleet status {folder}' lists them.")
+    check_known(read_fleet(folder).scenes, names)
     if not is_running(folder):
         raise BadInput(f"{folder}: nobody runs it; there is nothing to cancel.")
     outcome = requests.outcome(requests.ask(folder, "cancel", names or None), lambda: is_running(folder))
@@ -170,13 +167,9 @@ def _run(folder: Path, scenes: Any, *, as_json: bool, quiet: bool, retry: Any, *
             found = run_fleet(folder, scenes, workflow(), placement, retry=retry, report=show, written=show.written)
     except (Exception, KeyboardInterrupt) as error:
         raise Reported(error, {"fleet": str(folder)}) from error
-    if as_json:
-        write_json({"event": "summary", "ok": found.exit_code == 0, "fleet": str(folder), "totals": asdict(found.totals), "exit_code": found.exit_code})
-    elif not quiet:
-        scenes = read_fleet(folder).scenes
-        bad = [each for each in scenes if each.state in ("failed", "quarantined") or (each.result is not None and each.result.grade in BAD_GRADES)]
-        closing(*_overview(folder, found), *map(_line, bad))
-    return found.exit_code
+    bad = [each for each in found.scenes if each.state in ("failed", "quarantined") or (each.result is not None and each.result.grade in BAD_GRADES)]
+    words = [*_overview(folder, found), *map(_line, bad)]
+    return conclude(*words, as_json=as_json, quiet=quiet, code=found.exit_code, fleet=str(folder), totals=asdict(found.totals))
 
 
 def _overview(folder: Path, found: FleetState) -> list[str]:

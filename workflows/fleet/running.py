@@ -15,7 +15,7 @@ from pipeline.executors.memory import Limit
 from pipeline.executors.processes import Processes
 from pipeline.failures import cannot_write
 from pipeline.fleet import requests
-from pipeline.fleet.scheduler import Report, Scheduler, StageOf, states_for
+from pipeline.fleet.scheduler import Report, Scheduler, states_for
 from pipeline.fleet.state import NAME, FleetState, Scene, SceneState, check_scenes, read_fleet
 from pipeline.fleet.workers import Worker, Workers
 from pipeline.interrupt import stopping
@@ -107,19 +107,23 @@ def run_fleet(
         for state in states:
             if state.name in again and state.state in ("failed", "quarantined"):
                 state.state = "waiting"
-        stages = [StageOf(stage.name, stage.uses_device) for stage in workflow.stages]
         lost = _lost(fleet, lease)
         workers = _workers(workflow, placement)
-        return Scheduler(fleet, states, stages, workers, device=placement.device, report=report, written=written, stop=stop, lost=lost).run()
+        return Scheduler(fleet, states, workflow.stages, workers, device=placement.device, report=report, written=written, stop=stop, lost=lost).run()
+
+
+def check_known(states: Sequence[SceneState], names: Sequence[str]) -> None:
+    """Raise BadInput for a name that no scene has."""
+    known = {state.name for state in states}
+    for name in names:
+        if name not in known:
+            raise BadInput(f"{name!r:.100}: the fleet has no such scene. 'enerf fleet status FLEET' lists them.")
 
 
 def scenes_to_retry(states: Sequence[SceneState], names: Sequence[str]) -> list[str]:
     """The failed and quarantined scenes of these names; of all where none is given. Raises BadInput for a name that no scene has."""
-    known = {state.name: state for state in states}
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise BadInput(f"{unknown[0]!r:.100}: the fleet has no such scene. 'enerf fleet status FLEET' lists them.")
-    return [name for name, state in known.items() if state.state in ("failed", "quarantined") and (not names or name in names)]
+    check_known(states, names)
+    return [state.name for state in states if state.state in ("failed", "quarantined") and (not names or state.name in names)]
 
 
 def _lost(fleet: Path, lease: Lease) -> Callable[[], str | None]:

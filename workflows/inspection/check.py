@@ -34,7 +34,7 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
     """
     if not source.exists():
         raise BadInput(f"{source}: no such folder or file. Expected photographs, a video, or a posed data set.")
-    settings = Settings({stage.name: stage.settings for stage in workflow.stages})
+    settings = Settings(workflow.settings)
     settings.put_table(read_preset(CPU_PRESET, workflow.presets).table, f"preset {CPU_PRESET}")
     for text in sets:
         settings.put_option(text)

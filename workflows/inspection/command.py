@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from workflows.cli.options import folder_type, memory_limit, memory_option, output_options, set_option, workflow
-from workflows.cli.output import closing, listing, write_json
+from workflows.cli.output import conclude, listing
 from workflows.inspection.check import check_source, in_words
 from workflows.precompilation.start import start_alone
 
@@ -26,11 +26,8 @@ def check(source: Path, format_name: str | None, sets: tuple[str, ...], memory: 
     settings = ("poses.format=" + format_name,) if format_name else ()
     found = check_source(source, (*sets, *settings), memory_limit(memory), workflow())
     code = 2 if found["grade"] == "failed" else 0
-    if as_json:
-        write_json({"event": "summary", "ok": code == 0, **found, "exit_code": code})
-    else:
-        first, *others = in_words(found)
-        closing(first)
-        if not quiet:
-            listing(*others)
+    first, *others = in_words(found)
+    conclude(first, as_json=as_json, code=code, **found)
+    if not as_json and not quiet:
+        listing(*others)
     return code

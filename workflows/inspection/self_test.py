@@ -20,7 +20,7 @@ SMALLER: Table = {
 def self_test(folder: Path) -> None:
     """Raises what a stage raises. No page is written, and nothing is compiled in the background: both would take the time of the test."""
     write_scene(folder / "source")
-    settings = Settings({stage.name: stage.settings for stage in WORKFLOW.stages})
+    settings = Settings(WORKFLOW.settings)
     settings.put_table(read_preset("tiny", WORKFLOW.presets).table, "preset tiny")
     settings.put_table(SMALLER, "the self-test")
     run_stages(Run.create(folder / "run", folder / "source", table_of(settings.resolved()), device="cpu"), WORKFLOW.stages, device="cpu", until="bake")

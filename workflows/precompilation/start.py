@@ -38,7 +38,7 @@ SMALLER: Table = {
 
 def small_settings(settings: Table) -> dict[str, dict[str, Any]]:
     """The preset tiny with the choices of these settings. Those of poses are left out: they tell how a source is read."""
-    built = Settings({stage.name: stage.settings for stage in WORKFLOW.stages})
+    built = Settings(WORKFLOW.settings)
     tiny = read_preset("tiny", WORKFLOW.presets).table
     built.put_table(tiny, "preset tiny")
     small = table_of(built.resolved())
@@ -80,7 +80,7 @@ def precompiling(execute: Executor, settings: Table, memory: Limit | None) -> It
 
 def start_alone() -> None:
     """Compile the kernels of runs with the usual settings, in a process that goes on when this one ends."""
-    usual = Settings({stage.name: stage.settings for stage in WORKFLOW.stages})
+    usual = Settings(WORKFLOW.settings)
     usual.put_table(read_preset(USUAL, WORKFLOW.presets).table, f"preset {USUAL}")
     if _is_worth_it(limit_for(None, None)):
         start(table_of(usual.resolved()), detached=True)

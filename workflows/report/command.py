@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from workflows.cli.options import common_options, folder_type, json_option, workflow
-from workflows.cli.output import closing, write_json
+from workflows.cli.output import conclude
 from workflows.cli.target import open_run
 from workflows.report.page import write_report
 from workflows.report.viewer import write_run_viewer
@@ -21,8 +21,5 @@ def report(run_folder: Path, as_json: bool) -> None:
     run = open_run(run_folder)
     viewer = write_run_viewer(run, anew=True)
     path = write_report(run, workflow().stages)
-    if as_json:
-        shown = {} if viewer is None else {"viewer": str(viewer)}
-        write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), **shown, "exit_code": 0})
-    else:
-        closing(str(path), *([] if viewer is None else [str(viewer)]))
+    shown = {"report": str(path)} | ({} if viewer is None else {"viewer": str(viewer)})
+    conclude(*shown.values(), as_json=as_json, run=str(run.path), **shown)

@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 
 from pipeline.fleet import scheduler
-from pipeline.fleet.scheduler import Scheduler, StageOf, states_for
+from pipeline.fleet.scheduler import Scheduler, states_for
 from pipeline.fleet.state import FleetState, Scene, SceneState
 from pipeline.fleet.workers import Message, Task, Worker
+from pipeline.stage import Stage
+from tests.pipeline.toy import NoSettings
 
 STAGES = ("poses", "train", "bake")
 Answer = Callable[[Task], dict[str, Any] | None]
@@ -112,7 +114,8 @@ def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
 def run(fleet: Path, workers: Simulated, chosen: list[Scene], **more: Any) -> FleetState:
     fleet.mkdir(exist_ok=True)
     states = states_for(chosen, more.pop("former", None))
-    return Scheduler(fleet, states, [StageOf("poses"), StageOf("train", True), StageOf("bake", True)], workers, **more).run()
+    stages = [Stage(name, 1, NoSettings, (), lambda job: None, uses_device=name != "poses") for name in STAGES]
+    return Scheduler(fleet, states, stages, workers, **more).run()
 
 
 def state_of(found: FleetState, name: str) -> SceneState:
