@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from efficientnerf.asset.format import FormatError, describe, outline, serialize
+from efficientnerf.asset.format import describe, outline, serialize
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.surface.mesh import Mesh, moved
 from pipeline.decide import decide
-from pipeline.errors import BadInput, CorruptArtifact, UsageError
+from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.files import write_atomically
 from pipeline.stage import settings_dict, settings_from
@@ -35,7 +35,7 @@ from stages.viewer.page import compact_bytes, viewer_page
 from workflows.cli.resolve import Settings
 from workflows.cli.target import asset_of, is_run, open_run
 from workflows.destination import check_files, check_free, writing
-from workflows.loading import load_asset
+from workflows.loading import damage_of, load_asset
 from workflows.report.viewer import captured
 
 CAMERAS, VIEWER = ".json", ".html"
@@ -216,13 +216,11 @@ def export_viewers(export: Export) -> list[Written]:
     """The asset as a page for browsers: all of it, unless --region or --crop say what; with the cameras and photographs of a run."""
     if not export.viewers:
         return []
-    try:
+    with damage_of(asset_of(export.what)):
         if export.region is None and export.crop is None and not (is_run(export.what) and load_frame(export.what)):
             asset = compact_bytes(asset_of(export.what))
         else:
             asset = serialize(restricted(load_asset(export.what), export.region or "all", export.crop), "compact")
-    except FormatError as error:
-        raise CorruptArtifact(f"{export.what}: {error}", (str(export.what),)) from error
     cameras, photographs = captured(export.what) if is_run(export.what) else ([], {})
     page = viewer_page(asset, cameras=cameras, photographs=photographs, title=export.what.absolute().stem)
     for path in export.viewers:

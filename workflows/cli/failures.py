@@ -25,48 +25,36 @@ class Reported(Exception):
         self.facts = facts
 
 
-def exit_code(error: BaseException) -> int:
+def judged(error: BaseException) -> tuple[int, str]:
+    """The exit code, and the error in one or two lines."""
     if isinstance(error, PipelineError):
-        return int(error.exit_code)
+        return int(error.exit_code), str(error)
     if isinstance(error, click.exceptions.Exit):
-        return error.exit_code
+        return error.exit_code, ""
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        return 130
-    if isinstance(error, click.ClickException):
-        return 2
-    if isinstance(error, OSError):
-        return 2 if is_of_the_path(error) else 3
-    if isinstance(error, MemoryError):
-        return 3
-    if isinstance(error, UnicodeEncodeError):
-        return 2  # of a file's name
-    return INTERNAL
-
-
-def sentence(error: BaseException) -> str:
-    """The error in one or two lines."""
-    if isinstance(error, PipelineError):
-        return str(error)
-    if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        return "interrupted"
+        return 130, "interrupted"
     if isinstance(error, click.ClickException):
         text = error.format_message()
         # click says where help is to be found in lines of its own; one will do.
         context = getattr(error, "ctx", None)
-        return f"{text if text.endswith(('.', '?')) else f'{text}.'} Try '{context.command_path} --help'." if context is not None else text
+        return 2, f"{text if text.endswith(('.', '?')) else f'{text}.'} Try '{context.command_path} --help'." if context is not None else text
     if isinstance(error, OSError):
-        if isinstance(error, FileNotFoundError) and not error.filename and _working_folder_is_gone():
-            return "the working folder is gone: it was deleted or moved, and relative paths lead nowhere. Change to another folder, or give absolute paths."
-        what = error.strerror or type(error).__name__
-        if is_disk_full(error):
-            return f"{error.filename or 'the disk'}: {what}. Free some space and run the same command again; nothing is lost."
-        return f"{error.filename}: {what}." if error.filename else f"{what}."
+        return 2 if is_of_the_path(error) else 3, _of_the_system(error)
     if isinstance(error, MemoryError):
-        return "out of memory. Close other programs, or ask for less: smaller images, fewer voxels."
+        return 3, "out of memory. Close other programs, or ask for less: smaller images, fewer voxels."
     if isinstance(error, UnicodeEncodeError):
-        return f"{error.object[:200]}: a file of this name cannot be opened in the encoding {error.encoding}. Set LC_ALL=C.UTF-8."
+        return 2, f"{error.object[:200]}: a file of this name cannot be opened in the encoding {error.encoding}. Set LC_ALL=C.UTF-8."
     text = " ".join(str(error).split())
-    return f"internal error: {type(error).__name__}: {text[:300]}. Run it again with --debug for the traceback."
+    return INTERNAL, f"internal error: {type(error).__name__}: {text[:300]}. Run it again with --debug for the traceback."
+
+
+def _of_the_system(error: OSError) -> str:
+    if isinstance(error, FileNotFoundError) and not error.filename and _working_folder_is_gone():
+        return "the working folder is gone: it was deleted or moved, and relative paths lead nowhere. Change to another folder, or give absolute paths."
+    what = error.strerror or type(error).__name__
+    if is_disk_full(error):
+        return f"{error.filename or 'the disk'}: {what}. Free some space and run the same command again; nothing is lost."
+    return f"{error.filename}: {what}." if error.filename else f"{what}."
 
 
 def _working_folder_is_gone() -> bool:
@@ -93,12 +81,12 @@ def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
         error = error.__cause__  # click takes the end of any file for that of the terminal; only a prompt's is an interrupt, and there are none
     if isinstance(error, SystemExit):
         raise error
-    code = exit_code(error)
+    code, text = judged(error)
     if code == 0:
         return 0
     if debug:
         traceback.print_exception(error, file=sys.stderr)
-    text = _shortened(printable(sentence(error)))
+    text = _shortened(printable(text))
     details = [_shortened(printable(line)) for line in getattr(error, "details", ())]
     print("\n  ".join([f"enerf: {text}", *details]), file=sys.stderr, flush=True)
     if as_json:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, TextIO
 
 from pipeline.text import printable
@@ -172,32 +173,24 @@ class Bars:
         self.progress.update(self.tasks[stage][0], completed=event.get("done", 0), description=printable(words).replace("[", "\\["))
 
 
-class JsonLines:
-    """One JSON object per event on standard output."""
-
-    def __init__(self, quiet: bool = False) -> None:
-        self.quiet = quiet
-
-    def __call__(self, event: Event) -> None:
-        if not (self.quiet and event["event"] == "progress"):
-            write_json(event)
+def json_line(event: Event, *, quiet: bool = False) -> None:
+    """One JSON object per event on standard output; `quiet`: but for progress."""
+    if not (quiet and event["event"] == "progress"):
+        write_json(event)
 
 
-class Quiet:
-    """Warnings, and nothing else."""
-
-    def __call__(self, event: Event) -> None:
-        if event["event"] == "warning":
-            print(_line(event.get("stage") or "", sentence(event)), file=sys.stderr, flush=True)
+def warnings_only(event: Event) -> None:
+    if event["event"] == "warning":
+        print(_line(event.get("stage") or "", sentence(event)), file=sys.stderr, flush=True)
 
 
 @contextmanager
 def display(*, as_json: bool, quiet: bool) -> Iterator[Callable[[Event], None]]:
     """The display for the options and the kind of output."""
     if as_json:
-        yield JsonLines(quiet)
+        yield partial(json_line, quiet=quiet)
     elif quiet:
-        yield Quiet()
+        yield warnings_only
     elif sys.stderr.isatty():
         with Bars() as bars:
             yield bars

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.fleet.state import FleetState
 from pipeline.text import printable
 from workflows.cli.output import write_json
-from workflows.cli.progress import duration
+from workflows.cli.progress import duration, json_line
 from workflows.fleet.pages.updates import Pages
 from workflows.fleet.table import LiveTable
 
@@ -30,8 +30,7 @@ class Show:
     def __call__(self, event: dict[str, Any]) -> None:
         self._pages.catch_up()
         if self.as_json:
-            if not (self.quiet and event["event"] == "progress"):
-                write_json(event)
+            json_line(event, quiet=self.quiet)
             return
         line, bad = sentence(event), event["event"] in _BAD
         if self.table is not None:

@@ -8,12 +8,12 @@ from typing import Any
 from pipeline.run import NAME, Run
 from pipeline.runner import refuse_what_cannot_work
 from pipeline.stage import Stage, settings_of
-from stages.artifacts import BakeOutputs
+from stages.artifacts import BakeOutputs, EvaluateOutputs
 from workflows.cli.request import Options, plan_run
 from workflows.cli.target import resume_command
 from workflows.inspection.status import camera_verdict, result_verdict
+from workflows.report.documents import Metrics, sound
 from workflows.report.pages import has_pages, write_pages
-from workflows.report.summary import metrics
 from workflows.workflow import Workflow
 
 _PARTS = ("network", "asset", "mesh", "splats")
@@ -42,7 +42,8 @@ class WorkflowProgram:
 
     def describe(self, run: Path) -> dict[str, Any]:
         """The verdicts on its cameras and on what was made, PSNR and SSIM of that, and the size of its asset."""
-        found = metrics(run) or {}
+        measured = sound(EvaluateOutputs.of_run(run).metrics, Metrics)
+        found = {} if measured is None else measured[1]
         shown = {part: {name: found[part].get(name) for name in ("psnr", "ssim")} for part in _PARTS if found.get(part)}
         try:
             size = BakeOutputs.of_run(run).asset.stat().st_size

@@ -64,21 +64,8 @@ def read_sweeps(texts: Sequence[str], workflow: Workflow) -> list[Sweep]:
 
 
 def split_values(text: str) -> list[str]:
-    """The values between commas; a list in brackets and a text in quotes are one value each."""
-    values, depth, quote, begin = [], 0, "", 0
-    for at, character in enumerate(text):
-        if quote:
-            quote = "" if character == quote else quote
-        elif character in "\"'":
-            quote = character
-        elif character in "[{":
-            depth += 1
-        elif character in "]}":
-            depth -= 1
-        elif character == "," and depth == 0:
-            values.append(text[begin:at].strip())
-            begin = at + 1
-    values.append(text[begin:].strip())
+    """The values between commas; a list in brackets is one value."""
+    values = [value.strip() for value in re.split(r",(?![^\[]*\])", text)]
     return values if all(values) else []
 
 

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline import files
 from pipeline.decide import Decision
 from pipeline.locks.lock import holder_of
 from pipeline.run import Run
 from stages.artifacts import EvaluateOutputs, PosesOutputs
+from workflows.report.documents import Verdict, sound
 
 
 def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
@@ -30,13 +30,8 @@ def result_verdict(run: Path) -> dict[str, Any] | None:
 
 
 def _verdict(path: Path) -> dict[str, Any] | None:
-    try:
-        found = files.read_json(path)
-    except (OSError, files.Unreadable):
-        return None
-    if not isinstance(found, dict) or not all(isinstance(found.get(key), str) for key in ("grade", "summary")):
-        return None
-    return {"grade": found["grade"], "summary": found["summary"]}
+    found = sound(path, Verdict)
+    return None if found is None else {"grade": found[0].grade, "summary": found[0].summary}
 
 
 def _stage(decision: Decision) -> dict[str, Any]:

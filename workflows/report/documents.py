@@ -26,12 +26,6 @@ class Quality(msgspec.Struct):
     psnr_colour_fitted: float | None = None
 
 
-class NetworkQuality(Quality):
-    """Those of the network; `floaters` is its own share of opacity before its surfaces."""
-
-    floaters: float | None = None
-
-
 class MeshQuality(Quality):
     """Those of the mesh in its texture; in the colours of its vertices; on the pixels that it covers, and the asset's on the same."""
 
@@ -39,37 +33,37 @@ class MeshQuality(Quality):
     ssim_vertex_colours: float | None = None
     psnr_covered: float | None = None
     asset_psnr_covered: float | None = None
-    faces: int | None = None
-    texture_size: int | None = None
 
 
-class ViewQuality(msgspec.Struct):
+class OfView(msgspec.Struct):
     """The figures of one view, of the network, of the asset and of the mesh."""
 
-    name: str = ""
     network: Quality | None = None
     asset: Quality | None = None
     mesh: Quality | None = None
+
+
+class ViewQuality(OfView):
+    """A measured view."""
+
+    name: str = ""
     gap: Quality | None = None
     holes: float | None = None
     floaters: float | None = None
 
 
-class Strip(msgspec.Struct):
-    """A picture of photograph, network, asset and mesh: of which view, and the figures of what it shows."""
+class Strip(OfView):
+    """A picture of photograph, network, asset and mesh: of which view."""
 
     which: str = ""
     view: str = ""
-    network: Quality | None = None
-    asset: Quality | None = None
-    mesh: Quality | None = None
 
 
 class Metrics(msgspec.Struct):
     """metrics.json, as far as it is shown; see `stages.evaluate.summary`."""
 
     split: str = "test"
-    network: NetworkQuality | None = None
+    network: Quality | None = None
     asset: Quality | None = None
     mesh: MeshQuality | None = None
     splats: Quality | None = None
@@ -89,6 +83,13 @@ class ResultProblem(msgspec.Struct):
     cause: str = ""
     remedy: str = ""
     picture: str = ""
+
+
+class Verdict(msgspec.Struct):
+    """A verdict: its grade, and a sentence."""
+
+    grade: str
+    summary: str
 
 
 class ResultVerdict(msgspec.Struct):
@@ -115,3 +116,11 @@ def read(path: Path, kind: type[T]) -> tuple[T, dict[str, Any]] | None:
         raise Damaged(f"{name}: damaged ({error})") from None
     except UnicodeEncodeError:  # of msgspec, where it looks a name up
         raise Damaged(f"{name}: damaged (a name in it is no text)") from None
+
+
+def sound(path: Path, kind: type[T]) -> tuple[T, dict[str, Any]] | None:
+    """The same; None for a damaged document, too."""
+    try:
+        return read(path, kind)
+    except Damaged:
+        return None

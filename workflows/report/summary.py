@@ -5,14 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from pipeline.runner import Outcome
 from pipeline.text import printable
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.progress import duration, size
-from workflows.report import documents
-from workflows.report.documents import Metrics, ResultProblem, ResultVerdict
+from workflows.report.documents import Metrics, ResultProblem, ResultVerdict, sound
 
 RUN = Path()
 POSES, TRAIN, BAKE, EVALUATE = PosesOutputs.of_run(RUN), TrainOutputs.of_run(RUN), BakeOutputs.of_run(RUN), EvaluateOutputs.of_run(RUN)
@@ -35,37 +32,22 @@ def artifacts(run: Path) -> dict[str, str]:
     return {name: str(run / path) for name, path in ARTIFACTS.items() if (run / path).exists()}
 
 
-def metrics(run: Path) -> dict[str, Any] | None:
-    """RUN/evaluate/metrics.json, or None where it is missing or damaged."""
-    return _document(EvaluateOutputs.of_run(run).metrics, Metrics)
-
-
-def result(run: Path) -> dict[str, Any] | None:
-    """RUN/evaluate/verdict.json, or None where it is missing or damaged."""
-    return _document(EvaluateOutputs.of_run(run).verdict, ResultVerdict)
-
-
 def graded(run: Path, outcomes: Sequence[Outcome]) -> ResultVerdict | None:
     """The verdict on the result that these outcomes of stages made; None where they did not come so far. Of no outcomes: the one that is there."""
-    document = result(run) if not outcomes or any(outcome.stage == EvaluateOutputs.stage for outcome in outcomes) else None
-    return None if document is None else msgspec.convert(document, ResultVerdict)
-
-
-def _document(path: Path, kind: type[Any]) -> dict[str, Any] | None:
-    try:
-        found = documents.read(path, kind)
-    except documents.Damaged:
-        return None
-    return None if found is None else found[1]
+    reached = not outcomes or any(outcome.stage == EvaluateOutputs.stage for outcome in outcomes)
+    found = sound(EvaluateOutputs.of_run(run).verdict, ResultVerdict) if reached else None
+    return None if found is None else found[0]
 
 
 def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """The facts of the last line of `enerf run --json`, less `ok` and `exit_code`."""
+    outputs = EvaluateOutputs.of_run(run)
+    result, metrics = sound(outputs.verdict, ResultVerdict), sound(outputs.metrics, Metrics)
     return {
         "run": str(run),
         "artifacts": artifacts(run),
-        "result": result(run),
-        "metrics": metrics(run),
+        "result": None if result is None else result[1],
+        "metrics": None if metrics is None else metrics[1],
         "seconds": {outcome.stage: outcome.seconds for outcome in outcomes},
         "stages": [
             {"name": each.stage, "action": each.action, "reason": each.reason, "seconds": each.seconds, "bytes": each.size, "digest": each.digest}
@@ -93,8 +75,8 @@ def in_words(run: Path, outcomes: Sequence[Outcome], elapsed: float) -> list[str
         if name in TITLES:
             shown = os.path.relpath(path) if not os.path.relpath(path).startswith("..") else path
             lines.append(f"  {TITLES[name]:<10} {shown}  ({size(os.stat(path).st_size)})")
-    document = metrics(run)
-    found = None if document is None else msgspec.convert(document, Metrics)
+    metrics = sound(EvaluateOutputs.of_run(run).metrics, Metrics)
+    found = None if metrics is None else metrics[0]
     if (quality := quality_in_words(found)) is not None:
         lines.append(f"  {'quality':<10} {quality}")
     problems = [] if verdict is None else [problem_in_words(each) for each in verdict.problems]

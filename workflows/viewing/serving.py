@@ -15,9 +15,9 @@ from pipeline.interrupt import stopping
 from pipeline.stage import Stage
 from stages.viewer.page import NAME
 from workflows.cli.target import asset_of, is_run, open_run
-from workflows.viewing.page import make_page, present_page
-from workflows.viewing.server import LOOPBACK, Server
-from workflows.viewing.sites import AssetSite, RunSite
+from workflows.report.viewer import is_newest
+from workflows.viewing.server import LOOPBACK, Server, Site
+from workflows.viewing.sites import RunSite, asset_site, make_page
 
 POLL_SECONDS = 0.2  # seconds between two checks whether a signal came
 
@@ -25,9 +25,8 @@ POLL_SECONDS = 0.2  # seconds between two checks whether a signal came
 def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
     """The viewer page of a run or an asset file, and whether it was made now: in a run that can be written, or in a new temporary folder that stays."""
     asset = asset_of(what)
-    there = None if force else present_page(what, asset)
-    if there is not None:
-        return there, False
+    if not force and is_run(what) and is_newest(open_run(what), what / NAME):
+        return what / NAME, False
     target = (what if is_run(what) and os.access(what, os.W_OK) else Path(tempfile.mkdtemp(prefix="enerf-view-"))) / NAME
     make_page(what, asset, target)
     return target, True
@@ -65,11 +64,11 @@ def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, r
         folder = Path(name)
         if is_run(what):
             open_run(what)
-            site: AssetSite | RunSite = RunSite(Path(os.path.abspath(what)), stages, folder)
+            site: Site = RunSite(Path(os.path.abspath(what)), stages, folder)
         else:
             asset = asset_of(what)
             make_page(what, asset, folder / NAME)
-            site = AssetSite(folder / NAME)
+            site = asset_site(folder / NAME)
         with Server(site, address or LOOPBACK, port) as server:
             threading.Thread(target=server.serve_forever, kwargs={"poll_interval": POLL_SECONDS}, daemon=True).start()
             try:

@@ -8,13 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.errors import PipelineError
+from pipeline.failures import cannot_write
 from pipeline.stage import Stage
-from stages.viewer.page import NAME, policy
+from stages.viewer.page import NAME, policy, write_viewer
 from workflows.cli.output import plain
-from workflows.cli.target import asset_of, open_run
-from workflows.viewing.page import make_page
+from workflows.cli.target import asset_of, is_run, open_run
+from workflows.loading import damage_of
+from workflows.report.signature import ASSET_VIEWER, VIEWER, viewers
+from workflows.report.viewer import write_viewer_of
 from workflows.viewing.progress import PREVIEW, Progress, shown_identity
-from workflows.viewing.server import Answer, open_inside
+from workflows.viewing.server import Answer, Site, open_inside
 
 HTML, JSON, PNG = "text/html; charset=utf-8", "application/json", "image/png"
 LIVE = {"/": ("live.html", HTML), "/live.js": ("live.js", "text/javascript; charset=utf-8"), "/live.css": ("live.css", "text/css; charset=utf-8")}
@@ -26,14 +29,9 @@ LARGEST_PAGE, LARGEST_PREVIEW = 2**31, 2**24  # bytes
 _PREVIEW = re.compile(rf"/previews/([a-z]+)/({PREVIEW.pattern})")
 
 
-class AssetSite:
-    """An asset file: its viewer page, which is made."""
-
-    def __init__(self, page: Path) -> None:
-        self.page = page
-
-    def __call__(self, path: str) -> Answer | None:
-        return _page(self.page) if path in ("/", "/viewer.html") else None
+def asset_site(page: Path) -> Site:
+    """Of an asset file, whose viewer page is made."""
+    return lambda path: _page(page) if path in ("/", "/viewer.html") else None
 
 
 class RunSite:
@@ -81,6 +79,23 @@ class RunSite:
             except PipelineError:  # no asset yet, or one that is just replaced: status.json says
                 return None
             return _page(page)
+
+
+def make_page(what: Path, asset: Path, target: Path) -> None:
+    """Write the page of a run, of its Gaussians or its asset, with its cameras and photographs; or that of an asset file; atomically.
+
+    Raises CorruptArtifact for a damaged file, DiskFull, and BadInput where it cannot be written.
+    """
+    pages = viewers(open_run(what)) if is_run(what) else {}
+    shown = pages.get(VIEWER, asset)
+    try:
+        with damage_of(shown):
+            if is_run(what):
+                write_viewer_of(what, shown, target, ASSET_VIEWER if ASSET_VIEWER in pages and target == what / NAME else None)
+            else:
+                write_viewer(asset, target)
+    except OSError as error:
+        raise cannot_write(target, error) from error
 
 
 def _page(path: Path) -> Answer | None:

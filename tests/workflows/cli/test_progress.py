@@ -12,7 +12,7 @@ from pipeline.errors import BadInput
 from workflows.cli import progress
 from workflows.cli.failures import report_failure
 from workflows.cli.output import closing, listing, plain
-from workflows.cli.progress import Bars, JsonLines, Lines, Quiet, duration, size
+from workflows.cli.progress import Bars, Lines, duration, json_line, size, warnings_only
 
 
 def event(kind: str, **facts: object) -> dict[str, object]:
@@ -55,8 +55,8 @@ def test_every_display_takes_every_event(capsys: pytest.CaptureFixture[str]) -> 
     assert shown.count("[red]careful") == 2
     assert shown.count("12 images") == 2
     for each in events:
-        Quiet()(each)
-        JsonLines(quiet=True)(each)
+        warnings_only(each)
+        json_line(each, quiet=True)
     out, err = capsys.readouterr()
     assert "[red]careful" in err
     assert len(err.splitlines()) == 1
@@ -101,10 +101,10 @@ def test_each_of_several_stages_has_a_bar_and_lines_of_its_own() -> None:
 def test_hostile_text_reaches_no_display_raw(capsys: pytest.CaptureFixture[str]) -> None:
     told = [event("warning", text=HOSTILE), event("stage_started", reason=HOSTILE), event("progress", done=1, total=2, text=HOSTILE, name=HOSTILE)]
     for each in told:
-        Quiet()(each)
+        warnings_only(each)
         lines = Lines()
         lines(each)
-        JsonLines()(each)
+        json_line(each)
     with Bars() as bars:
         for each in told:
             bars(each)

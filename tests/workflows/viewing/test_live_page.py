@@ -17,7 +17,7 @@ from tests.efficientnerf.trees import random_tree
 from tests.stages.viewer.browser import Page, missing, opened
 from tests.workflows.viewing.growing import TRAIN, put, scratch
 from workflows.viewing.server import LOOPBACK, Server
-from workflows.viewing.sites import AssetSite, RunSite
+from workflows.viewing.sites import RunSite, asset_site
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
@@ -110,7 +110,7 @@ def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(chromium: A
 def test_a_page_that_another_put_in_its_place_runs_nothing(chromium: Any, tmp_path: Path) -> None:
     page = tmp_path / "viewer.html"
     page.write_text("<!doctype html><title>mine</title><body><script>document.title = 'run'</script><img src=x onerror='document.title = 2'>", encoding="utf-8")
-    with Server(AssetSite(page), LOOPBACK, 0) as made:
+    with Server(asset_site(page), LOOPBACK, 0) as made:
         threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
         with opened(chromium, made.url) as shown:
             shown.page.wait_for_timeout(200)

@@ -20,10 +20,10 @@ from tests.stages.formats.gaussians import scattered
 from tests.workflows.report.records import record, record_splats
 from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
 from workflows.report.signature import write_page
+from workflows.report.viewer import is_newest
 from workflows.viewing import progress, sites
-from workflows.viewing.page import make_page, present_page
 from workflows.viewing.server import Answer
-from workflows.viewing.sites import AssetSite, RunSite
+from workflows.viewing.sites import RunSite, asset_site, make_page
 
 
 @pytest.fixture
@@ -134,15 +134,15 @@ def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path:
     assert not (run.path / "viewer.html").exists()
     (run.path / "viewer.html").write_text("of the run", encoding="utf-8")
     assert body(site("/viewer.html")) == b"page 2", "what the run holds may be anybody's"
-    assert present_page(run.path, file) is None
-    write_page(run.path / "viewer.html", b"our own")
-    os.utime(run.path / "viewer.html", ns=(1, file.stat().st_mtime_ns))
-    assert present_page(run.path, file) is not None
-    os.utime(run.path / "viewer.html", ns=(1, file.stat().st_mtime_ns - 1))
-    assert present_page(run.path, file) is None, "one that is older than the asset is of another"
-    (run.path / "viewer.html").unlink()
-    (run.path / "viewer.html").symlink_to(run.path / "run.json")
-    assert present_page(run.path, file) is None
+    page = run.path / "viewer.html"
+    assert not is_newest(run, page)
+    write_page(page, b"our own")
+    assert is_newest(run, page)
+    os.utime(page, ns=(1, file.parent.stat().st_ctime_ns - 1))
+    assert not is_newest(run, page), "one that is older than the asset is of another"
+    page.unlink()
+    page.symlink_to(run.path / "run.json")
+    assert not is_newest(run, page)
 
 
 def test_the_viewer_is_of_the_gaussians_once_they_are_there_and_of_a_newer_asset(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,16 +172,16 @@ def test_the_viewer_is_of_the_gaussians_once_they_are_there_and_of_a_newer_asset
     assert third not in (first, second)
     assert of_gaussians
     make_page(run.path, bake.asset, run.path / "viewer.html")
-    assert present_page(run.path, bake.asset) is not None
+    assert is_newest(run, run.path / "viewer.html")
     record(run.path, bake.stage, sha256="1" * 64)
     assert shown() == (first, False)
-    assert present_page(run.path, bake.asset) is None
+    assert not is_newest(run, run.path / "viewer.html")
 
 
 def test_the_viewer_is_served_with_its_own_scripts_alone_and_without_an_origin(tmp_path: Path) -> None:
     """Whatever was written to its place: another script is not run, and nothing of this server is read."""
     (tmp_path / "viewer.html").write_text("page", encoding="utf-8")
-    site = AssetSite(tmp_path / "viewer.html")
+    site = asset_site(tmp_path / "viewer.html")
     assert body(site("/")) == body(site("/viewer.html")) == b"page"
     assert [site(path) for path in ("/status.json", "/live.js", "/..", "/viewer.html/")] == [None] * 4
     answer = site("/")
