@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,12 @@ from pipeline.decide import decide
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.files import write_atomically
-from pipeline.stage import settings_dict, settings_from
+from pipeline.stage import Stage, settings_from
 from stages.artifacts import BakeOutputs, MeshInputs, MeshOutputs, PosesOutputs, TrainOutputs
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format, cameras
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
-from stages.framing.true_frame import load_frame
+from stages.framing.true_frame import TrueFrame, load_frame
 from stages.io import scene
 from stages.memory.need import Need, libraries, refuse_more_than
 from stages.memory.tree import tree_bytes
@@ -84,27 +85,14 @@ class Export:
     def format(self, path: Path) -> Format:
         return self.formats[path.suffix.lower()]
 
-    @property
-    def cameras(self) -> list[Path]:
-        return [path for path in self.files if path.suffix.lower() == CAMERAS]
-
-    @property
-    def viewers(self) -> list[Path]:
-        return [path for path in self.files if path.suffix.lower() == VIEWER]
-
-    @property
-    def volumes(self) -> list[Path]:
-        return [path for path in self.files if path.suffix.lower() in VOLUME_EXPORTERS]
+    def of(self, extensions: Collection[str]) -> list[Path]:
+        """The files with these extensions."""
+        return [path for path in self.files if path.suffix.lower() in extensions]
 
     @property
     def surfaces(self) -> list[Path]:
         """The files that hold the surface."""
-        return [] if self.as_splats else [path for path in self.files if path.suffix.lower() in self.table]
-
-    @property
-    def splats(self) -> list[Path]:
-        """The files that hold 3D Gaussians."""
-        return [path for path in self.files if path.suffix.lower() in self.table] if self.as_splats else []
+        return [] if self.as_splats else self.of(self.table)
 
     @property
     def keeps_textures(self) -> bool:
@@ -121,14 +109,9 @@ class Export:
 
 def faces_from_text(text: str) -> int:
     """20k, 0.1m or a plain number. UsageError for anything else."""
-    digits, factor = text.strip().lower(), 1.0
-    if digits[-1:] in ("k", "m"):
-        digits, factor = digits[:-1], {"k": 1e3, "m": 1e6}[digits[-1]]
-    try:
-        count = float(digits) * factor
-    except ValueError:
-        count = 0.0
-    if not 1 <= count <= 2**31 or not digits.replace(".", "", 1).isascii() or not digits.replace(".", "", 1).isdigit():
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)([km]?)", text.strip().lower(), re.ASCII)
+    count = float(found[1]) * {"": 1, "k": 1e3, "m": 1e6}[found[2]] if found else 0.0
+    if not 1 <= count <= 2**31:
         raise UsageError(f"--faces {text}: expected a number of faces, such as 20k, 100k, 500k or 150000.")
     return round(count)
 
@@ -144,7 +127,7 @@ def check(export: Export) -> None:
             raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
     if (export.picture != "png" and not export.keeps_textures) or (export.texture not in (None, "off") and not (export.is_coloured and not export.as_points)):
         raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
-    for path in (*export.surfaces, *export.volumes):
+    for path in (*export.surfaces, *export.of(VOLUME_EXPORTERS)):
         export.format(path).refuse_without_package(path)
     beside = [] if export.texture == "off" else [each for path in export.surfaces for each in export.format(path).companions(path, export.picture)]
     check_files([*export.files, *dict.fromkeys(beside)], force=export.force, inputs=[export.what])
@@ -153,7 +136,7 @@ def check(export: Export) -> None:
 def export_cameras(export: Export) -> list[Written]:
     """The cameras of a run."""
     written, what = [], export.what
-    for path in export.cameras:
+    for path in export.of((CAMERAS,)):
         poses = PosesOutputs(open_run(what).folder("poses")) if is_run(what) else PosesOutputs(what)
         if not poses.scene.is_file():
             raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
@@ -198,7 +181,8 @@ def _surface(export: Export, wanted: Any, progress: Progress, points: int = 0) -
 
 def export_volumes(export: Export, settings: Settings) -> list[Written]:
     """The asset's voxels as volumes; what of it, the settings of the stage mesh say where --region does not."""
-    if not export.volumes:
+    files = export.of(VOLUME_EXPORTERS)
+    if not files:
         return []
     region = export.region or (settings.resolved()["mesh"].region if export.crop is None else "all")
     tree = restricted(load_asset(export.what), region, export.crop)
@@ -206,15 +190,16 @@ def export_volumes(export: Export, settings: Settings) -> list[Written]:
     need = Need({"grids": VOLUME_VOXEL * voxels, "the asset": tree_bytes(tree), "libraries": libraries()})
     refuse_more_than(export.limit, str(export.what), need, "Take an asset of fewer voxels (enerf convert --resolution).")
     frame = source_frame(tree.metadata)
-    for path in export.volumes:
+    for path in files:
         with writing(path, force=export.force):
             export.format(path)(tree, path, frame)
-    return [{"path": str(path.absolute()), "voxels": voxels} for path in export.volumes]
+    return [{"path": str(path.absolute()), "voxels": voxels} for path in files]
 
 
 def export_viewers(export: Export) -> list[Written]:
     """The asset as a page for browsers: all of it, unless --region or --crop say what; with the cameras and photographs of a run."""
-    if not export.viewers:
+    files = export.of((VIEWER,))
+    if not files:
         return []
     with damage_of(asset_of(export.what)):
         if export.region is None and export.crop is None and not (is_run(export.what) and load_frame(export.what)):
@@ -223,29 +208,34 @@ def export_viewers(export: Export) -> list[Written]:
             asset = serialize(restricted(load_asset(export.what), export.region or "all", export.crop), "compact")
     cameras, photographs = captured(export.what) if is_run(export.what) else ([], {})
     page = viewer_page(asset, cameras=cameras, photographs=photographs, title=export.what.absolute().stem)
-    for path in export.viewers:
+    for path in files:
         with writing(path, force=export.force):
             write_atomically(path, page)
-    return [{"path": str(path.absolute()), "bytes": len(page)} for path in export.viewers]
+    return [{"path": str(path.absolute()), "bytes": len(page)} for path in files]
+
+
+def made_with(what: Path, stage: Stage) -> Any:
+    """The settings with which a run's stage has made what it holds; None where that is not up to date, and for an asset."""
+    decision = decide(stage, open_run(what)) if is_run(what) else None
+    if decision is None or not decision.fresh or decision.manifest is None:
+        return None
+    return settings_from(stage.settings, decision.manifest.request.settings, where=stage.name)
+
+
+def frame_of(run: Path) -> tuple[SourceFrame, TrueFrame | None]:
+    """The frame of a run's exports, and the one that was found since its asset was made."""
+    metadata, true = describe(BakeOutputs.of_run(run).asset), load_frame(run)
+    return source_frame(metadata) if true is None else true.source_frame(metadata), true
 
 
 def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -> tuple[Mesh, SourceFrame] | None:
     """The mesh that the run's stage `mesh` has made, if that is what is wanted; its texture may be left out."""
-    if not is_run(what):
-        return None
-    run = open_run(what)
-    decision = decide(STAGE, run)
-    if not decision.fresh or decision.manifest is None:
-        return None
-    made = settings_from(MeshSettings, decision.manifest.request.settings, where=STAGE.name)
-    plain = [settings_dict(replace(each, texture="off", texture_size=2048)) for each in (made, wanted)]
-    if plain[0] != plain[1]:
+    made = made_with(what, STAGE)
+    if made is None or replace(made, texture="off", texture_size=2048) != replace(wanted, texture="off", texture_size=2048):
         return None
     if wanted.texture != "off" and (made.texture, made.texture_size) != (wanted.texture, wanted.texture_size):
         return None
-    mesh = read_mesh(MeshOutputs.of_run(what))
-    metadata, true = describe(BakeOutputs.of_run(what).asset), load_frame(what)
-    frame = source_frame(metadata) if true is None else true.source_frame(metadata)
+    mesh, (frame, true) = read_mesh(MeshOutputs.of_run(what)), frame_of(what)
     if true is not None:
         mesh = moved(mesh, true.from_capture.scale, true.from_capture.rotation, true.from_capture.translation)
     return mesh if wanted.texture != "off" or not keeps_textures else replace(mesh, texture=None), frame

@@ -2,38 +2,34 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from efficientnerf.asset.format import describe
 from efficientnerf.splats.gaussians import Gaussians
-from pipeline.decide import decide
-from pipeline.stage import settings_from
-from stages.artifacts import BakeOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
+from stages.artifacts import PosesOutputs, SplatsOutputs, TrainOutputs
+from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.splats.frames import in_capture, moved
 from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
-from stages.framing.true_frame import load_frame
 from stages.memory.need import refuse_more_than
 from stages.splats.memory import needed
 from stages.splats.run import gaussians_of
 from stages.splats.settings import STAGE, SplatsSettings
 from workflows.cli.resolve import Settings
-from workflows.cli.target import is_run, open_run
 from workflows.destination import writing
-from workflows.exporting import Export, Progress, Written
+from workflows.exporting import Export, Progress, Written, frame_of, made_with
 from workflows.loading import load_asset
 
 
 def export_splats(export: Export, settings: Settings, progress: Progress) -> list[Written]:
     """The asset as 3D Gaussians. `settings` holds those of the stage splats."""
-    if not export.splats:
+    files = export.of(SPLAT_EXPORTERS) if export.as_splats else []
+    if not files:
         return []
     wanted = replace(settings.resolved()["splats"], make="on")
     wanted = replace(wanted, region=export.region or (wanted.region if export.crop is None else "all"))
     gaussians, frame = (None if export.crop is not None else _made_by_the_stage(export.what, wanted)) or _made(export, wanted, progress)
     written: list[Written] = []
-    for path in export.splats:
+    for path in files:
         with writing(path, force=export.force):
             options = {"version": export.spz_version} if path.suffix.lower() == ".spz" else {}
             export.format(path)(gaussians, path, frame, **options)
@@ -54,15 +50,7 @@ def _made(export: Export, wanted: SplatsSettings, progress: Progress) -> tuple[G
 
 def _made_by_the_stage(what: Path, wanted: SplatsSettings) -> tuple[Gaussians, SourceFrame] | None:
     """The Gaussians that the run's stage `splats` has made, if those are what is wanted."""
-    if not is_run(what):
+    if made_with(what, STAGE) != wanted:
         return None
-    decision = decide(STAGE, open_run(what))
-    if not decision.fresh or decision.manifest is None:
-        return None
-    made: Any = settings_from(SplatsSettings, decision.manifest.request.settings, where=STAGE.name)
-    if made != wanted:
-        return None
-    gaussians, metadata, true = read_splats(SplatsOutputs.of_run(what).ply), describe(BakeOutputs.of_run(what).asset), load_frame(what)
-    if true is None:
-        return gaussians, source_frame(metadata)
-    return moved(gaussians, true.from_capture), true.source_frame(metadata)
+    gaussians, (frame, true) = read_splats(SplatsOutputs.of_run(what).ply), frame_of(what)
+    return gaussians if true is None else moved(gaussians, true.from_capture), frame

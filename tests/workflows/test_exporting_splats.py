@@ -37,7 +37,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     format.save(tree, BakeOutputs.of_run(path).asset)
     SPLAT_EXPORTERS[".ply"](scattered(), SplatsOutputs.of_run(path).ply, source_frame(METADATA))
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(MADE))))
-    monkeypatch.setattr("workflows.exporting_splats.decide", lambda stage, run: fresh)
+    monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
     monkeypatch.setattr(exporting_splats, "_made", lambda export, wanted, progress: pytest.fail(f"made again, with {wanted}"))
     return path
 

@@ -1,4 +1,4 @@
-"""The page of a fleet in a browser: sorted, filtered, walked through by keys; pictures as they come into sight, the turntable of one scene at a time."""
+"""The page of a fleet in a browser: sorted and filtered."""
 
 from pathlib import Path
 from typing import Any

@@ -70,12 +70,11 @@ function thumbnail(scene) {
   if (scene.video) {
     frame.addEventListener("pointerenter", (event) => event.pointerType !== "touch" && play(scene, frame));
     frame.addEventListener("pointerleave", (event) => event.pointerType !== "touch" && stop(frame));
-    frame.addEventListener("click", () => { frame.closest("tr").focus(); play(scene, frame); }); // a tap; what is tapped next takes the focus, and stops it
+    frame.addEventListener("click", () => (frame.querySelector("video") ? stop(frame) : play(scene, frame))); // a tap
   }
   return cell;
 }
 function play(scene, frame) {
-  if (frame.querySelector("video")) return;
   const video = element("video");
   Object.assign(video, { preload: "none", muted: true, loop: true, playsInline: true, src: scene.video });
   frame.append(video);
@@ -97,7 +96,6 @@ function nameCell(scene) {
 
 function row(scene) {
   const made = element("tr");
-  made.tabIndex = -1;
   made.append(thumbnail(scene), nameCell(scene));
   for (const column of columns.slice(1)) {
     const cell = element("td", column.key === "state" ? null : column.text(scene), column.kind || "word");
@@ -114,11 +112,6 @@ function row(scene) {
   cell.append(button);
   made.append(cell);
   made.scene = scene;
-  if (scene.video) {
-    const frame = made.querySelector(".thumb div"), still = matchMedia("(prefers-reduced-motion: reduce)");
-    made.addEventListener("focusin", () => made.matches(":has(:focus-visible), :focus-visible") && !still.matches && play(scene, frame));
-    made.addEventListener("focusout", (event) => made.contains(event.relatedTarget) || stop(frame));
-  }
   return made;
 }
 
@@ -183,8 +176,7 @@ function sort() {
   const sign = wanted.down ? -1 : 1;
   order.sort((a, b) => missing(a.value) - missing(b.value) || sign * compare(a.value, b.value) || a.place - b.place);
   const ordered = document.createDocumentFragment();
-  fleet.order = order.map((each) => each.scene);
-  for (const scene of fleet.order) {
+  for (const { scene } of order) {
     ordered.append(scene.row);
     if (scene.details) ordered.append(scene.details);
   }
@@ -222,12 +214,10 @@ function makeHead() {
 function makeStates() {
   for (const state of STATES) {
     const count = fleet.totals[state];
-    if (count) {
-      const part = element("i", null, state);
-      part.style.width = `${(100 * count) / fleet.scenes.length}%`;
-      at("share").append(part);
-    }
     if (!count) continue;
+    const part = element("i", null, state);
+    part.style.width = `${(100 * count) / fleet.scenes.length}%`;
+    at("share").append(part);
     const button = element("button", `${count} ${state}`);
     button.type = "button";
     button.dataset.state = state;
@@ -245,7 +235,6 @@ function makeFigures() {
   const figures = [
     ["done", `${fleet.totals.done} of ${fleet.scenes.length}`],
     ["failed or quarantined", String(fleet.totals.failed + fleet.totals.quarantined)],
-    ["throughput", fleet.throughput === null ? "" : `${fleet.throughput.toFixed(fleet.throughput < 10 ? 1 : 0)} scenes/h`],
     ["end, forecast", fleet.running && fleet.forecast !== null ? `in ${duration(fleet.forecast)}` : ""],
     ["time of all stages", fleet.seconds ? duration(fleet.seconds) : ""],
     ["mean PSNR", measured.length ? `${mean(measured).toFixed(2)} dB of ${measured.length}` : ""],
@@ -261,25 +250,6 @@ function makeFigures() {
   at("now").textContent = `${fleet.state}; ${fleet.executor}, ${fleet.slots} at a time; begun ${time(fleet.started)}, as of ${time(fleet.updated)}${fleet.note ? `; ${fleet.note}` : ""}`;
 }
 
-function move(step) {
-  const ordered = fleet.order.filter((scene) => !scene.row.hidden);
-  const place = ordered.indexOf(document.activeElement.closest?.("tr")?.scene);
-  const next = ordered[place < 0 ? (step > 0 ? 0 : ordered.length - 1) : Math.min(Math.max(place + step, 0), ordered.length - 1)];
-  next?.row.focus();
-}
-document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey) return;
-  const scene = document.activeElement.closest?.("tr")?.scene, own = document.activeElement === scene?.row;
-  if (event.key === "Escape") { wanted.filter = at("filter").value = ""; apply(); writeAddress(); document.activeElement.blur(); return; }
-  if (/^(INPUT|SELECT)$/.test(document.activeElement.tagName)) return;
-  if (event.key === "/") at("filter").focus();
-  else if (event.key === "j" || event.key === "ArrowDown") move(1);
-  else if (event.key === "k" || event.key === "ArrowUp") move(-1);
-  else if (own && event.key === "Enter" && scene.report) location.href = scene.report;
-  else if (own && event.key === " ") toggle(scene);
-  else return;
-  event.preventDefault();
-});
 at("filter").addEventListener("input", () => { wanted.filter = at("filter").value; apply(); writeAddress(); });
 at("follow").addEventListener("change", writeAddress);
 

@@ -1,12 +1,13 @@
 """FLEET/index.html: all scenes of a fleet on one page, rewritten as the fleet goes on.
 
 The page is one file with its script, and asks for nothing but the thumbnails in FLEET/thumbnails/, which a browser loads as they come into sight, and the
-turntable of the scene that is pointed at or has the focus. Names and messages are text, whatever they hold.
+turntable of the scene that is pointed at. Names and messages are text, whatever they hold.
 """
 
 import functools
 import json
 from collections.abc import Container, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -27,14 +28,12 @@ LONGEST = 300  # characters of a value that is shown
 
 
 def index_page(
-    state: FleetState, *, title: str, pictures: Mapping[str, int] | None = None, reports: Container[str] = (), throughput: float | None = None,
-    comparison: str | None = None,
-) -> str:  # fmt: skip
+    state: FleetState, *, title: str, pictures: Mapping[str, int] | None = None, reports: Container[str] = (), comparison: str | None = None
+) -> str:
     """The page as text.
 
     pictures    scene -> when its thumbnail was made, nanoseconds; others have none
     reports     scenes whose report is there
-    throughput  scenes an hour, where it is known
     comparison  the page of a sweep, where there is one
     """
     facts = {
@@ -46,10 +45,9 @@ def index_page(
         "executor": printable(state.executor),
         "note": printable(state.note or "", LONGEST),
         "slots": state.slots,
-        "totals": {name: getattr(state.totals, name) for name in ("waiting", "running", "done", "failed", "quarantined")},
+        "totals": asdict(state.totals),
         "seconds": sum(stage.seconds for scene in state.scenes for name, stage in scene.stages.items() if name not in scene.shares),
         "bytes": sum(scene.bytes for scene in state.scenes),
-        "throughput": throughput,
         "sweep": sorted({setting for scene in state.scenes for setting in scene.sweep or {}}),
         "scenes": [_scene(scene, (pictures or {}).get(scene.name), reported=scene.name in reports) for scene in state.scenes],
     }

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import time
-from datetime import datetime
 from pathlib import Path
 
 from pipeline.files import write_atomically
@@ -31,12 +30,9 @@ class Pages:
         self._pending: FleetState | None = None
         self._pictures: dict[str, tuple[str, int]] = {}  # scene -> what its thumbnail is of, and when it was made
         self._reports: set[str] = set()  # scenes whose report was seen
-        self._done_before: int | None = None
 
     def __call__(self, state: FleetState) -> None:
         """Write the pages if it is time, and in any case once the fleet has ended."""
-        if self._done_before is None:
-            self._done_before = sum(scene.state == "done" for scene in state.scenes)
         self._pending = state
         self.catch_up()
 
@@ -60,8 +56,7 @@ class Pages:
         compared = comparison.write_comparison(self.fleet, state, reports, plots=ended)
         pictures = {name: made for name, (_, made) in self._pictures.items() if made}
         title, compared_in = self.fleet.absolute().name, comparison.NAME if compared else None
-        throughput = self._throughput(state)
-        page = index.index_page(state, title=title, pictures=pictures, reports=reports, throughput=throughput, comparison=compared_in)
+        page = index.index_page(state, title=title, pictures=pictures, reports=reports, comparison=compared_in)
         write_atomically(self.fleet / index.NAME, page.encode("utf-8"), durable=ended)
         write_atomically(self.fleet / spreadsheet.NAME, spreadsheet.fleet_csv(state).encode("utf-8"), durable=ended)
 
@@ -70,14 +65,6 @@ class Pages:
         begun = (scene for scene in state.scenes if scene.name not in self._reports and any(stage.state == "done" for stage in scene.stages.values()))
         self._reports |= {scene.name for scene in begun if is_own(self.fleet / scene.run / REPORT)}
         return self._reports
-
-    def _throughput(self, state: FleetState) -> float | None:
-        """Scenes an hour since this process began."""
-        done = sum(scene.state == "done" for scene in state.scenes) - (self._done_before or 0)
-        with contextlib.suppress(ValueError):
-            seconds = (datetime.fromisoformat(state.updated) - datetime.fromisoformat(state.started)).total_seconds()
-            return 3600 * done / seconds if done > 0 and seconds > 1 else None
-        return None
 
     def _make_thumbnails(self, state: FleetState) -> None:
         """Of scenes whose turntable, or whose photographs before that, have come since; as many as there is time for."""
