@@ -13,7 +13,7 @@ from pipeline.run import Run
 from stages.framing.true_frame import AS_CAPTURED, NAME, TrueFrame, load_frame, save_frame
 from workflows import measuring
 from workflows.cli.options import folder_type, output_options, workflow
-from workflows.cli.output import closing, listing, write_json
+from workflows.cli.output import closing, conclude, listing
 from workflows.cli.resolve import metres_of
 from workflows.cli.target import open_run
 from workflows.report.page import NAME as REPORT
@@ -67,8 +67,7 @@ def measure(run: Path, places: tuple[str, ...], known: tuple[tuple[str, str, str
         summary = sides
         if not as_json:
             listing(measuring.sides_in_words(sides), *measuring.unit_in_words(sides))
-    if as_json:
-        write_json({"event": "summary", "ok": True, "run": str(run), **summary, "exit_code": 0})
+    conclude(as_json=as_json, quiet=True, run=str(run), **summary)
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # places may begin with a minus
@@ -91,8 +90,7 @@ def orient(run: Path, places: tuple[str, ...], up: str | None, plane: bool, forg
     opened = open_run(run)
     if forget:
         _keep(opened, _found(run).with_ground(None))
-        if as_json:
-            write_json({"event": "summary", "ok": True, "run": str(run), "exit_code": 0})
+        conclude(as_json=as_json, quiet=True, run=str(run))
         return
     inside = measuring.measured(run)
     error = None
@@ -107,13 +105,11 @@ def orient(run: Path, places: tuple[str, ...], up: str | None, plane: bool, forg
     conflict = known and angle > max(error or 0.0, measuring.UPRIGHT)
     if conflict:
         print(f"warning: the new up is {said}.", file=sys.stderr)
-    if as_json:
-        facts = {"up": list(ground.up), "up_error": error, "ground": ground.height, "degrees_from_run": angle, "up_of_run": words}
-        write_json({"event": "summary", "ok": True, "run": str(run), **facts, "exit_code": 0})
-    elif not quiet:
-        again = measuring.how_to_turn_upright(run, inside)
-        lines = [f"  its turntable keeps the former up; upright: {again}"] if again else []
-        closing(f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}", *lines)
+    facts = {"up": list(ground.up), "up_error": error, "ground": ground.height, "degrees_from_run": angle, "up_of_run": words}
+    again = measuring.how_to_turn_upright(run, inside)
+    lines = [f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}"]
+    lines += [f"  its turntable keeps the former up; upright: {again}"] if again else []
+    conclude(*lines, as_json=as_json, quiet=quiet, run=str(run), **facts)
 
 
 def _keep(opened: Run, frame: TrueFrame) -> None:

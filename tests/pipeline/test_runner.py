@@ -1,4 +1,3 @@
-import contextlib
 import errno
 import itertools
 import os
@@ -9,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pipeline import artifact, files
+from pipeline import artifact
 from pipeline.decide import decide, survey
 from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, StageFailed, UsageError
 from pipeline.executors import local
@@ -190,35 +189,6 @@ def test_what_the_user_sees_of_an_error(run: Run, error: Exception, kind: type[E
     assert type(caught.value) is kind
     assert "\n" not in str(caught.value)
     assert kind is not StageFailed or str(caught.value).startswith("count: ")
-
-
-def test_a_disk_that_fills_up_while_publishing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At whichever step: the former artifact, or the new one, stands; and the next run goes on."""
-    run_stages(run, STAGES)
-    set_one(run, "count", steps=9)
-    for moment in itertools.count(1):
-        left = [moment]
-        for name in ("rename", "sync_folder", "sync_file"):
-            monkeypatch.setattr(files, name, _failing(getattr(files, name), left))
-        with contextlib.suppress(DiskFull):
-            run_stages(run, STAGES, only="count", force=True)
-        monkeypatch.undo()
-        made = read_manifest(run.folder("count"))
-        assert not artifact.differences(run.folder("count"), made.outputs).damaged
-        if left[0] > 0:
-            break
-    assert moment > 10
-    assert actions(run_stages(run, STAGES))["double"] == "ran"
-
-
-def _failing(step: object, left: list[int]) -> object:
-    def call(*arguments: object) -> object:
-        left[0] -= 1
-        if left[0] == 0:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return step(*arguments)  # type: ignore[operator]
-
-    return call
 
 
 def test_a_failed_stage_keeps_its_checkpoint_and_goes_on(run: Run) -> None:

@@ -103,16 +103,24 @@ def read_config(path: Path) -> Config:
 def read_toml(option: str, path: Path) -> dict[str, Any]:
     """The TOML file that an option names. Raises UsageError and BadInput."""
     try:
-        with open(files.open_plain(path), "rb") as file:
-            data = file.read(MAX_TOML + 1)
-    except OSError as error:
-        raise UsageError(f"{option} {path}: cannot be read ({error.strerror}).") from None
-    try:
-        return parse_toml(data.decode("utf-8"))
-    except UnicodeDecodeError:
-        raise BadInput(f"{option} {path}: not a text file; expected TOML in UTF-8.") from None
+        return parse_toml(read_text(path, MAX_TOML, f"{option} "))
     except ValueError as error:
         raise BadInput(f"{option} {path}: not valid TOML: {printable(error, 300)}.") from None
+
+
+def read_text(path: Path, limit: int, option: str = "") -> str:
+    """The text of a plain file of at most so many bytes; spreadsheets write a mark before it. Raises UsageError, whose text begins with the option."""
+    try:
+        with open(files.open_plain(path), "rb") as file:
+            data = file.read(limit + 1)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{option}{path}: cannot be read ({getattr(error, 'strerror', None) or error}).") from None
+    if len(data) > limit:
+        raise UsageError(f"{option}{path}: larger than {limit} bytes.")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{option}{path}: byte {error.start} is no UTF-8; expected a text file.") from None
 
 
 def parse_toml(text: str, limit: int = MAX_TOML) -> dict[str, Any]:

@@ -23,13 +23,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline import files
 from pipeline.errors import UsageError
 from pipeline.fleet.state import MOST_SCENES, Scene, is_scene_name
 from pipeline.run import MOST_SOURCES
 from pipeline.text import printable
 from stages.formats.importers.photographs import is_video
-from workflows.cli.resolve import parse_toml
+from workflows.cli.resolve import parse_toml, read_text
 from workflows.fleet.checked import OPTIONS, Checker, Choice, Text
 from workflows.fleet.folders import folder_entries, glob_entries, listed_entries
 from workflows.workflow import Workflow
@@ -64,7 +63,7 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
     if len(given) == 1 and given[0].lower().endswith(SUFFIXES) and not Path(given[0]).is_dir():
         path = Path(given[0])
         inside = [path.absolute().parent, *roots]
-        common, entries = (_toml if path.suffix.lower() == ".toml" else _csv)(_text(path), checker)
+        common, entries = (_toml if path.suffix.lower() == ".toml" else _csv)(read_text(path, MAX_BYTES), checker)
         base = path.absolute().parent
     else:
         base = Path()  # the working folder, which may be gone: absolute sources need none
@@ -83,21 +82,6 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
     scenes = [reader.scene(entry) for entry in entries]
     checker.end()
     return scenes
-
-
-def _text(path: Path) -> str:
-    """A manifest's text. Raises UsageError."""
-    try:
-        with open(files.open_plain(path), "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}).") from None
-    if len(data) > MAX_BYTES:
-        raise UsageError(f"{path}: larger than {MAX_BYTES} bytes; expected a manifest. Split it into several fleets.")
-    try:
-        return data.decode("utf-8-sig")  # spreadsheets write a mark before it
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{path}: byte {error.start} is no UTF-8; expected a text file.") from None
 
 
 def _toml(text: str, checker: Checker) -> tuple[Choice, list[Entry]]:

@@ -26,7 +26,7 @@ from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.measuring import Measured, how_to_turn_upright, measured, sides_in_words, sides_of, unit_in_words
 from workflows.report import documents
-from workflows.report.documents import Damaged, Metrics, Quality, ResultVerdict
+from workflows.report.documents import Damaged, MeshQuality, Metrics, Quality, ResultVerdict
 from workflows.report.signature import write_page
 from workflows.report.summary import BAKE, EVALUATE, MESH, POINTS, POSES, RUN, SPLATS, TRAIN, TURNTABLE, against_network, quality_in_words, split_of
 
@@ -256,12 +256,11 @@ def _means(found: Metrics | None) -> list[tuple[str, ...]]:
     """A row of means for each of what was measured: PSNR, SSIM, PSNR with fitted colours."""
     if found is None:
         return []
-    mesh = found.mesh
-    vertices = None if mesh is None else Quality(mesh.psnr_vertex_colours, mesh.ssim_vertex_colours)
-    on_mesh = [None if mesh is None else Quality(psnr) for psnr in ((mesh.psnr_covered, mesh.asset_psnr_covered) if mesh is not None else (None, None))]
+    mesh = found.mesh or MeshQuality()
     rows = (("network", found.network, ""), ("asset", found.asset, ""), ("mesh, unlit, before the asset's surroundings", mesh, ""),
-            ("mesh in the colours of its vertices", vertices, ""), ("mesh, on the pixels that it covers", on_mesh[0], ""),
-            ("asset, on the same pixels", on_mesh[1], ""), ("3D Gaussians", found.splats, ""), ("asset minus network, on the same pixels", found.gap, "+"),
+            ("mesh in the colours of its vertices", Quality(mesh.psnr_vertex_colours, mesh.ssim_vertex_colours), ""),
+            ("mesh, on the pixels that it covers", Quality(mesh.psnr_covered), ""), ("asset, on the same pixels", Quality(mesh.asset_psnr_covered), ""),
+            ("3D Gaussians", found.splats, ""), ("asset minus network, on the same pixels", found.gap, "+"),
             ("asset's innermost box before the network's surroundings", found.asset_with_network_background, ""))  # fmt: skip
     return [
         (name, *_figures(quality, sign), "" if quality.psnr_colour_fitted is None else f"{quality.psnr_colour_fitted:{sign}.2f}")

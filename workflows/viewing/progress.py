@@ -49,7 +49,7 @@ class Progress:
         self.path, self.stages, self.clock = path, stages, clock
         self.previews: dict[tuple[str, str], str] = {}  # stage and name -> file, relative to the run: all that may be asked for
         self._lock = threading.Lock()
-        self._hashes: Any = None
+        self._hashes = Hashes(Run(path).cache)
         self._state: dict[str, Any] = {}
         self._due = -float("inf")
 
@@ -69,8 +69,6 @@ class Progress:
 
     def _look(self) -> dict[str, Any]:
         run = open_run(self.path)
-        if self._hashes is None:
-            self._hashes = Hashes(run.cache)
         decisions = survey(self.stages, run, hashes=self._hashes)
         previews: dict[tuple[str, str], str] = {}
         training = {outputs.stage: _training(run, each, previews) for outputs in TRAINED for each in decisions if each.stage == outputs.stage}

@@ -15,97 +15,42 @@ from tests.workflows.command import Enerf, Result
 
 SECONDS = 10
 
-KINDS: dict[str, Callable[[Path], str]] = {}
 
-
-def kind(make: Callable[[Path], object]) -> Callable[[Path], object]:
-    KINDS[make.__name__] = lambda path: str(make(path) or path)
-    return make
-
-
-@kind
-def missing(path: Path) -> None:
-    pass
-
-
-@kind
-def missing_below(path: Path) -> Path:
-    return path / "a/b"
-
-
-@kind
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
-@kind
-def endless_device(path: Path) -> str:
-    return "/dev/zero"
-
-
-@kind
-def link_to_a_device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-@kind
-def link_to_itself(path: Path) -> None:
-    path.symlink_to(path)
-
-
-@kind
-def empty_folder(path: Path) -> None:
-    path.mkdir()
-
-
-@kind
 def other_folder(path: Path) -> None:
     path.mkdir()
     (path / "notes.md").write_text("mine", encoding="utf-8")
 
 
-@kind
 def folder_of_pipes(path: Path) -> None:
     path.mkdir()
     for name in ("run.json", "transforms.json", "a.png", "asset.nerftree", "scene.json", "poses_bounds.npy"):
         os.mkfifo(path / name)
 
 
-@kind
-def empty_file(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-@kind
-def other_file(path: Path) -> None:
-    path.write_bytes(b"\x93NUMPY\xff\0\n" * 50)
-
-
-@kind
 def below_a_file(path: Path) -> Path:
     path.write_text("mine", encoding="utf-8")
     return path / "below"
 
 
-@kind
-def nul(path: Path) -> str:
-    return f"{path}\0x"
-
-
-@kind
-def long_name(path: Path) -> Path:
-    return path / ("x" * 4096)
-
-
-@kind
-def long_path(path: Path) -> Path:
-    return path.joinpath(*["y" * 200] * 40)
-
-
-@kind
-def odd_name(path: Path) -> Path:
-    return path.with_name(f"a\nb\x1b[31m\u202e\udcff{path.suffix}")
-
+# What is made at a path; the argument is what is returned, or the path.
+KINDS: dict[str, Callable[[Path], object]] = {
+    "missing": lambda path: path,
+    "missing_below": lambda path: path / "a/b",
+    "pipe": os.mkfifo,
+    "endless_device": lambda path: "/dev/zero",
+    "link_to_a_device": lambda path: path.symlink_to("/dev/zero"),
+    "link_to_itself": lambda path: path.symlink_to(path),
+    "empty_folder": os.mkdir,
+    "other_folder": other_folder,
+    "folder_of_pipes": folder_of_pipes,
+    "empty_file": Path.touch,
+    "other_file": lambda path: path.write_bytes(b"\x93NUMPY\xff\0\n" * 50) and None,
+    "below_a_file": below_a_file,
+    "nul": lambda path: f"{path}\0x",
+    "long_name": lambda path: path / ("x" * 4096),
+    "long_path": lambda path: path.joinpath(*["y" * 200] * 40),
+    "odd_name": lambda path: path.with_name(f"a\nb\x1b[31m\u202e\udcff{path.suffix}"),
+}
 
 # Where the argument goes; ASSET, SOURCE and NEW are what is sound. Next to it what a missing file, or an empty folder, means: nothing is wrong with it.
 COMMANDS: dict[str, tuple[list[str], str, set[str]]] = {
@@ -192,7 +137,7 @@ def test_hostile_paths(enerf: Enerf, toys: Path, tmp_path: Path, asset: Path, co
     for number, (name, make) in enumerate(KINDS.items()):
         place = tmp_path / str(number)
         place.mkdir()
-        path = make(place / f"x{suffix}")
+        path = str(make(place / f"x{suffix}") or place / f"x{suffix}")
         named = {"X": path, "ASSET": str(asset), "SOURCE": str(toys), **{f"NEW{end}": str(place / f"new{end}") for end in ("", ".ply", ".json", ".nerftree")}}
         as_json = bool(number % 2)
         given = [named.get(argument, argument) for argument in arguments] + ["--json"] * as_json

@@ -75,6 +75,24 @@ def with_pictures(folder: Path, state: FleetState) -> None:
             write_page(folder / scene.name / "report.html", b"the report")
 
 
+def toy_manifest(folder: Path, count: int, **fails: str) -> Path:
+    """A manifest of toy scenes s0, s1 and so on, whose sources are made; toy_manifest(folder, 3, s1="bad") lets the training of s1 fail so."""
+    lines = ['preset = "tiny"']
+    for number in range(count):
+        source = folder / "shoots" / f"s{number}"
+        source.mkdir(parents=True, exist_ok=True)
+        (source / "a.txt").write_text(f"scene {number}", encoding="utf-8")
+        lines += [f"[scenes.s{number}]", f'source = "{source}"', f'train.fail = "{fails.get(f"s{number}", "")}"']
+    path = folder / "scenes.toml"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+def fleet_json(fleet: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((fleet / "fleet.json").read_text(encoding="utf-8"))
+    return found
+
+
 def facts(page: str) -> dict[str, Any]:
     """What a page's script is handed."""
     found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL)

@@ -1,44 +1,28 @@
 """`enerf fleet` on toy scenes: whatever becomes of one scene, the others are done."""
 
-import json
 import os
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from pipeline.fleet import requests
 from tests.pipeline.toy import contents
 from tests.workflows.command import Enerf
+from tests.workflows.fleet.fleets import fleet_json, toy_manifest
 from workflows.fleet.running import held
 
 
 @pytest.fixture
 def scenes(toys: Path, tmp_path: Path) -> Path:
     """A folder of four scenes' sources."""
-    folder = tmp_path / "shoots"
-    for number in range(4):
-        (folder / f"s{number}").mkdir(parents=True)
-        (folder / f"s{number}" / "a.txt").write_text(f"scene {number}", encoding="utf-8")
-    return folder
+    toy_manifest(tmp_path, 4)
+    return tmp_path / "shoots"
 
 
 def manifest(folder: Path, **fails: str) -> Path:
-    path = folder.parent / "scenes.toml"
-    lines = ['preset = "tiny"']
-    for source in sorted(folder.iterdir()):
-        lines += [f"[scenes.{source.name}]", f'source = "{source}"']
-        if source.name in fails:
-            lines += [f'train.fail = "{fails[source.name]}"']
-    path.write_text("\n".join(lines), encoding="utf-8")
-    return path
-
-
-def fleet_json(fleet: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((fleet / "fleet.json").read_text(encoding="utf-8"))
-    return found
+    return toy_manifest(folder.parent, 4, **fails)
 
 
 def states(fleet: Path) -> dict[str, str]:

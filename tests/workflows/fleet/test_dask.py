@@ -5,33 +5,15 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.workflows.command import Enerf
+from tests.workflows.fleet.fleets import fleet_json, toy_manifest
 
 pytest.importorskip("distributed", reason="Dask distributed (the extra fleet) is not installed")
-
-
-@pytest.fixture
-def scenes(toys: Path, tmp_path: Path) -> Callable[..., Path]:
-    """scenes(s1="bad") writes a manifest of three scenes, of which s1 fails so."""
-
-    def write(**fails: str) -> Path:
-        lines = ['preset = "tiny"']
-        for number in range(3):
-            source = tmp_path / "shoots" / f"s{number}"
-            source.mkdir(parents=True)
-            (source / "a.txt").write_text(f"scene {number}", encoding="utf-8")
-            lines += [f"[scenes.s{number}]", f'source = "{source}"', f'train.fail = "{fails.get(f"s{number}", "")}"']
-        path = tmp_path / "scenes.toml"
-        path.write_text("\n".join(lines), encoding="utf-8")
-        return path
-
-    return write
 
 
 def cluster(folder: Path, *, processes: bool) -> list[Any]:
@@ -40,18 +22,13 @@ def cluster(folder: Path, *, processes: bool) -> list[Any]:
     return ["--cluster", "local", "--cluster-options", path, "--json"]
 
 
-def fleet_json(fleet: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((fleet / "fleet.json").read_text(encoding="utf-8"))
-    return found
-
-
 def digests(run: Path) -> dict[str, str]:
     return {path.parent.name: json.loads(path.read_bytes())["digest"] for path in run.glob("*/manifest.json")}
 
 
-def test_scenes_on_dask_are_as_one_by_one(enerf: Enerf, scenes: Callable[..., Path], tmp_path: Path) -> None:
+def test_scenes_on_dask_are_as_one_by_one(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
     fleet = tmp_path / "fleet"
-    result = enerf("fleet", scenes(s1="bad"), "--out", fleet, *cluster(tmp_path, processes=False))
+    result = enerf("fleet", toy_manifest(tmp_path, 3, s1="bad"), "--out", fleet, *cluster(tmp_path, processes=False))
     assert result.code == 3, result.err
     found = {scene["name"]: scene for scene in fleet_json(fleet)["scenes"]}
     assert {name: scene["state"] for name, scene in found.items()} == {"s0": "done", "s1": "quarantined", "s2": "done"}
@@ -78,7 +55,7 @@ def _runs(process: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="who runs a stage is read from /proc")
-def test_a_killed_workers_stage_goes_on_elsewhere(enerf: Enerf, scenes: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_killed_workers_stage_goes_on_elsewhere(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
     fleet, killed = tmp_path / "fleet", []
 
     def attempts() -> list[int]:
@@ -97,7 +74,7 @@ def test_a_killed_workers_stage_goes_on_elsewhere(enerf: Enerf, scenes: Callable
 
     killer = threading.Thread(target=kill)
     killer.start()
-    result = enerf("fleet", scenes(s0="slow"), "--out", fleet, *cluster(tmp_path, processes=True))
+    result = enerf("fleet", toy_manifest(tmp_path, 3, s0="slow"), "--out", fleet, *cluster(tmp_path, processes=True))
     killer.join()
     assert result.code == 0, fleet_json(fleet)
     retries = [each["text"] for each in result.objects if each["event"] == "retry" and each["scene"] == "s0"]

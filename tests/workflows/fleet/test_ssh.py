@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import json
 import os
 import signal
 import threading
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.workflows.command import Enerf
+from tests.workflows.fleet.fleets import fleet_json, toy_manifest
 
 pytest.importorskip("distributed", reason="Dask distributed (the extra fleet) is not installed")
 asyncssh: Any = pytest.importorskip("asyncssh", reason="asyncssh (the extra fleet) is not installed: no fleet is run by ssh")
@@ -121,24 +121,12 @@ dashboard = false
     return path
 
 
-def manifest(folder: Path, count: int) -> Path:
-    lines = ['preset = "tiny"']
-    for number in range(count):
-        source = folder / "shoots" / f"s{number}"
-        source.mkdir(parents=True)
-        (source / "a.txt").write_text(f"scene {number}", encoding="utf-8")
-        lines += [f"[scenes.s{number}]", f'source = "{source}"']
-    path = folder / "scenes.toml"
-    path.write_text("\n".join(lines), encoding="utf-8")
-    return path
-
-
 def test_a_fleet_runs_on_workers_that_ssh_starts(enerf: Enerf, toys: Path, server: Server, tmp_path: Path) -> None:
     fleet = tmp_path / "fleet"
     chosen = options(tmp_path, server.port)
-    result = enerf("fleet", manifest(tmp_path, 2), "--out", fleet, "--jobs", 2, "--cluster", "ssh", "--cluster-options", chosen, "--json")
+    result = enerf("fleet", toy_manifest(tmp_path, 2), "--out", fleet, "--jobs", 2, "--cluster", "ssh", "--cluster-options", chosen, "--json")
     assert result.code == 0, result.err
-    found: dict[str, Any] = json.loads((fleet / "fleet.json").read_text(encoding="utf-8"))
+    found = fleet_json(fleet)
     assert (found["state"], found["executor"], found["totals"]["done"]) == ("done", "dask", 2)
     assert {stage["worker"].startswith("tcp://127.0.0.1:") for scene in found["scenes"] for stage in scene["stages"].values()} == {True}
     started = [command for command in server.commands if "dask_spec" in command]
