@@ -147,8 +147,7 @@ def abandon(place: Workplace, trash: Path) -> None:
         place.out.mkdir()
         return
     files.discard(place.folder, trash)
-    if place.root.is_dir() and files.is_empty(place.root):
-        place.root.rmdir()
+    _remove_if_empty(place.root)
 
 
 def seal(out: Path, made: Manifest) -> None:
@@ -168,8 +167,7 @@ def publish(run: Path, stage: str, place: Workplace) -> None:
     _sync(place.folder, run)
     files.discard(old, work)
     files.discard(place.folder, work)
-    if files.is_empty(place.root):
-        place.root.rmdir()
+    _remove_if_empty(place.root)
 
 
 def finished(place: Workplace, stage: str) -> Manifest | None:
@@ -186,8 +184,7 @@ def is_published(run: Path, stage: str, place: Workplace) -> bool:
 def clear_published(run: Path, place: Workplace) -> None:
     """Delete the work folder of a published artifact: an interrupted forced run left it, and nothing resumes it."""
     files.discard(place.folder, run / WORK)
-    if files.is_folder(place.root) and files.is_empty(place.root):
-        place.root.rmdir()
+    _remove_if_empty(place.root)
 
 
 def recover(run: Path, stages: Collection[str]) -> list[str]:
@@ -235,8 +232,12 @@ def _clear_published(run: Path, stage: str, root: Path) -> None:
     for folder in list(root.iterdir()):
         if published is not None and folder.name == published.request.digest and files.is_folder(folder) and not files.exists(folder / "out"):
             files.discard(folder, run / WORK)
-    if files.is_empty(root):
-        root.rmdir()
+    _remove_if_empty(root)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if files.is_folder(folder) and files.is_empty(folder):
+        folder.rmdir()
 
 
 def _sealed(folder: Path, stage: str, request: str | None = None) -> Manifest | None:

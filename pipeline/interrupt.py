@@ -4,21 +4,17 @@ import contextlib
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 _DONE = b"\0"  # no signal has the number 0
-_GRACE = 0.3  # seconds for Python's own handler to end the process before the watching thread does
 
 
 class Stop:
     """Whether a signal has arrived. Calling it returns the number of the first, or None."""
 
-    def __init__(self) -> None:
-        self.number: int | None = None
-        self.presses = 0
+    number: int | None = None
 
     def __call__(self) -> int | None:
         return self.number
@@ -40,11 +36,6 @@ def stopping() -> Iterator[Stop]:
     def arrived(number: int, frame: FrameType | None) -> None:
         if stop.number is None:
             stop.number = number
-        if number == signal.SIGINT:
-            stop.presses += 1
-            if stop.presses > 1:
-                signal.signal(signal.SIGINT, signal.SIG_DFL)
-                os.kill(os.getpid(), signal.SIGINT)
 
     def restore() -> None:
         for number in handled:
@@ -67,8 +58,8 @@ def stopping() -> Iterator[Stop]:
 
 @contextmanager
 def _watching() -> Iterator[None]:
-    """Python runs its handlers between two bytecodes of the main thread: never, while that is inside a long foreign call. A thread
-    that reads the bytes which the C handler writes ends the process at the second Ctrl-C even then."""
+    """A thread that reads the bytes which the C handler writes ends the process at the second Ctrl-C: Python runs its own handlers between two bytecodes
+    of the main thread, never while that is inside a long foreign call."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     former = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
@@ -81,7 +72,6 @@ def _watching() -> Iterator[None]:
                     os.write(former, received)
             presses += received[0] == signal.SIGINT
             if presses > 1:
-                time.sleep(_GRACE)
                 os._exit(128 + signal.SIGINT)
 
     thread = threading.Thread(target=watch, name="second Ctrl-C", daemon=True)

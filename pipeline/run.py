@@ -140,16 +140,10 @@ class Run:
         What is not changed is as another process may have left it. What is read first, and changed for that, is read in `locked`.
         """
         with self.locked():
-            former = {name: getattr(self, name) for name in changes}
             before = self.plain()
             self._set(changes)
-            if self.plain() == before:
-                return
-            try:
+            if self.plain() != before:
                 self._save()
-            except BaseException:
-                self._set(former)
-                raise
 
     @property
     def sources(self) -> dict[str, Path]:

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from pipeline.errors import PipelineError
 from stages.formats.importers import formats_of
 from stages.formats.importers.photographs import is_video, photographs
-from stages.formats.importers.source import ImportSettings, Source
+from stages.formats.importers.source import Source
 from stages.io.photo import working_size
 from stages.io.pictures import UnreadableImage, read_header
 
@@ -18,15 +18,6 @@ FEW_PIXELS = 16e6  # of all photographs at working size
 WITHOUT_SURROUNDINGS = ("blender", "llff")  # formats of objects before a constant background, and of forward-facing captures
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
 SPLATS_SHARE, MAX_SPLATS = 0.15, 600.0  # of the budget, and seconds, in which two cores take all steps of any capture; docs/experiments/splats.md
-
-
-class PosesSettings(ImportSettings, Protocol):
-    """Settings of the stage poses that the share follows."""
-
-    @property
-    def format(self) -> str: ...
-    @property
-    def max_image_size(self) -> int: ...
 
 
 def share_budget(seconds: float, share: float, *, splats: bool) -> dict[str, float]:
@@ -44,8 +35,10 @@ def share_budget(seconds: float, share: float, *, splats: bool) -> dict[str, flo
     return {"train": train, "bake": seconds - train, **parts}
 
 
-def train_share(sources: Sequence[Path], poses: PosesSettings) -> float:
+def train_share(sources: Sequence[Path], poses: Any) -> float:
     """The share of the stage train, by what the sources are and how many pixels their photographs have at working size.
+
+    poses  settings of that stage
 
     Photographs of a source are taken to be as large as its first; videos have many pixels; a source that cannot be read has none (the stage poses reports it).
     """
@@ -58,7 +51,7 @@ def train_share(sources: Sequence[Path], poses: PosesSettings) -> float:
     return FEW_PIXELS_TRAIN_SHARE if pixels < FEW_PIXELS else TRAIN_SHARE
 
 
-def _pixels(source: Path, poses: PosesSettings) -> float:
+def _pixels(source: Path, poses: Any) -> float:
     pictures = [source] if is_video(source) else photographs(Source(source, poses.allow_outside))
     if any(map(is_video, pictures)):
         return float("inf")

@@ -56,8 +56,8 @@ class Program(Protocol):
 class _Channel(Channel):
     """The pipes to the parent."""
 
-    def warn(self, stage: str, text: str) -> None:
-        self.send({"event": "warning", "stage": stage, "text": text, "time": time.time()})
+    def say(self, stage: str, text: str, event: str = "message") -> None:
+        self.send({"event": event, "stage": stage, "text": text, "time": time.time()})
 
 
 def serve(program: Program) -> None:
@@ -65,7 +65,7 @@ def serve(program: Program) -> None:
     channel = _Channel()
     end_with(channel.receive()["parent"])
     while (request := channel.receive())["kind"] != "end":
-        with warnings_for_users(partial(channel.warn, request.get("stage") or "")):
+        with warnings_for_users(partial(channel.say, request.get("stage") or "", event="warning")):
             try:
                 answer = {"ok": True, **_answer(program, request, channel)}
             except Exception as error:
@@ -81,7 +81,7 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     path = Path(request["run"])
     if request["kind"] == "prepare":
         for text in program.prepare(path, request["scene"], request["memory"]):
-            channel.warn("", text)
+            channel.say("", text, "warning")
         found = _survey(program, path)
         return {"stages": found, "finished": program.is_finished(path), **_estimates(program, path, found, request, channel), **program.describe(path)}
     if request["kind"] == "finish":
@@ -90,7 +90,7 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     name = request["stage"]
     stage = next(each for each in program.stages if each.name == name)
     if request.get("donor") and take_over(_opened(program, path), stage, Path(request["donor"])):
-        channel.send({"event": "message", "stage": name, "text": f"{name}: adopted from {Path(request['donor']).name}", "time": time.time()})
+        channel.say(name, f"{name}: adopted from {Path(request['donor']).name}")
     memory = None if request["memory"] is None else Limit(request["memory"], "its share of the worker's memory")
     run = _opened(program, path)
     outcome = run_stages(run, program.stages, only=name, device=request["device"], memory=memory, report=channel.send, execute=execute_alone)[0]
@@ -141,8 +141,7 @@ def _estimates(program: Program, path: Path, surveyed: Sequence[dict[str, Any]],
         memory = program.memory(path, name, facts["device"] if stage.uses_device else "cpu")
         found["memory"] = {} if memory is None else {name: memory}
     except Exception as error:
-        text = f"{name}: its need cannot be estimated ({type(error).__name__}: {printable(str(error), 300)})"
-        channel.send({"event": "message", "stage": name, "text": text, "time": time.time()})
+        channel.say(name, f"{name}: its need cannot be estimated ({type(error).__name__}: {printable(str(error), 300)})")
     return found
 
 

@@ -43,8 +43,9 @@ class Scheduler:
     """
 
     def __init__(
-        self, fleet: Path, states: Sequence[SceneState], stages: Sequence[Stage], workers: Workers, *, device: str = "cpu", report: Report | None = None,
-        written: Callable[[FleetState], None] | None = None, stop: Callable[[], int | None] = lambda: None, lost: Callable[[], str | None] = lambda: None,
+        self, fleet: Path, states: Sequence[SceneState], stages: Sequence[Stage], workers: Workers, *, device: str = "cpu",
+        report: Report = lambda event: None, written: Callable[[FleetState], None] = lambda state: None,
+        stop: Callable[[], int | None] = lambda: None, lost: Callable[[], str | None] = lambda: None,
     ) -> None:  # fmt: skip
         self.fleet = fleet
         self.stages = {stage.name: stage for stage in stages}
@@ -127,7 +128,7 @@ class Scheduler:
             raise StageFailed(f"{self.fleet}: {why} {len(self._open)} scenes wait. Start workers, and give the fleet's command again: what is done is kept.")
         if note != self.state.note:
             self.state.note, self._changed = note, True
-            if note is not None and self._report is not None:
+            if note is not None:
                 self._report({"time": time.time(), "event": "warning", "scene": "", "text": note})
 
     def _take_requests(self) -> None:
@@ -336,14 +337,12 @@ class Scheduler:
         self.state.updated, self.state.totals = _now(), Totals.of(self.state.scenes)
         self.state.forecast_seconds = 0.0 if ending is not None else forecast_seconds(self.state.scenes, list(self.stages), self.state.slots)
         write_fleet(self.fleet, self.state)
-        if self._written is not None:
-            self._written(self.state)
+        self._written(self.state)
         self._changed = False
         self._next_write = now + max(WRITE_SECONDS, WRITE_INTERVAL_RATIO * (time.monotonic() - now))
 
     def _tell(self, each: Progress, event: str, **facts: Any) -> None:
-        if self._report is not None:
-            self._report({"time": time.time(), **facts, "event": event, "scene": each.state.name})
+        self._report({"time": time.time(), **facts, "event": event, "scene": each.state.name})
 
 
 def states_for(scenes: Sequence[Scene], former: FleetState | None) -> list[SceneState]:

@@ -22,7 +22,7 @@ COMMANDS = {  # name -> its module, and what `enerf --help` says of it
     "board": ("workflows.board", "Write a sheet of markers to print, for lengths in metres."),
     "measure": ("workflows.measure", "Measure lengths in a run, or give it metres by lengths that you know."),
     "orient": ("workflows.measure", "Set which way is up in a run, by places on the ground."),
-    "check": ("workflows.inspection.command", "Check photographs before a run."),
+    "check": ("workflows.inspection.check", "Check photographs before a run."),
     "doctor": ("workflows.inspection.doctor", "Show what is installed and what works, for a bug report."),
     "cache": ("workflows.inspection.doctor", "Show or remove compiled kernels and features."),
     "status": ("workflows.cli.status", "Show which stages are up to date, and why not."),

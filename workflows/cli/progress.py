@@ -17,9 +17,7 @@ from workflows.cli.output import write_json
 
 Event = Mapping[str, Any]
 
-# In a log, one line per ten seconds or per tenth of the way, whichever comes first, but no more than one in two seconds.
-SECONDS_BETWEEN_LINES = 10.0
-SECONDS_BETWEEN_TENTHS = 2.0
+SECONDS_BETWEEN_LINES = 10.0  # of a stage, in a log
 
 # Numbers beyond these come of files that are damaged, or made to mislead.
 _LONGEST = 1e12  # seconds
@@ -91,12 +89,12 @@ class Lines:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
-        self.last: dict[str, tuple[float, float]] = {}  # of each stage the time of its last line, and the share that was done
+        self.last: dict[str, float] = {}  # of each stage the time of its last line
 
     def __call__(self, event: Event) -> None:
         stage = event.get("stage") or ""
         if event["event"] == "stage_started":
-            self.last[stage] = time.monotonic(), 0.0
+            self.last[stage] = time.monotonic()
         if event["event"] == "progress":
             self._progress(stage, event)
         elif words := sentence(event):
@@ -107,14 +105,10 @@ class Lines:
 
     def _progress(self, stage: str, event: Event) -> None:
         now, total = time.monotonic(), event.get("total") or 0
-        share = event.get("done", 0) / total if total else 0.0
-        last_time, last_share = self.last.get(stage, (0.0, 0.0))
-        if share < last_share:  # the stage has come to its next part
-            self.last[stage] = last_time, last_share = last_time, 0.0
-        waited = now - last_time
-        if waited < SECONDS_BETWEEN_LINES and (waited < SECONDS_BETWEEN_TENTHS or share - last_share < 0.1):
+        if now - self.last.get(stage, -SECONDS_BETWEEN_LINES) < SECONDS_BETWEEN_LINES:
             return
-        self.last[stage] = now, share
+        self.last[stage] = now
+        share = event.get("done", 0) / total if total else 0.0
         left = f"{duration(event['left'])} left" if event.get("left") else ""
         words = [f"{share:4.0%}" if total else "", str(event.get("text", "")), facts(event), left]
         self._line(stage, "  ".join(word for word in words if word))

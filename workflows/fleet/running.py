@@ -89,8 +89,8 @@ def run_fleet(
     placement: Placement,
     *,
     retry: Sequence[str] | None = None,
-    report: Report | None = None,
-    written: Callable[[FleetState], None] | None = None,
+    report: Report,
+    written: Callable[[FleetState], None],
 ) -> FleetState:
     """Run what of a fleet is not done, and return its state. Raises RunLocked where it is being run, Interrupted after a signal, PipelineError.
 

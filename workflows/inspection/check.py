@@ -5,18 +5,23 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import click
+
 from pipeline.errors import BadInput
 from pipeline.executors.memory import Limit
 from pipeline.text import printable
 from stages.cores import count_cores
 from stages.formats.importers import formats_of
 from stages.io.material import find_material
-from stages.verdict.preflight import check
+from stages.verdict import preflight
 from stages.verdict.verdict import plural
 from stages.video.frames import Reader, frames_of
 from stages.video.reading import UnreadableVideo
+from workflows.cli.options import folder_type, memory_limit, memory_option, output_options, set_option, workflow
+from workflows.cli.output import conclude, listing
 from workflows.cli.progress import duration, size
 from workflows.cli.resolve import Settings, read_preset
+from workflows.precompilation.start import start_alone
 from workflows.workflow import Workflow
 
 CPU_PRESET = "preview"  # as `enerf run` has it without CUDA
@@ -24,6 +29,29 @@ STANDING = {  # of a video of which a run would keep hardly a frame
     "sentence": "Hardly a frame of the video differs from the others: the camera stands still, or all is dark.",
     "remedy": "Walk round the subject while filming, slowly, in good light.",
 }
+
+
+@click.command()
+@click.argument("source", metavar="SOURCE", type=folder_type)
+@click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE, detected by default. See poses.format in 'enerf presets poses'.")
+@set_option
+@memory_option
+@output_options
+def check(source: Path, format_name: str | None, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool) -> int:
+    """Check the photographs in the folder SOURCE, or frames of a video, before a run: sharpness, exposure, focal lengths, sizes, and overlap on small images.
+    Report likely problems and what to do, and estimate the time and memory of camera poses and of a full run on this CPU.
+
+    The grade is good, usable, poor or failed. The exit code is 0, or 2 if no cameras can be found.
+    """
+    start_alone()
+    settings = ("poses.format=" + format_name,) if format_name else ()
+    found = check_source(source, (*sets, *settings), memory_limit(memory), workflow())
+    code = 2 if found["grade"] == "failed" else 0
+    first, *others = in_words(found)
+    conclude(first, as_json=as_json, code=code, **found)
+    if not as_json and not quiet:
+        listing(*others)
+    return code
 
 
 def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflow: Workflow) -> dict[str, Any]:
@@ -42,7 +70,7 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
     poses = stages["poses"]
     with TemporaryDirectory() as work:
         folder = with_frames_for_videos(source, poses, Path(work))
-        found = check(folder, poses, count_cores(), stages).document() | {"source": str(source)}
+        found = preflight.check(folder, poses, count_cores(), stages).document() | {"source": str(source)}
         if folder != source:
             found["problems"] = [each | STANDING if (each["what"], each["grade"]) == ("few", "failed") else each for each in found["problems"]]
     found["forecast"]["memory_limit"] = None if limit is None else limit.bytes

@@ -6,7 +6,6 @@ nothing from the network. The template is report.html.j2.
 
 import functools
 import os
-import stat
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -27,7 +26,7 @@ from workflows.cli.progress import duration, size
 from workflows.measuring import Measured, how_to_turn_upright, measured, sides_in_words, sides_of, unit_in_words
 from workflows.report import documents
 from workflows.report.documents import Damaged, MeshQuality, Metrics, Quality, ResultVerdict
-from workflows.report.signature import write_page
+from workflows.report.signature import size_of, write_page
 from workflows.report.summary import BAKE, EVALUATE, MESH, POINTS, POSES, RUN, SPLATS, TRAIN, TURNTABLE, against_network, quality_in_words, split_of
 
 NAME = "report.html"
@@ -98,7 +97,7 @@ def _template() -> jinja2.Template:
         finalize=_shown,
     )
     environment.filters["link"] = lambda name: quote(os.fsencode(name.as_posix()))
-    environment.tests["there"] = jinja2.pass_context(lambda context, name: _size(context["folder"] / name) is not None)
+    environment.tests["there"] = jinja2.pass_context(lambda context, name: size_of(context["folder"] / name) is not None)
     return environment.get_template(TEMPLATE)
 
 
@@ -128,7 +127,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         mesh=MESH,
         splats=SPLATS,
         viewer=VIEWER,
-        files=[{"name": name, "what": what, "size": size(count)} for name, what in DOWNLOADS if (count := _size(folder / name)) is not None],
+        files=[{"name": name, "what": what, "size": size(count)} for name, what in DOWNLOADS if (count := size_of(folder / name)) is not None],
         views=_views(found),
         asset_report=_facts(folder, BAKE.report, damaged),
         mesh_report=_facts(folder, MESH.report, damaged),
@@ -158,15 +157,6 @@ def _shown(value: Any) -> Any:
     if isinstance(value, Markup) or value is None or isinstance(value, bool | float):
         return value
     return printable(value if isinstance(value, str) else plain(value), LONGEST)
-
-
-def _size(path: Path) -> int | None:
-    """Bytes of a file, None where there is none (any more)."""
-    try:
-        status = os.stat(path)
-    except OSError:
-        return None
-    return status.st_size if stat.S_ISREG(status.st_mode) else None
 
 
 def _previews(folder: Path, previews: Path) -> list[Path]:

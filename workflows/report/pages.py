@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from pipeline.run import NAME, Run
 from pipeline.stage import Stage
-from workflows.report.signature import PAGES, is_own, viewer_is_missing
+from workflows.report.signature import PAGES, is_newer, is_own, viewer_is_missing
 
 
 def write_pages(run: Run, stages: Sequence[Stage]) -> None:
@@ -18,12 +18,7 @@ def write_pages(run: Run, stages: Sequence[Stage]) -> None:
 
 
 def has_pages(run: Run, stages: Sequence[Stage]) -> bool:
-    """Whether the report is there and no artifact was published after it (that is a rename of its folder, which sets ctime) nor a setting changed, no page is
-    missing, and none is another's."""
-    try:
-        written = os.stat(run.path / "report.html", follow_symlinks=False).st_mtime_ns
-    except OSError:
-        return False
+    """Whether the report is there and no artifact was published after it nor a setting changed, no page is missing, and none is another's."""
     shown = (run.path / NAME, *(run.folder(stage.name) for stage in stages))
-    newest = all(os.stat(each, follow_symlinks=False).st_ctime_ns <= written for each in shown if os.path.lexists(each))
-    return newest and not viewer_is_missing(run) and all(is_own(run.path / name) for name in PAGES if os.path.lexists(run.path / name))
+    written = [run.path / name for name in PAGES if os.path.lexists(run.path / name)]
+    return is_newer(run.path / "report.html", shown) and not viewer_is_missing(run) and all(map(is_own, written))

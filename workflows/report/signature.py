@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import stat
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -48,6 +49,15 @@ def is_own(path: Path) -> bool:
     """Whether this program wrote the page, for this user."""
     found = _read(path)
     return found is not None and hmac.compare_digest(_signature(found[0]), found[1])
+
+
+def is_newer(page: Path, shown: Iterable[Path]) -> bool:
+    """Whether a page is there, and was written after all that it shows: an artifact is published by a rename of its folder, which sets ctime."""
+    try:
+        written = os.stat(page, follow_symlinks=False).st_mtime_ns
+        return all(os.stat(each, follow_symlinks=False).st_ctime_ns <= written for each in shown if os.path.lexists(each))
+    except OSError:
+        return False
 
 
 def altered_pages(run: Path) -> list[str]:

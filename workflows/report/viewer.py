@@ -14,7 +14,7 @@ from stages.framing import true_frame
 from stages.mesh.files import read_vertices
 from stages.viewer.captured import captured_views
 from stages.viewer.page import compact_bytes, splats_page, viewer_page
-from workflows.report.signature import ASSET_VIEWER, VIEWER, is_own, viewers, write_page
+from workflows.report.signature import ASSET_VIEWER, VIEWER, is_newer, is_own, viewers, write_page
 
 
 def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
@@ -96,12 +96,7 @@ def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
 
 
 def is_newest(run: Run, path: Path) -> bool:
-    """Whether the page is our own, and none of the artifacts that it shows was published after it: that is a rename of its folder, which sets ctime."""
-    try:
-        status = os.stat(path, follow_symlinks=False)
-        stages = (BakeOutputs.stage, MeshOutputs.stage, SplatsOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)
-        shown = [run.path / NAME, run.path / true_frame.NAME, *map(run.folder, stages)]  # run.json says what is to be shown
-        changed = [os.stat(each, follow_symlinks=False).st_ctime_ns for each in shown if os.path.lexists(each)]
-    except OSError:
-        return False
-    return all(each <= status.st_mtime_ns for each in changed) and is_own(path)
+    """Whether the page is our own, and none of the artifacts that it shows was published after it."""
+    stages = (BakeOutputs.stage, MeshOutputs.stage, SplatsOutputs.stage, PosesOutputs.stage, TrainOutputs.stage)
+    shown = [run.path / NAME, run.path / true_frame.NAME, *map(run.folder, stages)]  # run.json says what is to be shown
+    return is_newer(path, shown) and is_own(path)

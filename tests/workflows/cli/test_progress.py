@@ -33,7 +33,7 @@ def test_lines_are_throttled(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = Lines(stream)
     lines(event("stage_started", reason="never run"))
     for step in range(1000):
-        now[0] = 0.1 * step  # 100 s in all, a tenth every ten seconds
+        now[0] = 0.1 * step  # 100 s in all
         lines(event("progress", done=step + 1, total=1000, text="training", loss=0.5, left=125.0))
     lines(event("stage_done", seconds=100.0, cores_busy=1.7, cores=2))
     shown = stream.getvalue().splitlines()
@@ -89,7 +89,7 @@ def test_each_of_several_stages_has_a_bar_and_lines_of_its_own() -> None:
         bars(event("progress", stage="mesh", done=3, total=4))
         bars(event("stage_done", stage="splats"))
         assert {task.fields["stage"]: task.completed for task in bars.progress.tasks} == {"mesh": 3}
-        lines.last["mesh"] = lines.last["splats"] = (-1e9, 0.0)
+        lines.last["mesh"] = lines.last["splats"] = -1e9
         for share in (2, 3):
             for stage in ("mesh", "splats"):
                 lines(event("progress", stage=stage, done=share, total=4))

@@ -1,6 +1,5 @@
 """Pages of a running fleet: each written atomically, now and then, and at the end."""
 
-import contextlib
 import os
 import time
 from pathlib import Path
@@ -12,7 +11,7 @@ from stages.figures.thumbnails import write_thumbnail
 from stages.io.pictures import UnreadableImage
 from workflows.fleet.pages import comparison, index, spreadsheet
 from workflows.report.page import NAME as REPORT
-from workflows.report.signature import is_own
+from workflows.report.signature import is_newer, is_own
 
 FILES = (index.NAME, index.THUMBNAILS, spreadsheet.NAME, comparison.NAME, comparison.FOLDER)  # what pages consist of
 SECONDS = 5.0  # between two writings, and WRITE_INTERVAL_RATIO as long as one takes
@@ -83,7 +82,7 @@ class Pages:
             if picture is None:
                 continue
             try:
-                if not _is_newer(target, picture):
+                if not is_newer(target, [picture]):
                     write_thumbnail(picture, target)
                 self._pictures[scene.name] = stage, os.stat(target).st_mtime_ns
             except UnreadableImage:
@@ -107,10 +106,3 @@ def _picture(run: Path, stage: str) -> Path | None:
         if names:
             return Path(parent, min(names))
     return None
-
-
-def _is_newer(target: Path, picture: Path) -> bool:
-    """Whether a thumbnail was made after its picture was published."""
-    with contextlib.suppress(OSError):
-        return os.stat(target).st_mtime_ns > os.stat(picture).st_ctime_ns
-    return False
