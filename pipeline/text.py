@@ -3,8 +3,6 @@
 All that a stranger wrote goes through `printable` where it enters a message; every line goes through it once more on its way to a terminal.
 """
 
-_SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
-
 
 def printable(text: object, limit: int | None = None) -> str:
     """`text` with every character that is no letter, mark, number, punctuation, symbol or plain space as an escape: \\n, \\x1b, \\u202e, \\udcff.
@@ -17,14 +15,7 @@ def printable(text: object, limit: int | None = None) -> str:
     if limit is not None:
         shown = shown[: limit + 1]  # an escape is never shorter than what it stands for
     if not shown.isprintable():
-        shown = "".join(character if character.isprintable() else _escaped(character) for character in shown)
+        shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode("ascii") for each in shown)
     if limit is not None and len(shown) > limit:
         shown = shown[: max(limit - 1, 0)] + "…"
     return shown
-
-
-def _escaped(character: str) -> str:
-    code = ord(character)
-    if character in _SHORT:
-        return _SHORT[character]
-    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

@@ -2,6 +2,7 @@
 nothing heavy."""
 
 import ast
+import functools
 import graphlib
 import re
 import subprocess
@@ -70,9 +71,14 @@ def modules(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
 def imported(path: Path) -> Iterator[str]:
     """Full names of the modules that a file imports, anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -114,7 +120,7 @@ def import_graph() -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {}
     for name, path in paths.items():
         found = graph.setdefault(name, set())
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Import):
                 found |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -137,7 +143,7 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
     """(module:function, its node)"""
     for package in OURS:
         for path in modules(package):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for node in ast.walk(tree_of(path)):
                 if isinstance(node, ast.FunctionDef):
                     yield f"{dotted(path)}:{node.name}", node
 
@@ -190,7 +196,7 @@ def test_nothing_unpickles_or_evaluates() -> None:
             names = {name.partition(".")[0] for name in imported(path)} & {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
             calls = {
                 node.func.id
-                for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+                for node in ast.walk(tree_of(path))
                 if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec")
             }
             wrong += [f"{path.relative_to(ROOT)}: {name}" for name in sorted(names | calls)]
@@ -200,10 +206,9 @@ def test_nothing_unpickles_or_evaluates() -> None:
 def within_functions(path: Path) -> Iterator[tuple[int, str]]:
     """(line, what is imported there, as it is written) of the imports of a file that stand in functions."""
     lines = path.read_text(encoding="utf-8").splitlines()
-    tree = ast.parse("\n".join(lines))
     inside = {
         node.lineno
-        for function in ast.walk(tree)
+        for function in ast.walk(tree_of(path))
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
         for node in ast.walk(function)
         if isinstance(node, ast.Import | ast.ImportFrom)

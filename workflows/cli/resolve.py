@@ -239,14 +239,15 @@ class Settings:
                     dropped.append(f"{stage}.{name}")
         return dropped
 
-    def put_option(self, text: str) -> None:
-        """One `--set stage.name=value`."""
+    def put_option(self, text: str) -> tuple[str, str, str]:
+        """One `--set stage.name=value`; returns the three."""
         path, equals, value = text.partition("=")
         stage, dot, name = path.strip().partition(".")
         origin = f"--set {printable(text, MAX_SHOWN)}"
         if not equals or not dot or not name:
             raise UsageError(f"{origin}: expected stage.name=value, as in --set train.iterations=2000.")
         self.put(stage, name, parse_value(value.strip()), origin)
+        return stage, name, value.strip()
 
     def put_seed(self, seed: int) -> None:
         """Set `seed` in every stage that has it."""

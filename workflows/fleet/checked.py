@@ -160,10 +160,8 @@ def table_of_options(texts: Sequence[str], workflow: Workflow) -> Table:
     checked = Settings(workflow.settings)
     found: Table = {}
     for text in texts:
-        checked.put_option(text)
-        path, _, value = text.partition("=")
-        stage, _, name = path.strip().partition(".")
-        found.setdefault(stage, {})[name] = Text(value.strip())
+        stage, name, value = checked.put_option(text)
+        found.setdefault(stage, {})[name] = Text(value)
     return found
 
 

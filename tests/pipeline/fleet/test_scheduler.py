@@ -49,19 +49,6 @@ def test_scenes_are_prepared_run_in_order_and_finished(tmp_path: Path) -> None:
     assert order.index("s0") < order.index("s4")
 
 
-def test_stages_are_admitted_by_memory_and_a_large_one_has_its_turn(tmp_path: Path) -> None:
-    workers = Simulated([Worker("a", 8, 8 * GIB, slots=4)], at("s0", "train", 1, kind="refused", text="needs 7.0 GiB.", needed=7 * GIB))
-    assert run(tmp_path / "one", workers, scenes(12)).totals.done == 12
-    assert workers.most["a"] == (8 * GIB, 4)
-    names = [name for name, stage, _ in workers.log if stage == "train"]
-    assert names.count("s0") == 2
-    assert names.index("s11") > len(names) - 1 - names[::-1].index("s0")  # it did not have to wait for all others
-    workers = Simulated([Worker("a", 8, 8 * GIB, slots=2)], at("s1", "train", kind="refused", text="needs 9.0 GiB.", needed=9 * GIB))
-    found = run(tmp_path / "two", workers, scenes(3))  # more than any worker has
-    assert (found.state, found.totals.done) == ("failed", 2)
-    assert (state_of(found, "s1").state, state_of(found, "s1").reason) == ("quarantined", "needs 9.0 GiB.")
-
-
 @pytest.mark.parametrize("result", [{"kind": "memory", "text": "out of memory."}, {"kind": "died", "signal": signal.SIGKILL, "text": "ended by SIGKILL."}])
 def test_what_ran_out_of_memory_is_tried_once_in_half(tmp_path: Path, result: dict[str, Any]) -> None:
     workers = Simulated([Worker("a", 2, 4 * GIB)], at("s0", "bake", lines=["it said this"], **result))

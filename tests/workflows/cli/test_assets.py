@@ -1,7 +1,6 @@
 """verify, diff and convert with bare asset files."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,9 @@ import pytest
 from efficientnerf.asset.file import memory
 from efficientnerf.asset.format import WRITERS, describe, load, save
 from tests.efficientnerf.trees import random_tree
-from tests.workflows.command import Result
+from tests.workflows.command import Enerf, Result
 from workflows.cli.assets import LAYOUTS
 
-Enerf = Callable[..., Result]
 ROOT = Path(__file__).resolve().parents[3]
 
 

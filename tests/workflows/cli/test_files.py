@@ -2,7 +2,6 @@
 
 import json
 import typing
-from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,12 +24,11 @@ from stages.mesh.settings import MeshSettings
 from stages.turntable.settings import TurntableSettings
 from tests.stages.formats.gaussians import scattered
 from tests.stages.io.meshes import Z_UP, block
-from tests.workflows.command import Result
+from tests.workflows.command import Enerf
 from workflows.cli.files import EXR, TEXTURES
 from workflows.cli.main import COMMANDS
 from workflows.exporting import faces_from_text
 
-Enerf = Callable[..., Result]
 SCALE = 0.5
 
 

@@ -106,20 +106,8 @@ def test_the_page_shows_the_asset_against_its_network_and_the_verdict(tmp_path: 
     found = links(text)
     assert {"evaluate/strip_worst.png", "evaluate/strip_best.png", "evaluate/captured_path.mp4"} <= set(found)
     assert "evaluate/strip_median.png" not in found
-    figures = (
-        "-1.89",
-        "-0.040",
-        "3.40 %",
-        "5.10 %",
-        "28.75",
-        "-2.25",
-        "25.00",
-        "0.800",
-        "&lt;b&gt;.jpg",
-        "It has &lt;b&gt;.",
-        "Few rays.",
-        "Raise bake.max_mib.",
-    )
+    figures = ("-1.89", "-0.040", "3.40 %", "5.10 %", "28.75", "-2.25", "25.00", "0.800")
+    figures += ("&lt;b&gt;.jpg", "It has &lt;b&gt;.", "Few rays.", "Raise bake.max_mib.")
     assert [each for each in figures if each not in text] == []
 
 
