@@ -1,4 +1,4 @@
-"""Displays of a running fleet: a live table on a terminal, else a line for each stage that ends; JSON lines; or only what goes wrong."""
+"""Displays of a running fleet: a line for each stage that ends, on a terminal above what runs; JSON lines; or only what goes wrong."""
 
 import sys
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ _BAD = ("scene_failed", "scene_quarantined", "retry", "warning")
 class Show:
     """Takes the scheduler's events, and the state whenever it was written: pages are made of it.
 
-    table  the live table; None where there is no terminal
+    table  what runs; None where there is no terminal
     """
 
     def __init__(self, fleet: Path, *, as_json: bool, quiet: bool, table: LiveTable | None = None) -> None:
@@ -35,23 +35,27 @@ class Show:
         line, bad = sentence(event), event["event"] in _BAD
         if self.table is not None:
             self.table(event)
-            if line is not None and bad:
-                self.table.say(line)
-        elif line is not None and (bad or not self.quiet):
-            print(line, file=sys.stderr, flush=True)
+        if line is not None and (bad or not self.quiet):
+            self._say(line, "yellow" if bad else None)
 
     def written(self, state: FleetState) -> None:
         """fleet.json was written."""
         if self.table is not None:
-            self.table.written(state)
+            self.table.state = state
         self._pages(state)
         if self._pages.trouble is not None and self._pages.trouble != self._trouble:
             text = f"the fleet's pages cannot be written: {self._pages.trouble}"
             if self.as_json:
                 write_json({"event": "warning", "scene": "", "text": text})
             else:
-                print(printable(text), file=sys.stderr, flush=True)
+                self._say(text, "yellow")
         self._trouble = self._pages.trouble
+
+    def _say(self, line: str, style: str | None) -> None:
+        if self.table is not None:
+            self.table.say(line, style)
+        else:
+            print(printable(line), file=sys.stderr, flush=True)
 
 
 def sentence(event: dict[str, Any]) -> str | None:
