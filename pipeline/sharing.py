@@ -43,7 +43,9 @@ def take_over(run: Run, stage: Stage, donor: Path) -> bool:
             artifact.publish(run.path, stage.name, place)
         except OSError as error:
             raise failed(run.path, error) from error
-        _forget(run, stage)
+        hashes = Hashes(run.cache)
+        hashes.forget(f"{stage.name}/")  # those that are remembered are of the files before
+        hashes.save()
     return True
 
 
@@ -68,10 +70,3 @@ def _linked(source: Path, made: Manifest, place: Workplace) -> bool:
         return False
     artifact.seal(place.out, made)
     return True
-
-
-def _forget(run: Run, stage: Stage) -> None:
-    """Digests that were remembered are of the files before."""
-    hashes = Hashes(run.cache)
-    hashes.forget(f"{stage.name}/")
-    hashes.save()

@@ -152,7 +152,7 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
     prefix = f"{where}." if where else ""
     if not isinstance(mapping, Mapping):
         raise UsageError(f"{where or cls.__name__}: expected a table of settings, found {_shown(mapping)}.")
-    hints = hints_of(cls)
+    hints = hints_of(cls)  # type: ignore[arg-type]
     names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
     values = {}
     for name, value in mapping.items():

@@ -40,11 +40,8 @@ class Program(Protocol):
     def describe(self, run: Path) -> dict[str, Any]:
         """What fleet.json shows of a run as it is now: "metrics", "bytes", "verdict", "result"."""
 
-    def space(self, run: Path, stage: str, memory: int | None) -> int:
-        """Bytes that a stage which runs next writes at its peak, in this much memory."""
-
-    def memory(self, run: Path, stage: str, device: str) -> int | None:
-        """Bytes that a stage which runs next takes at its peak, by what those before it made; None where that is not known."""
+    def needs(self, run: Path, stage: str, device: str, memory: int | None) -> tuple[int, int | None]:
+        """Bytes that a stage which runs next writes at its peak in this much memory, and that it takes, by what those before it made; None: not known."""
 
     def is_finished(self, run: Path) -> bool:
         """Whether the pages about a run are there and newer than its stages."""
@@ -135,14 +132,12 @@ def _estimates(program: Program, path: Path, surveyed: Sequence[dict[str, Any]],
     if name is None:
         return {}
     stage, facts = next(each for each in program.stages if each.name == name), request["next"]
-    found: dict[str, Any] = {}
     try:
-        found["space"] = {name: program.space(path, name, facts["memory"])}
-        memory = program.memory(path, name, facts["device"] if stage.uses_device else "cpu")
-        found["memory"] = {} if memory is None else {name: memory}
+        space, memory = program.needs(path, name, facts["device"] if stage.uses_device else "cpu", facts["memory"])
+        return {"space": {name: space}, "memory": {} if memory is None else {name: memory}}
     except Exception as error:
         channel.say(name, f"{name}: its need cannot be estimated ({type(error).__name__}: {printable(str(error), 300)})")
-    return found
+        return {}
 
 
 def _survey(program: Program, path: Path) -> list[dict[str, Any]]:

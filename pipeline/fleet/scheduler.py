@@ -12,7 +12,6 @@ from typing import Any
 from pipeline.errors import Interrupted, RunLocked, StageFailed
 from pipeline.executors.memory import size_text
 from pipeline.fleet import disk, requests
-from pipeline.fleet.absence import Absence
 from pipeline.fleet.admission import Admission
 from pipeline.fleet.failure import LOCKED_PAUSE, Attempts, remedy
 from pipeline.fleet.forecast import forecast_seconds
@@ -27,6 +26,8 @@ Report = Callable[[dict[str, Any]], None]
 WRITE_SECONDS = 1.0  # between two writings of fleet.json, and WRITE_INTERVAL_RATIO as long as one takes
 WRITE_INTERVAL_RATIO = 20.0
 LOOK_SECONDS = 1.0  # between two checks for requests, and for workers that came or went
+LONGEST_ABSENCE = 300.0  # seconds that a fleet waits while it has no worker
+REPORT_SECONDS = 30.0  # seconds before that is reported
 
 
 class Scheduler:
@@ -61,7 +62,7 @@ class Scheduler:
         self._largest: int | None = None  # bytes of the largest worker; None where no limit is known
         self._next_number = 0
         self._next_write = self._next_look = 0.0
-        self._absence = Absence(queued=workers.queued)
+        self._worker_seen = time.monotonic()
         self._changed = True
         self._cancelled = self._ending = False
         for each in self._open:
@@ -122,14 +123,18 @@ class Scheduler:
         return True
 
     def _look_for_workers(self, now: float) -> None:
-        """Report a lack of workers. Raises StageFailed where it has lasted too long."""
-        note = self._absence.note(anyone=bool(self._alive), now=now)
-        if (why := self._absence.ends(now)) is not None and not self._tasks:  # one that takes no more tasks may still end those that it has
-            raise StageFailed(f"{self.fleet}: {why} {len(self._open)} scenes wait. Start workers, and give the fleet's command again: what is done is kept.")
+        """Report a lack of workers. Raises StageFailed where it has lasted too long; jobs of a queue may be hours in coming."""
+        self._worker_seen = now if self._alive else self._worker_seen
+        absent, minutes = now - self._worker_seen, f"{LONGEST_ABSENCE / 60:.0f} minutes"
+        patience = "as long as it takes" if self.workers.queued else minutes
+        note = f"no worker is there; one is waited for, {patience}" if not self._alive and absent >= REPORT_SECONDS else None
         if note != self.state.note:
             self.state.note, self._changed = note, True
             if note is not None:
                 self._report({"time": time.time(), "event": "warning", "scene": "", "text": note})
+        if absent > LONGEST_ABSENCE and not self.workers.queued and not self._tasks:  # one that takes no more tasks may still end those that it has
+            what = f"{len(self._open)} scenes wait. Start workers, and give the fleet's command again: what is done is kept."
+            raise StageFailed(f"{self.fleet}: no worker was there for {minutes}. {what}")
 
     def _take_requests(self) -> None:
         for request in requests.take(self.fleet):
@@ -175,12 +180,12 @@ class Scheduler:
             self._give_up(each, "failed", f"{shown} Free some space, and go on.")
 
     def _has_disk(self, each: Progress, need: int) -> bool:
-        """Whether the disk has space for so many bytes of its stage, besides what running stages will write."""
+        """Whether the disk has space for so many bytes of its stage and what running stages will write: what they have written already is no longer free."""
         if not need:
             return True
-        running = [(self.fleet / other.state.run, other.space.get(str(other.task.request.get("stage")), 0)) for other in self._tasks.values() if other.task]
-        free = disk.free_space(self.fleet) - disk.SCENE * len(self._all)
-        return disk.has_room(free, (self.fleet / each.state.run, need), running)
+        running = [(other, other.space.get(str(other.task.request.get("stage")), 0)) for other in self._tasks.values() if other.task]
+        left = sum(max(0, need - disk.written_in(self.fleet / other.state.run)) for other, need in [(each, need), *running])
+        return left + disk.RESERVE + disk.RESERVE_PER_SCENE * len(self._all) <= disk.free_space(self.fleet)
 
     def _order(self, each: Progress) -> tuple[bool, bool, int]:
         uses = each.what in self.stages and self.stages[each.what].uses_device

@@ -94,8 +94,7 @@ class Diamond:
     stages = (*STAGES, AFTER_LEFT)
     prepare: Callable[..., list[str]]
     describe: Callable[..., dict[str, object]]
-    space: Callable[..., int]
-    memory: Callable[..., int | None]
+    needs: Callable[..., tuple[int, int | None]]
     is_finished: Callable[..., bool]
     finish: Callable[..., None]
 

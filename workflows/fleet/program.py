@@ -51,21 +51,13 @@ class WorkflowProgram:
             size = 0
         return {"metrics": shown, "bytes": size, "verdict": camera_verdict(run), "result": result_verdict(run)}
 
-    def space(self, run: Path, stage: str, memory: int | None) -> int:
-        opened, settings = self._opened(run)
-        return self.workflow.space(stage, run, tuple(opened.sources.values()), settings, memory)
-
-    def memory(self, run: Path, stage: str, device: str) -> int | None:
-        opened, settings = self._opened(run)
-        return self.workflow.memory(stage, run, tuple(opened.sources.values()), settings, device)
+    def needs(self, run: Path, stage: str, device: str, memory: int | None) -> tuple[int, int | None]:
+        opened = self._open(run)
+        about = stage, run, tuple(opened.sources.values()), settings_of(self.stages, opened.settings)
+        return self.workflow.space(*about, memory), self.workflow.memory(*about, device)
 
     def _open(self, run: Path) -> Run:
         return Run.open(run, resume_command, frozenset(stage.name for stage in self.stages))
-
-    def _opened(self, run: Path) -> tuple[Run, dict[str, Any]]:
-        """A run, and the settings of its stages by their names."""
-        opened = self._open(run)
-        return opened, settings_of(self.stages, opened.settings)
 
     def is_finished(self, run: Path) -> bool:
         return has_pages(self._open(run), self.stages)

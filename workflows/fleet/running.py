@@ -107,7 +107,11 @@ def run_fleet(
         for state in states:
             if state.name in again and state.state in ("failed", "quarantined"):
                 state.state = "waiting"
-        lost = _lost(fleet, lease)
+
+        def lost() -> str | None:
+            why = lease.lost()
+            return None if why is None else f"{fleet}: no longer this process's to run: {why}. What is done is kept."
+
         workers = _workers(workflow, placement)
         return Scheduler(fleet, states, workflow.stages, workers, device=placement.device, report=report, written=written, stop=stop, lost=lost).run()
 
@@ -124,14 +128,6 @@ def scenes_to_retry(states: Sequence[SceneState], names: Sequence[str]) -> list[
     """The failed and quarantined scenes of these names; of all where none is given. Raises BadInput for a name that no scene has."""
     check_known(states, names)
     return [state.name for state in states if state.state in ("failed", "quarantined") and (not names or state.name in names)]
-
-
-def _lost(fleet: Path, lease: Lease) -> Callable[[], str | None]:
-    def lost() -> str | None:
-        why = lease.lost()
-        return None if why is None else f"{fleet}: no longer this process's to run: {why}. What is done is kept."
-
-    return lost
 
 
 def _workers(workflow: Workflow, placement: Placement) -> Workers:

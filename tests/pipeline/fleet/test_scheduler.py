@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pipeline.errors import Interrupted, RunLocked, StageFailed
-from pipeline.fleet import absence, disk, failure, requests
+from pipeline.fleet import disk, failure, requests, scheduler
 from pipeline.fleet.state import Scene, read_fleet
 from pipeline.fleet.workers import Task, Worker
 from tests.pipeline.fleet.simulated import STAGES, Answer, Simulated, done, hurry, run, scene_of, scenes, state_of, what
@@ -183,8 +183,8 @@ def test_without_a_worker_it_waits_and_then_gives_up(tmp_path: Path, monkeypatch
     calls = itertools.count()
     workers.between = lambda: workers.workers.append(Worker("late", 1)) if next(calls) == 5 else None
     assert run(tmp_path, workers, scenes(2)).state == "done"
-    monkeypatch.setattr(absence, "LONGEST", 0.0)
-    monkeypatch.setattr(absence, "REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(scheduler, "LONGEST_ABSENCE", 0.0)
+    monkeypatch.setattr(scheduler, "REPORT_SECONDS", 0.0)
     told: list[dict[str, Any]] = []
     nobody = Simulated([])
     with pytest.raises(StageFailed, match="2 scenes wait"):
@@ -199,7 +199,7 @@ def test_without_a_worker_it_waits_and_then_gives_up(tmp_path: Path, monkeypatch
 
 
 def test_jobs_of_a_queue_are_waited_for_and_so_are_those_after_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(absence, "LONGEST", 0.0)
+    monkeypatch.setattr(scheduler, "LONGEST_ABSENCE", 0.0)
     calls = itertools.count()
 
     def between() -> None:
@@ -212,7 +212,7 @@ def test_jobs_of_a_queue_are_waited_for_and_so_are_those_after_them(tmp_path: Pa
             assert "as long as it takes" in (read_fleet(tmp_path).note or "")
             workers.workers = [Worker("next", 1)]
 
-    monkeypatch.setattr(absence, "REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(scheduler, "REPORT_SECONDS", 0.0)
     workers = Simulated([], between=between, queued=True)
     assert run(tmp_path, workers, scenes(6)).state == "done"
     assert next(calls) > 60
