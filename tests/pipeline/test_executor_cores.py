@@ -6,16 +6,7 @@ import pytest
 
 from pipeline.executors import cores as module
 from pipeline.executors.cores import VARIABLES, cores, keep_to_quota
-
-
-def machine(root: Path, cgroup: str, files: dict[str, str]) -> Path:
-    (root / "proc/self").mkdir(parents=True)
-    (root / "proc/self/cgroup").write_text(cgroup)
-    for name, text in files.items():
-        path = root / "sys/fs/cgroup" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    return root
+from tests.pipeline.machine import machine
 
 
 @pytest.fixture(autouse=True)
