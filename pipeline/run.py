@@ -37,19 +37,22 @@ FORMAT = "enerf-run"
 VERSION = 1
 MOST_SOURCES = 100
 _ABANDONED = 24 * 3600.0  # seconds after which no process still writes to a temporary file, such as that of a report
-# The fields of an untrusted run.json. Settings are checked by the stages that have them.
 _Path = Annotated[str, msgspec.Meta(max_length=4096)]
-_FIELDS: dict[str, Any] = {
-    "source": _Path | None,
-    "also": Annotated[list[_Path], msgspec.Meta(max_length=MOST_SOURCES)],
-    "settings": dict[str, dict[str, Any]],
-    "preset": Annotated[str, msgspec.Meta(max_length=200)] | None,
-    "seed": Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None,
-    "device": Annotated[str, msgspec.Meta(max_length=200)] | None,
-    "memory": Annotated[int, msgspec.Meta(ge=1, le=NO_LIMIT)] | None,
-    "viewer": Annotated[str, msgspec.Meta(max_length=200)] | None,
-    "created": Annotated[float, msgspec.Meta(gt=-1e15, lt=1e15)],
-}
+_Word = Annotated[str, msgspec.Meta(max_length=200)]
+
+
+class _Document(msgspec.Struct):
+    """run.json, untrusted. Settings are checked by the stages that have them."""
+
+    source: _Path | None = None
+    also: Annotated[list[_Path], msgspec.Meta(max_length=MOST_SOURCES)] = []
+    settings: dict[str, dict[str, Any]] = {}
+    preset: _Word | None = None
+    seed: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None = None
+    device: _Word | None = None
+    memory: Annotated[int, msgspec.Meta(ge=1, le=NO_LIMIT)] | None = None
+    viewer: _Word | None = None
+    created: Annotated[float, msgspec.Meta(gt=-1e15, lt=1e15)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -279,24 +282,14 @@ def _recorded(run: Path) -> dict[str, Any]:
     version = value.get("version")
     if type(version) is int and version > VERSION:
         raise BadInput(f"{path}: made by a newer version: run format {version!r:.20}; this build reads {VERSION}. Upgrade efficientnerf.")
-    if version != VERSION or type(version) is not int:
-        raise _damaged(path, "version", version)
-    fields = {name: _field(path, name, value) for name in _FIELDS}
-    source = fields["source"]
-    return {**fields, "source": None if source is None else Path(source), "also": tuple(map(Path, fields["also"]))}
-
-
-def _field(path: Path, name: str, value: dict[str, Any]) -> Any:
-    found = value.get(name, {"settings": {}, "also": [], "created": 0.0}.get(name))
     try:
-        checked = msgspec.convert(found, _FIELDS[name])
-        paths = checked if name == "also" else [checked] if name == "source" and checked is not None else []
-        if any("\0" in path or not os.path.isabs(os.fsencode(path)) for path in paths):
-            raise ValueError
-    except (ValueError, OverflowError):  # a path that no file system can name is a ValueError, too
-        raise _damaged(path, name, found) from None
-    return checked
-
-
-def _damaged(path: Path, name: str, found: Any) -> CorruptArtifact:
-    return CorruptArtifact(f"{path}: {name} is {found!r:.60}. Restore the file, or start a new run.", (NAME,))
+        if version != VERSION or type(version) is not int:
+            raise ValueError(f"version is {version!r:.60}")
+        document = msgspec.convert(value, _Document)
+        paths = [each for each in (document.source, *document.also) if each is not None]
+        if any("\0" in each or not os.path.isabs(os.fsencode(each)) for each in paths):
+            raise ValueError("source, also: expected absolute paths")
+    except (ValueError, OverflowError) as error:  # a path that no file system can name is a ValueError, too
+        raise CorruptArtifact(f"{path}: {printable(error, 300)}. Restore the file, or start a new run.", (NAME,)) from None
+    source = None if document.source is None else Path(document.source)
+    return {**msgspec.structs.asdict(document), "source": source, "also": tuple(map(Path, document.also))}

@@ -55,7 +55,7 @@ def test_something_else_is_refused_and_left_alone(tmp_path: Path) -> None:
         ({"format": "blend"}, BadInput, "run"),
         ({"source": 5}, CorruptArtifact, "source"),
         ({"source": "/a\0b"}, CorruptArtifact, "source"),
-        ({"source": "/\ud800"}, CorruptArtifact, "source"),
+        ({"source": "/\ud800"}, CorruptArtifact, "surrogates"),
         ({"source": "../.."}, CorruptArtifact, "source"),
         ({"source": "/" + "x" * 5000}, CorruptArtifact, "source"),
         ({"settings": {"train": {"x": [[[]]] * 3}}, "preset": ["a"]}, CorruptArtifact, "preset"),

@@ -1,16 +1,20 @@
 """RUN/viewer.html: made where there is an asset, made again when that changes, and no hindrance where anything is wrong."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from efficientnerf.asset.format import save
+from efficientnerf.geometry.cameras import rays
 from pipeline.run import Run
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP
+from stages.io import scene as scenes
 from stages.io.pictures import opened
+from stages.io.png import write_png
 from stages.viewer.captured import PHOTOGRAPHS, SIDE, captured_views, photograph
 from tests.efficientnerf.trees import random_tree
 from tests.stages.balls import poses
@@ -41,11 +45,6 @@ def test_a_run_gets_a_page_with_its_cameras_and_photographs(run: Run) -> None:
 
 
 def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    from stages.io import scene as scenes
-    from stages.io.png import write_png
-
     folder = poses(tmp_path / "poses", count=PHOTOGRAPHS + 9)
     cameras, photographs = captured_views(folder, tmp_path / "train")
     assert (len(cameras), len(photographs)) == (PHOTOGRAPHS + 9, PHOTOGRAPHS)
@@ -55,8 +54,6 @@ def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Pat
     view = scene.views[0]
     side = 2 * SIDE
     camera = replace(view.camera, width=side, height=side, model="SIMPLE_RADIAL", params=(float(side), side / 2, side / 2, 0.2))
-    from efficientnerf.geometry.cameras import rays
-
     directions = rays(camera)[1] @ camera.world_from_camera[:3, :3]
     x = (directions[:, 0] / directions[:, 2]).reshape(side, side)
     write_png(np.repeat((128 + 127 * np.sin(30 * x)).astype(np.uint8)[..., None], 3, axis=2), folder / view.image)
