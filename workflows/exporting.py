@@ -48,30 +48,19 @@ Written = dict[str, Any]
 
 @dataclass(frozen=True)
 class Export:
-    """An export request.
+    """An export request."""
 
-    what       a run or an asset
-    files      to write, by extension; those that are there only if `force`
-    as_points  points instead of a mesh
-    as_splats  3D Gaussians instead of a mesh
-    region, crop  of the asset; None: as the settings say
-    texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
-    picture    how textures are stored
-    spz_version  of files .spz
-    limit      of memory
-    """
-
-    what: Path
-    files: tuple[Path, ...]
-    as_points: bool = False
-    as_splats: bool = False
-    region: str | None = None
+    what: Path  # a run or an asset
+    files: tuple[Path, ...]  # to write, by extension
+    as_points: bool = False  # instead of a mesh
+    as_splats: bool = False  # 3D Gaussians instead of a mesh
+    region: str | None = None  # of the asset; None: as the settings say; so is crop
     crop: Box | None = None
-    force: bool = False
-    texture: str | None = None
-    picture: str = "png"
+    force: bool = False  # whether files that are there are replaced
+    texture: str | None = None  # of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
+    picture: str = "png"  # how textures are stored
     spz_version: int = 4
-    limit: Limit | None = None
+    limit: Limit | None = None  # of memory
 
     @property
     def formats(self) -> dict[str, Format]:

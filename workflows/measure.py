@@ -105,7 +105,7 @@ def orient(run: Path, places: tuple[str, ...], up: str | None, plane: bool, forg
     conflict = known and angle > max(error or 0.0, measuring.UPRIGHT)
     if conflict:
         print(f"warning: the new up is {said}.", file=sys.stderr)
-    facts = {"up": list(ground.up), "up_error": error, "ground": ground.height, "degrees_from_run": angle, "up_of_run": words}
+    facts: dict[str, Any] = {"up": list(ground.up), "up_error": error, "ground": ground.height, "degrees_from_run": angle, "up_of_run": words}
     again = measuring.how_to_turn_upright(run, inside)
     lines = [f"{run}: up is set{'' if error is None else f', within {error:.2g} degrees (99 %)'}{'' if conflict else f'; {said}'}"]
     lines += [f"  its turntable keeps the former up; upright: {again}"] if again else []

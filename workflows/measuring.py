@@ -55,22 +55,15 @@ _EXPECTED = "expected X,Y,Z, or pixels of two photographs or more: a.jpg:120,340
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What can be measured in.
-
-    true   the frame in which places are given: that of exports
-    error  of the scale, as a share (99 %); None: not known
-    own_up  (3,) unit, in the capture's frame, as the run found it
-    shape  how sure lengths are by the cameras, whatever their scale: their standard deviation, as a share
-    grain  the standard deviation of a place X,Y,Z that someone picked, in the capture's unit: half a voxel
-    """
+    """What can be measured in."""
 
     cameras: Mapping[str, Camera]
-    true: TrueFrame
+    true: TrueFrame  # the frame in which places are given: that of exports
     metric: bool
-    error: float | None
-    own_up: np.ndarray
-    shape: float
-    grain: float
+    error: float | None  # of the scale, as a share (99 %); None: not known
+    own_up: np.ndarray  # (3,) unit, in the capture's frame, as the run found it
+    shape: float  # how sure lengths are by the cameras, whatever their scale: their standard deviation, as a share
+    grain: float  # the standard deviation of a place X,Y,Z that someone picked, in the capture's unit: half a voxel
 
     @property
     def frame(self) -> Similarity:

@@ -118,8 +118,8 @@ def _job_done(stage: Stage, asked: dict[str, Any], channel: _Channel) -> dict[st
         except (Exception, KeyboardInterrupt) as error:
             failure = interruption_in(error, stop()) or translated(error, stage.name, Path(asked["out"]))
             facts = {name: getattr(failure, name) for name in ("number", "needed", "files", "details") if hasattr(failure, name)}
-            told = {"error": type(failure).__name__, "facts": facts, "text": str(failure), "trace": "".join(traceback.format_exception(error))}
-            return {**told, "ok": False, "kind": "error"}
+            about = {"error": type(failure).__name__, "facts": facts, "text": str(failure), "trace": "".join(traceback.format_exception(error))}
+            return {**about, "ok": False, "kind": "error"}
 
 
 def _opened(program: Program, path: Path) -> Run:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from pipeline import errors
@@ -16,23 +17,19 @@ class FailureInChild(Exception):
     """The traceback of what a child raised, as its text: the cause of the error that is raised here."""
 
 
+@dataclass
 class SideBySide:
-    """An executor for stages that do not need each other. Used from `jobs` threads at most; closed by `with`.
+    """An executor for stages that do not need each other. Used from `jobs` threads at most; closed by `with`."""
 
-    module  what a child runs: it calls `serving.serve`
-    jobs    stages at a time
-    cores   that each of them may use: what one leaves idle the others take, and the last one has all of them
-    need    stage -> bytes that it takes at its peak; None: not known
-    least   seconds that the stages before have taken for it to be worth it: each child takes some to begin
-    """
+    module: str  # what a child runs: it calls `serving.serve`
+    jobs: int  # stages at a time
+    cores: int  # that each of them may use: what one leaves idle the others take, and the last one has all of them
+    need: Callable[[Stage], int | None]  # bytes that a stage takes at its peak; None: not known
+    least: float = 0.0  # seconds that the stages before have taken for it to be worth it: each child takes some to begin
 
-    def __init__(self, module: str, jobs: int, cores: int, need: Callable[[Stage], int | None], least: float = 0.0) -> None:
-        self.jobs = jobs
-        self.cores = cores
-        self.need = need
-        self.least = least
-        self._children = Children(module, jobs)
-        self._names = [f"stages side by side {number}" for number in range(jobs)]
+    def __post_init__(self) -> None:
+        self._children = Children(self.module, self.jobs)
+        self._names = [f"stages side by side {number}" for number in range(self.jobs)]
         self._free: queue.SimpleQueue[str] = queue.SimpleQueue()
         for name in self._names:
             self._free.put(name)

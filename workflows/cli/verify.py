@@ -1,6 +1,7 @@
 """`enerf verify`."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -35,7 +36,7 @@ def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
     except CorruptArtifact as error:
         raise Reported(error, {"asset": str(path), "damaged": list(error.files)}) from error
     about = describe_asset(path)
-    facts = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
+    facts: dict[str, Any] = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
     words = f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(path.stat().st_size)}, all as written"
     conclude(words, as_json=as_json, quiet=quiet, asset=str(path), **facts, damaged=[])
 

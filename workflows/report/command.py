@@ -1,6 +1,7 @@
 """`enerf report`."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -21,5 +22,5 @@ def report(run_folder: Path, as_json: bool) -> None:
     run = open_run(run_folder)
     viewer = write_run_viewer(run, anew=True)
     path = write_report(run, workflow().stages)
-    shown = {"report": str(path)} | ({} if viewer is None else {"viewer": str(viewer)})
+    shown: dict[str, Any] = {"report": str(path)} | ({} if viewer is None else {"viewer": str(viewer)})
     conclude(*shown.values(), as_json=as_json, run=str(run.path), **shown)

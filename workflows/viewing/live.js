@@ -14,13 +14,6 @@ function seconds(value) {
   return minutes < 60 ? `${minutes} min ${whole % 60} s` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
-function bytes(value) {
-  if (!value) return "";
-  const units = ["B", "KiB", "MiB", "GiB", "TiB"];
-  const power = Math.min(Math.floor(Math.log2(value) / 10), units.length - 1);
-  return `${(value / 1024 ** power).toFixed(power ? 1 : 0)} ${units[power]}`;
-}
-
 function element(name, text, className) {
   const made = document.createElement(name);
   made.textContent = text;
@@ -119,7 +112,7 @@ function show(state) {
     const item = element("li", stage.name, stage.state);
     const making = state.written_by && stage.state === "partial";
     item.append(element("span", [making ? "being made" : stage.state, seconds(stage.seconds)].filter(Boolean).join(" · ")));
-    item.title = (making ? "" : stage.reason) || stage.note || bytes(stage.bytes);
+    item.title = (making ? "" : stage.reason) || stage.note || "";
     return item;
   }));
   for (const [stage, found] of Object.entries(state.training)) showTraining(stage, found);

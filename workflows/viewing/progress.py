@@ -5,7 +5,7 @@ import re
 import stat
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,8 +45,8 @@ class _Line(msgspec.Struct):
 class Progress:
     """A run that others write, read now and then."""
 
-    def __init__(self, path: Path, stages: Sequence[Stage], clock: Callable[[], float] = time.monotonic) -> None:
-        self.path, self.stages, self.clock = path, stages, clock
+    def __init__(self, path: Path, stages: Sequence[Stage]) -> None:
+        self.path, self.stages = path, stages
         self.previews: dict[tuple[str, str], str] = {}  # stage and name -> file, relative to the run: all that may be asked for
         self._lock = threading.Lock()
         self._hashes = Hashes(Run(path).cache)
@@ -57,13 +57,13 @@ class Progress:
         """As `enerf status --json` gives, with `training`: steps, curves and previews by stage; `asset`: an identifier of what the viewer shows, or None;
         `error`: why the run could not be read now, or None. Where it is too early to read again, the last state is returned."""
         with self._lock:
-            began = self.clock()
+            began = time.monotonic()
             if began >= self._due:
                 try:
                     self._state = {**self._look(), "error": None}
                 except (PipelineError, OSError) as error:  # a stage may be replaced under our eyes
                     self._state = {**self._state, "error": printable(error, 500)}
-                now = self.clock()
+                now = time.monotonic()
                 self._due = now + max(PAUSE, (now - began) / SHARE)
             return self._state
 
