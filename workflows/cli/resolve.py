@@ -5,6 +5,7 @@ mapping `{stage: {setting: value}}`.
 """
 
 import difflib
+import functools
 import re
 import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -65,6 +66,12 @@ def preset_names(folder: Path = WORKFLOW.presets) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
+def merged(table: Table, over: Table) -> dict[str, dict[str, Any]]:
+    """The values of one table, and those of another over them."""
+    return {stage: {**table.get(stage, {}), **over.get(stage, {})} for stage in {**table, **over}}
+
+
+@functools.cache
 def read_preset(name: str, folder: Path = WORKFLOW.presets) -> Preset:
     """A preset with what it inherits. Raises UsageError for an unknown name and for a cycle."""
     return _read_preset(name, folder, ())
@@ -80,8 +87,7 @@ def _read_preset(name: str, folder: Path, heirs: tuple[str, ...]) -> Preset:
     own = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
     description, inherits = own.pop("description"), own.pop("inherits", None)
     parent = {} if inherits is None else _read_preset(inherits, folder, (*heirs, name)).table
-    merged = {stage: {**parent.get(stage, {}), **own.get(stage, {})} for stage in {**parent, **own}}
-    return Preset(name, description, inherits, own, merged)
+    return Preset(name, description, inherits, own, merged(parent, own))
 
 
 def read_config(path: Path) -> Config:

@@ -14,7 +14,7 @@ from pipeline.run import NAME as RUN_NAME
 from pipeline.stage import Stage, plain, settings_from, settings_of
 from pipeline.text import printable
 from workflows.budget import share_budget, train_share
-from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, seconds_of
+from workflows.cli.resolve import Settings, merged, nearest, parse_value, read_preset, seconds_of
 from workflows.workflow import Workflow
 
 Table = dict[str, dict[str, Any]]
@@ -41,24 +41,17 @@ class Choice:
 
     def over(self, other: Choice) -> Choice:
         """This one where it has a value, else the other."""
-        settings = {stage: {**other.settings.get(stage, {}), **self.settings.get(stage, {})} for stage in {**other.settings, **self.settings}}
-        return Choice(
-            settings,
-            other.preset if self.preset is None else self.preset,
-            other.seed if self.seed is None else self.seed,
-            other.budget if self.budget is None else self.budget,
-        )
+        options = {name: getattr(other if getattr(self, name) is None else self, name) for name in ("preset", "seed", "budget")}
+        return Choice(merged(other.settings, self.settings), **options)
 
     def with_budget(self, sources: Sequence[Path], workflow: Workflow) -> Table:
         """The settings, with what the budget makes of them."""
         if self.budget is None:
             return self.settings
-        preset = read_preset(self.preset or DEFAULT_PRESET, workflow.presets).table
-        (poses,) = (stage.settings for stage in workflow.stages if stage.name == "poses")
-        stated: Any = settings_from(poses, {**preset.get("poses", {}), **self.settings.get("poses", {})}, where="poses")
-        splats = {**preset.get("splats", {}), **self.settings.get("splats", {})}.get("make") != "off"
-        parts = share_budget(self.budget, train_share(sources, stated), splats=splats)
-        return {**self.settings, **{stage: {**self.settings.get(stage, {}), "time_budget": seconds} for stage, seconds in parts.items()}}
+        stated = merged(read_preset(self.preset or DEFAULT_PRESET, workflow.presets).table, self.settings)
+        poses: Any = settings_from(workflow.settings["poses"], stated.get("poses", {}), where="poses")
+        parts = share_budget(self.budget, train_share(sources, poses), splats=stated.get("splats", {}).get("make") != "off")
+        return merged(self.settings, {stage: {"time_budget": seconds} for stage, seconds in parts.items()})
 
 
 class Checker:
@@ -171,24 +164,21 @@ def refuse_what_cannot_work(scenes: Sequence[Scene], workflow: Workflow, fleet: 
     what  was given, the beginning of the message
     """
     checker = Checker(workflow, what)
-    presets: dict[str, Mapping[str, Any]] = {}
     refused: dict[bytes, str | None] = {}  # scenes are many, and their settings few
     for scene in scenes:
         if (fleet / scene.name / RUN_NAME).is_file():
             continue
-        name = scene.preset or DEFAULT_PRESET
-        if name not in presets:
-            presets[name] = read_preset(name, workflow.presets).table
-        key = canonical_json([name, scene.settings])
+        preset = scene.preset or DEFAULT_PRESET
+        key = canonical_json([preset, scene.settings])
         if key not in refused:
-            refused[key] = _why_refused(scene.settings, presets[name], workflow.stages)
+            refused[key] = _why_refused(merged(read_preset(preset, workflow.presets).table, scene.settings), workflow.stages)
         if (why := refused[key]) is not None:
             checker.mistake(why, scene=scene.name)
     checker.end()
 
 
-def _why_refused(given: Mapping[str, Mapping[str, Any]], preset: Mapping[str, Any], stages: Sequence[Stage]) -> str | None:
-    settings = settings_of(stages, {stage.name: {**preset.get(stage.name, {}), **given.get(stage.name, {})} for stage in stages})
+def _why_refused(given: Table, stages: Sequence[Stage]) -> str | None:
+    settings = settings_of(stages, given)
     try:
         for stage in stages:
             if stage.check is not None:

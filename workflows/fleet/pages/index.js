@@ -75,6 +75,7 @@ function thumbnail(scene) {
   return cell;
 }
 function play(scene, frame) {
+  document.querySelectorAll("video").forEach((other) => other.remove()); // one at a time
   const video = element("video");
   Object.assign(video, { preload: "none", muted: true, loop: true, playsInline: true, src: scene.video });
   frame.append(video);
