@@ -225,29 +225,20 @@ def write_atomically(path: Path, data: bytes, *, durable: bool = True) -> None:
         temporary.write_bytes(data)
 
 
-def is_temporary(name: str, path: str) -> bool:
-    """Whether a file of this name is what a kill left of writing `path`."""
+def is_temporary(name: str, *of: str) -> bool:
+    """Whether a file of this name is what a kill left of writing a file of one of these names; of any where none is given."""
     found = _TEMPORARY.fullmatch(name)
-    return found is not None and found.group(1) == _repeated(path)
+    return found is not None and (not of or found.group(1) in map(_repeated, of))
 
 
-def remove_temporaries(path: Path) -> None:
-    """The plain files that kills left of writing `path`; only while no other process writes it. Raises OSError."""
-    if not path.parent.is_dir():
-        return
-    with os.scandir(path.parent) as entries:
-        found = [entry for entry in entries if is_temporary(entry.name, path.name) and entry.is_file(follow_symlinks=False)]
-    for entry in found:
-        Path(entry.path).unlink(missing_ok=True)
-
-
-def remove_abandoned(folder: Path, seconds: float) -> None:
-    """The plain files directly in a folder that kills left of writing any file, last written longer ago than this. Raises OSError."""
+def remove_temporaries(folder: Path, *of: str, seconds: float = 0.0) -> None:
+    """The plain files directly in a folder that kills left of writing files of these names, which no other process writes; or of any, last written longer
+    ago than this. Raises OSError."""
     with os.scandir(folder) as entries:
-        found = [entry for entry in entries if _TEMPORARY.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)]
+        found = [entry for entry in entries if is_temporary(entry.name, *of) and entry.is_file(follow_symlinks=False)]
     for entry in found:
         with contextlib.suppress(FileNotFoundError):
-            if entry.stat(follow_symlinks=False).st_mtime < time.time() - seconds:
+            if not seconds or entry.stat(follow_symlinks=False).st_mtime < time.time() - seconds:
                 os.unlink(entry.path)
 
 

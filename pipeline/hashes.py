@@ -79,7 +79,7 @@ class Hashes:
             return
         try:
             self.path.parent.mkdir(exist_ok=True)
-            files.remove_temporaries(self.path)
+            files.remove_temporaries(self.path.parent, self.path.name)
             files.write_atomically(self.path, files.canonical_json({"format": FORMAT, "files": self._entries}))
             self._changed = False
         except OSError:

@@ -198,9 +198,9 @@ class Run:
     def _clear_temporaries(self) -> None:
         """Remove files outside of artifacts that killed writers left; those that cannot be removed do no harm."""
         with contextlib.suppress(OSError):
-            for path in (self.path / NAME, self.path / HOLDER, self.cache):
-                files.remove_temporaries(path)
-            files.remove_abandoned(self.path, _ABANDONED)
+            files.remove_temporaries(self.path, NAME, HOLDER)
+            files.remove_temporaries(self.path, seconds=_ABANDONED)
+            files.remove_temporaries(self.cache.parent, self.cache.name)
 
     def plain(self) -> dict[str, Any]:
         """What run.json holds."""
@@ -255,7 +255,7 @@ def _make_folder(path: Path) -> None:
 
 def _is_ours(name: str) -> bool:
     """Whether a kill while a run was created may have left a file of this name."""
-    return name in (LOCK, HOLDER, LEASE) or files.is_temporary(name, NAME) or files.is_temporary(name, HOLDER)
+    return name in (LOCK, HOLDER, LEASE) or files.is_temporary(name, NAME, HOLDER)
 
 
 def _absolute(path: Path) -> Path:

@@ -52,7 +52,7 @@ def check_fleet_folder(fleet: Path) -> None:
     if RUN_NAME in names:
         raise BadInput(f"{fleet}: is a run. Give a new folder for the fleet.")
     own = (*_OWN, *PAGES) if LEASE in names else _OWN  # pages without a trace of who wrote them are others'
-    others = [name for name in names if name not in own and not files.is_temporary(name, NAME) and not files.is_temporary(name, HOLDER)]
+    others = [name for name in names if name not in own and not files.is_temporary(name, NAME, HOLDER)]
     others = [name for name in others if not (fleet / name / RUN_NAME).is_file()]  # a fleet.json that was damaged may have been removed
     if NAME not in names and others:
         raise BadInput(f"{fleet}: exists and is not a fleet (no {NAME}; it holds {others[0]!r}). Give a new or an empty folder.")
