@@ -1,7 +1,6 @@
 """RUN/viewer.html: the page that shows what the run made in a browser. Like the report it belongs to no stage and can be made again."""
 
 import os
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,8 +19,8 @@ from workflows.report.signature import ASSET_VIEWER, VIEWER, is_newer, is_own, v
 def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
     """Write the run's `viewers` atomically, where one is missing, not this program's own or older than what it shows, or `anew`; returns the first one's path.
 
-    None, and no page, for a run without a sound asset, and for one whose files are too large for a page that is made by itself. Raises DiskFull, and
-    BadInput where the folder cannot be written.
+    None, and no page, for a run without a sound asset, for damaged Gaussians, and for files too large for a page that is made by itself. Raises DiskFull,
+    and BadInput where the folder cannot be written.
     """
     shown, path = viewers(run), run.path / VIEWER
     for name in (VIEWER, ASSET_VIEWER):
@@ -30,21 +29,12 @@ def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
             if name not in shown:
                 page.unlink(missing_ok=True)
             elif anew or not is_newest(run, page):
-                _write_sound(run, shown, name)
+                write_viewer_of(run.path, shown[name], page, ASSET_VIEWER if name == VIEWER and ASSET_VIEWER in shown else None)
+        except FormatError:  # `enerf verify` says what is wrong
+            page.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(page, error) from error
     return path if os.path.lexists(path) else None
-
-
-def _write_sound(run: Run, shown: Mapping[str, Path], name: str) -> None:
-    """Write a page of what it shows, or of the asset where Gaussians are damaged; none where that is damaged, too. `enerf verify` says what is wrong."""
-    page, other = run.path / name, ASSET_VIEWER if name == VIEWER and ASSET_VIEWER in shown else None
-    for made in dict.fromkeys((shown[name], BakeOutputs.of_run(run.path).asset)):
-        try:
-            write_viewer_of(run.path, made, page, other)
-            return
-        except FormatError:
-            page.unlink(missing_ok=True)
 
 
 def write_viewer_of(run: Path, shown: Path, target: Path, other: str | None = None) -> None:
