@@ -188,23 +188,26 @@ class Children:
     def _child(self, run: str | None, kind: Kind) -> _Child | None:
         """A child for this run, or for the preparation of any, with these cores and devices: the run's own, else a free one, for starting another costs a
         second; else a new one. None once all are closed."""
-        with self._lock:
-            if self._closed:
-                return None
-            idle = [child for child in self._children if child.idle_since is not None]
-            doomed = [child for child in idle if child.run is not None and child.run == run and child.kind != kind]
-            found = next((child for child in idle if child.run == run and child.kind == kind), None)
-            if found is None:
-                doomed += [child for child in self._excess(idle) if child not in doomed]
-                found = next((child for child in idle if child.run is None and child.kind == kind), None)
-            self._remove(doomed)
-            if found is None:
-                found = self._starter.submit(_Child, self.module, kind).result()
-                self._children.append(found)
-            found.run, found.idle_since = run, None
-        for child in doomed:
-            child.end()
-        return found
+        doomed: list[_Child] = []
+        try:
+            with self._lock:
+                if self._closed:
+                    return None
+                idle = [child for child in self._children if child.idle_since is not None]
+                doomed += [child for child in idle if child.run is not None and child.run == run and child.kind != kind]
+                found = next((child for child in idle if child.run == run and child.kind == kind), None)
+                if found is None:
+                    doomed += [child for child in self._excess(idle) if child not in doomed]
+                    found = next((child for child in idle if child.run is None and child.kind == kind), None)
+                self._remove(doomed)
+                if found is None:
+                    found = self._starter.submit(_Child, self.module, kind).result()
+                    self._children.append(found)
+                found.run, found.idle_since = run, None
+                return found
+        finally:
+            for child in doomed:
+                child.end()
 
     def _excess(self, idle: Sequence[_Child]) -> list[_Child]:
         """The idle children of runs that exceed `most` once another is added, longest idle first."""

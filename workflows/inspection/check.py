@@ -120,8 +120,8 @@ def in_words(found: dict[str, Any]) -> list[str]:
 
 
 def _of_the_run(about: dict[str, Any]) -> str:
-    room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} available; lower --target-mib"
-    memory = f"up to about {size(about['run_bytes'])} of memory{room}"
+    excess = "" if about["fits"] else f", more than the {size(about['memory_limit'])} available; lower --target-mib"
+    memory = f"up to about {size(about['run_bytes'])} of memory{excess}"
     if about["run_seconds"] is None:
         return f"Then training, for the time set by --budget or the preset; {memory}."
     longest = sorted(about["stage_seconds"].items(), key=lambda stage: -stage[1])[:3]
