@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset import format
-from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Texture
 from pipeline.errors import CorruptArtifact, UsageError
@@ -29,6 +28,7 @@ from stages.mesh.settings import MeshSettings
 from stages.points import run as points
 from stages.points.settings import PointsSettings
 from tests.stages.io.meshes import accessor, block, glb_document
+from tests.workflows.assets import write_block
 from workflows import exporting
 from workflows.cli.resolve import Settings, table_of
 from workflows.exporting import Export
@@ -42,20 +42,22 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run whose stage `mesh` is fresh, made with MADE: a block with a texture."""
     path = tmp_path / "run"
     Run.create(path, Path("/photographs"), {"mesh": settings_dict(MADE)})
-    for outputs in (BakeOutputs.of_run(path), MeshOutputs.of_run(path)):
-        outputs.folder.mkdir()
-    index = np.argwhere(np.ones((4, 4, 4), bool))
-    tree = tree_from_voxels((1, 1, 1), 0.5, np.full(3, -1.0), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), brick=4, metadata=METADATA)
-    format.save(tree, BakeOutputs.of_run(path).asset)
+    write_block(BakeOutputs.of_run(path).asset, metadata=METADATA)
     rng = np.random.default_rng(0)
     mesh = replace(block(), texture=Texture(rng.random((12, 3, 2)), rng.integers(0, 256, (16, 16, 3), dtype=np.uint8)))
     outputs = MeshOutputs.of_run(path)
+    outputs.folder.mkdir()
     for file in (outputs.ply, outputs.glb, outputs.obj):
         MESH_EXPORTERS[file.suffix](mesh, file, source_frame(METADATA))
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(MADE))))
     monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)
     monkeypatch.setattr(exporting, "_meshed", lambda export, tree, border, frame, wanted, progress: pytest.fail(f"made again, with {wanted}"))
     return path
+
+
+def make_cameras(run: Path) -> None:
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
 
 
 def settings(**mesh: Any) -> Settings:
@@ -79,8 +81,7 @@ def test_what_the_stage_has_made_is_written_as_it_made_it(run: Path) -> None:
 
 
 def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(run: Path) -> None:
-    PosesOutputs.of_run(run).folder.mkdir()
-    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    make_cameras(run)
     save_frame(TrueFrame(Similarity(3.0, np.eye(3), np.zeros(3)), 0.01, ()), run)
     export(run, "mesh.obj", "mesh.ply", "mesh.glb")
     before, after = (read_vertices(SimpleNamespace(ply=path))[0] for path in (MeshOutputs.of_run(run).ply, run.parent / "mesh.ply"))  # type: ignore[arg-type]
@@ -89,8 +90,7 @@ def test_what_the_stage_has_made_is_written_in_the_frame_that_was_found_since(ru
 
 
 def test_what_the_stage_has_made_is_written_upright_where_up_was_set(run: Path) -> None:
-    PosesOutputs.of_run(run).folder.mkdir()
-    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    make_cameras(run)
     up = np.array([0.48, -0.6, -0.64])
     save_frame(AS_CAPTURED.with_ground(Ground(tuple(up.tolist()), 0.5, [])), run)
     export(run, "mesh.ply", "mesh.glb")
@@ -121,8 +121,7 @@ def test_points_are_those_of_the_stage_on_its_mesh(run: Path, tmp_path: Path) ->
     assert (run.parent / "a.ply").read_bytes() == stage
     with pytest.raises(pytest.fail.Exception, match=r"made again, with .*max_faces=200000"):
         export(run, "b.ply", as_points=True, chosen=settings(max_faces=400))
-    PosesOutputs.of_run(run).folder.mkdir()
-    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    make_cameras(run)
     save_frame(TrueFrame(Similarity(3.0, np.eye(3), np.zeros(3)), 0.01, ()), run)
     export(run, "c.ply", as_points=True)
     before, after = (np.frombuffer(data.split(b"end_header\n", 1)[1], VERTEX) for data in (stage, (run.parent / "c.ply").read_bytes()))
@@ -154,8 +153,7 @@ def test_colours_of_vertices_are_asked_of_photographs_where_there_are_any(run: P
     other = settings(texture="photographs")
     (without,) = export(run, "a.ply", chosen=other)
     assert without["faces"] == 12
-    PosesOutputs.of_run(run).folder.mkdir()
-    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    make_cameras(run)
     with pytest.raises(pytest.fail.Exception, match=r"made again, with .*texture='photographs'"):
         export(run, "b.ply", chosen=other)
     with pytest.raises(UsageError, match="keeps a texture"):

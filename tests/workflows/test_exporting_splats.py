@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset import format
-from efficientnerf.asset.tree import tree_from_voxels
 from pipeline.run import Run
 from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, SplatsOutputs
@@ -17,6 +15,7 @@ from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.writing import source_frame
 from stages.splats.settings import SplatsSettings
 from tests.stages.formats.gaussians import read_spz, scattered
+from tests.workflows.assets import write_block
 from workflows import exporting_splats
 from workflows.cli.resolve import Settings, table_of
 from workflows.exporting import Export
@@ -30,11 +29,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run whose stage `splats` is fresh, made with MADE."""
     path = tmp_path / "run"
     Run.create(path, Path("/photographs"), {"splats": settings_dict(MADE)})
-    for outputs in (BakeOutputs.of_run(path), SplatsOutputs.of_run(path)):
-        outputs.folder.mkdir()
-    index = np.argwhere(np.ones((4, 4, 4), bool))
-    tree = tree_from_voxels((1, 1, 1), 0.5, np.full(3, -1.0), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), metadata=METADATA)
-    format.save(tree, BakeOutputs.of_run(path).asset)
+    write_block(BakeOutputs.of_run(path).asset, metadata=METADATA)
+    SplatsOutputs.of_run(path).folder.mkdir()
     SPLAT_EXPORTERS[".ply"](scattered(), SplatsOutputs.of_run(path).ply, source_frame(METADATA))
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(MADE))))
     monkeypatch.setattr("workflows.exporting.decide", lambda stage, run: fresh)

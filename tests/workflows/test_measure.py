@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.asset import format
-from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, project
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs, TurntableOutputs
@@ -23,6 +21,7 @@ from stages.io.scene import Scene, View, load, save, save_points, similarity_to_
 from tests.efficientnerf.capture.rings import cameras_round
 from tests.stages.balls import ORBIT, SIMILARITY
 from tests.stages.io.meshes import Z_UP, block
+from tests.workflows.assets import write_block
 from tests.workflows.command import Enerf
 from workflows.loading import load_asset
 
@@ -35,14 +34,10 @@ def run(tmp_path: Path) -> Path:
     """Six photographs of unknown unit, and an asset of them."""
     path = tmp_path / "run"
     Run.create(path, Path("/photographs"))
-    for outputs in (PosesOutputs.of_run(path), BakeOutputs.of_run(path)):
-        outputs.folder.mkdir()
+    PosesOutputs.of_run(path).folder.mkdir()
     views = [View(f"images/{c.name}", None, "train", SIMILARITY.camera(c), c, 1.0, 5.0) for c in cameras()]
     save(Scene("photographs", tuple(views), np.array([[-1.0] * 3, [1.0] * 3]), None, SIMILARITY, ORBIT), PosesOutputs.of_run(path).folder)
-    metadata = {"world_from_capture": similarity_to_json(SIMILARITY), "metric": False}
-    index = np.argwhere(np.ones((4, 4, 4), bool))
-    tree = tree_from_voxels((1, 1, 1), 0.001, np.full(3, -0.002), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), brick=4, metadata=metadata)
-    format.save(tree, BakeOutputs.of_run(path).asset)
+    write_block(BakeOutputs.of_run(path).asset, 0.001, {"world_from_capture": similarity_to_json(SIMILARITY), "metric": False})
     return path
 
 

@@ -5,11 +5,8 @@ import os
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from efficientnerf.asset import format
-from efficientnerf.asset.tree import tree_from_voxels
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs, SplatsOutputs
 from stages.formats.exporters import SPLAT_EXPORTERS
@@ -17,6 +14,7 @@ from stages.formats.exporters.writing import CAPTURE_IS_Z_UP
 from stages.viewer.html import policy_hash
 from stages.viewer.page import script_text
 from tests.stages.formats.gaussians import scattered
+from tests.workflows.assets import write_block
 from tests.workflows.report.records import record, record_splats
 from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
 from workflows.report.signature import write_page
@@ -104,11 +102,6 @@ def test_a_preview_that_became_a_link_is_not_followed(run: Run, tmp_path: Path) 
     assert site("/previews/train/preview_000002.png") is None
 
 
-def asset(path: Path) -> None:
-    index = np.argwhere(np.ones((4, 4, 4), bool))
-    format.save(tree_from_voxels((1, 1, 1), 0.5, np.full(3, -1.0), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), brick=4), path)
-
-
 def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
 
@@ -122,11 +115,10 @@ def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path:
     site = site_of(run, tmp_path)
     assert site("/viewer.html") is None
     file = BakeOutputs.of_run(run.path).asset
-    file.parent.mkdir()
-    asset(file)
+    write_block(file)
     first = json.loads(site.status())["asset"]
     assert [body(site("/viewer.html")) for _ in range(2)] == [b"page 1"] * 2
-    asset(file)
+    write_block(file)
     os.utime(file, ns=(1, file.stat().st_mtime_ns + 10**9))
     assert json.loads(site.status())["asset"] != first
     assert body(site("/viewer.html")) == b"page 2"
@@ -151,7 +143,7 @@ def test_the_viewer_is_of_the_gaussians_once_they_are_there_and_of_a_newer_asset
     site = site_of(run, tmp_path)
     bake = BakeOutputs.of_run(run.path)
     record(run.path, bake.stage)
-    asset(bake.asset)
+    write_block(bake.asset)
 
     def shown() -> tuple[str, bool]:
         """What tells it from another, and whether it is of Gaussians."""

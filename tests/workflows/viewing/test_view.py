@@ -12,13 +12,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from efficientnerf.asset import format
-from efficientnerf.asset.tree import tree_from_voxels
 from pipeline.run import Run
 from stages.artifacts import BakeOutputs
+from tests.workflows.assets import write_block
 from tests.workflows.command import Enerf
 from workflows.report.signature import write_page
 from workflows.viewing import serving, sites
@@ -45,10 +43,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
 def run(tmp_path: Path) -> Path:
     """A run with nothing but an asset."""
     path = Run.create(tmp_path / "run", Path("/photographs"), {}).path
-    file = BakeOutputs.of_run(path).asset
-    file.parent.mkdir()
-    index = np.argwhere(np.ones((4, 4, 4), bool))
-    format.save(tree_from_voxels((1, 1, 1), 0.5, np.full(3, -1.0), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), brick=4), file)
+    write_block(BakeOutputs.of_run(path).asset)
     return path
 
 
