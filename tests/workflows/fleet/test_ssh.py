@@ -55,6 +55,8 @@ class Server:
         for child in self.processes:
             kill(child)
         await asyncio.gather(*(child.wait() for child in self.processes))
+        for child in self.processes:
+            child._transport.close()  # type: ignore[attr-defined]  # else each warns once it is collected
 
 
 def kill(child: asyncio.subprocess.Process) -> None:
