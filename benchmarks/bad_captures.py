@@ -22,12 +22,11 @@ import cv2
 import numpy as np
 
 from benchmarks.machine import hardware
-from benchmarks.poses import aligned_errors, true_centres
+from benchmarks.poses import STILL_LIFE, TRUTH, percent_off, true_centres
 from benchmarks.scenes import room
 from stages.io.pictures import opened, rgb_and_alpha
 
 ROOT = Path(__file__).resolve().parents[1]
-GOOD, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
 ENERF = (sys.executable, "-m", "workflows.cli.main")
 MOST_ERROR = 1.0  # % of the mean distance of the cameras from their middle, root mean square
 ENOUGH = 0.75  # share of the photographs that can be placed, from which a capture without a diagnosis counts
@@ -193,7 +192,7 @@ def write(capture: Capture, count: int, folder: Path) -> list[str]:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     good = {}
-    for path in sorted(GOOD.glob("*.jpg"))[:count]:
+    for path in sorted(STILL_LIFE.glob("*.jpg"))[:count]:
         with opened(path) as image:
             good[path.name] = np.ascontiguousarray(rgb_and_alpha(image)[0][..., ::-1])
     made = capture.make(good)
@@ -262,17 +261,8 @@ def _last_json(text: str) -> dict[str, Any]:
 
 def _error(run: Path, capture: Capture) -> float | None:
     """Root mean square of the centres' distances from the truth, %; None where there are too few."""
-    truth = true_centres(TRUTH)
-    views = json.loads((run / "poses" / "scene.json").read_text())["views"]
-    pairs = [
-        (np.array(view["source_camera"]["world_from_camera"])[:3, 3], truth[capture.names(view["source_camera"]["name"])])
-        for view in views
-        if capture.names(view["source_camera"]["name"]) in truth
-    ]
-    if len(pairs) < 4:
-        return None
-    errors = aligned_errors(np.array([found for found, _ in pairs]), np.array([true for _, true in pairs]))
-    return round(100 * float(np.sqrt((errors**2).mean())), 3)
+    cameras = [view["source_camera"] for view in json.loads((run / "poses" / "scene.json").read_text())["views"]]
+    return percent_off({capture.names(camera["name"]): np.array(camera["world_from_camera"])[:3, 3] for camera in cameras}, true_centres(TRUTH))
 
 
 def in_markdown(rows: list[Row]) -> str:

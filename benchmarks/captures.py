@@ -23,9 +23,8 @@ import numpy as np
 
 from benchmarks.machine import hardware
 from benchmarks.minutes import code_version
-from benchmarks.poses import aligned_errors, true_centres
-from benchmarks.stage_runs import read_json
-from pipeline.files import write_atomically
+from benchmarks.poses import percent_off, true_centres
+from pipeline.files import read_json, write_atomically, write_json
 from pipeline.run import NAME as RUN_FILE
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
 from workflows.asset import NAMES as STAGES
@@ -82,7 +81,7 @@ def row_of(run: Path, reference: Path | None = None) -> dict[str, Any]:
         "missing": [stage for stage in STAGES if stage not in manifests],
         "cameras": cameras,
         "photographs": len(read_where_there(PosesOutputs.of_run(run).report).get("registered", ())) or None,
-        "percent_off_reference": None if reference is None or "poses" not in manifests else percent_off(run, reference),
+        "percent_off_reference": None if reference is None or "poses" not in manifests else off_reference(run, reference),
         "result": result,
         **{kind: {key: (metrics.get(kind) or {}).get(key) for key in ("psnr", "ssim")} for kind in KINDS},
         "views": (metrics.get("asset") or {}).get("views"),
@@ -114,9 +113,8 @@ def verdict_of(run: Path, stage: str) -> dict[str, Any] | None:
     }
 
 
-def percent_off(run: Path, reference: Path) -> float | None:
-    """Root mean square of the centres' distances from a reference's, % of the mean distance from the middle; None where they have fewer than four in common.
-    The reference is a transforms.json, or a list of {"img_name", "position"} as trainers of 3D Gaussians write them."""
+def off_reference(run: Path, reference: Path) -> float | None:
+    """How far the centres are off those of a reference: a transforms.json, or a list of {"img_name", "position"} as trainers of 3D Gaussians write them."""
     stated = read_json(reference)
     if isinstance(stated, list):
         centres = {Path(camera["img_name"]).stem: np.array(camera["position"]) for camera in stated}
@@ -124,11 +122,7 @@ def percent_off(run: Path, reference: Path) -> float | None:
         centres = {Path(name).stem: centre for name, centre in true_centres(reference).items()}
     views = [view["source_camera"] for view in read_json(PosesOutputs.of_run(run).scene)["views"]]
     found = {Path(view["name"]).stem: np.array(view["world_from_camera"])[:3, 3] for view in views}
-    names = sorted(found.keys() & centres.keys())
-    if len(names) < 4:
-        return None
-    errors = aligned_errors(np.array([found[name] for name in names]), np.array([centres[name] for name in names]))
-    return round(100 * float(np.sqrt((errors**2).mean())), 3)
+    return percent_off(found, centres)
 
 
 def write_picture(run: Path, path: Path) -> bool:
@@ -216,7 +210,7 @@ def write(rows: Mapping[str, Mapping[str, Any]], out: Path) -> None:
     """The figures and the page, in the order of the sets."""
     order = {name: place for place, name in enumerate(SETS)}
     ordered = {name: rows[name] for name in sorted(rows, key=lambda name: (order.get(name, len(order)), name))}
-    write_atomically(out / f"{FILE}.json", (json.dumps({"rows": ordered}, indent=1, allow_nan=False) + "\n").encode())
+    write_json(out / f"{FILE}.json", {"rows": ordered})
     write_atomically(out / f"{FILE}.md", in_markdown(ordered).encode())
 
 

@@ -26,7 +26,6 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 # Seconds at most. Most of the tests' time is compilation of kernels.
 PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "trees": 60.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
-TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
 TESTS = ["tests/efficientnerf", "tests/benchmarks/paper", "--ignore=tests/efficientnerf/backends/test_cuda_builds.py", "-k",
          "cuda or readback or device or gpu"]  # fmt: skip
 METHOD = ["torch", "triton", "numba", "scipy", "safetensors", "msgspec", "platformdirs"]
@@ -36,6 +35,17 @@ PIPELINE = [
 ]  # fmt: skip
 
 
+def ended(command: list[str], seconds: float, **options: Any) -> tuple[int | None, str]:
+    """Exit code of a program, None where it took too long and was stopped; and what it printed."""
+    with tempfile.TemporaryFile("w+") as output:
+        try:
+            code: int | None = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, timeout=seconds, check=False, **options).returncode
+        except subprocess.TimeoutExpired:
+            code = None
+        output.seek(0)
+        return code, output.read()
+
+
 def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[str, Any]:
     """The summary of `enerf run`, and the last progress of its training."""
     needed = PIPELINE if list(source.glob("transforms*.json")) else [*PIPELINE, "pycolmap"]
@@ -43,13 +53,12 @@ def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[
     if missing:
         return {"left_out": f"not installed here: {', '.join(missing)}"}
     command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(folder), "--device", "cuda", "--json", *options]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=max(1.0, seconds), check=False)
-    except subprocess.TimeoutExpired as late:
-        return {"stopped_after_seconds": round(late.timeout)}
-    events = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-    if done.returncode != 0:
-        return {"exit_code": done.returncode, "error": (events[-1].get("error") if events else None) or done.stderr[-2000:]}
+    code, output = ended(command, seconds)
+    if code is None:
+        return {"stopped_after_seconds": round(seconds)}
+    events = [json.loads(line) for line in output.splitlines() if line.startswith("{")]
+    if code != 0:
+        return {"exit_code": code, "error": (events[-1].get("error") if events else None) or output[-2000:]}
     training = [event for event in events if event["event"] == "progress" and event["stage"] == "train"]
     summary = events[-1]
     took = summary["seconds"]
@@ -71,13 +80,8 @@ def tests(seconds: float) -> dict[str, Any]:
     command = [sys.executable, "-m", "pytest", "-q", "-W", "default", "-p", "no:cacheprovider", "--continue-on-collection-errors", *TESTS]
     if importlib.util.find_spec("xdist") is not None:
         command += ["-n", str(min(8, os.cpu_count() or 1))]
-    with tempfile.TemporaryFile("w+") as output:
-        try:
-            code: int | None = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT, timeout=seconds, check=False).returncode
-        except subprocess.TimeoutExpired:
-            code = None
-        output.seek(0)
-        lines = output.read().splitlines()
+    code, output = ended(command, seconds, cwd=ROOT)
+    lines = output.splitlines()
     failed = [line for line in lines if line.startswith(("FAILED", "ERROR", "E   "))]
     return {"exit_code": code, **({} if code == 0 else {"failed": failed[:80]}), "last": lines[-1] if lines else ""}
 
@@ -104,7 +108,7 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
         from efficientnerf.asset import format
 
         tree = format.load(given.asset) if given.asset else gpu_kernels.shell(384)
-        return gpu_kernels.frame_rates("cuda", tree, 800, 10, TILES)
+        return gpu_kernels.frame_rates("cuda", tree, 800, 10)
     if part == "trees":
         import gpu_tree
 
@@ -126,13 +130,9 @@ def in_child(part: str, seconds: float) -> dict[str, Any]:
         command = [sys.executable, __file__, *sys.argv[1:], "--only", part, "--seconds", str(max(1.0, seconds - 10)), "--json", str(figures)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
         begun = time.monotonic()
-        with tempfile.TemporaryFile("w+") as output:
-            try:
-                code = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, env=environment, timeout=seconds, check=False).returncode
-            except subprocess.TimeoutExpired:
-                return {"stopped_after_seconds": round(seconds)}
-            output.seek(0)
-            text = output.read()
+        code, text = ended(command, seconds, env=environment)
+        if code is None:
+            return {"stopped_after_seconds": round(seconds)}
         if code != 0 or not figures.exists():
             return {"error": text[-3000:] or f"exit code {code}"}
         return {**json.loads(figures.read_text(encoding="utf-8")), "seconds_in_all": round(time.monotonic() - begun, 1)}

@@ -7,14 +7,10 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
-from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from gpu_kernels import BOUNDS, ball, orbit
+from gpu_kernels import BOUNDS, ball, counted_waits, orbit, synchronise
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.refinement import fit
@@ -42,8 +38,7 @@ class Clock:
         self.last = time.perf_counter()
 
     def lap(self, name: str) -> None:
-        if self.device == "cuda":
-            torch.cuda.synchronize()
+        synchronise(self.device)
         now = time.perf_counter()
         self.seconds[name], self.last = round(now - self.last, 3), now
 
@@ -99,15 +94,10 @@ def waits_of(state: RefinementState, targets: Targets, device: str, options: dic
     """Lines that waited for the device in further steps; the first is left out, which waits by design."""
     running = fit.optimise(state, targets, **options)
     next(running)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        if device == "cuda":
-            torch.cuda.set_sync_debug_mode("warn")
+    with counted_waits(device) as waits:
         for _ in running:
             pass
-        if device == "cuda":
-            torch.cuda.set_sync_debug_mode("default")
-    return dict(Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "called a synchronizing" in str(w.message)))
+    return waits
 
 
 def test_view_psnr(m: Model, trees: list[NerfTree], camera: Camera, device: str) -> dict[str, float]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import model
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
+from tests.poses import looking_at
 
 BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])
 
@@ -42,6 +44,26 @@ def milliseconds(run: Callable[[], Any], device: str, repeats: int) -> float:
             run()
             taken.append(1e3 * (time.perf_counter() - started))
     return float(np.median(taken))
+
+
+def synchronise(device: str) -> None:
+    """Wait until the device has done all that it was given."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
+@contextlib.contextmanager
+def counted_waits(device: str) -> Iterator[dict[str, int]]:
+    """File and line -> how often the host waited there for the device; filled in at the end."""
+    found: dict[str, int] = {}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("warn")
+        yield found
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("default")
+    found.update(Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "called a synchronizing" in str(w.message)))
 
 
 def copy_rate(device: str, mebibytes: int, repeats: int) -> float:
@@ -127,32 +149,22 @@ def orbit(side: int, frames: int) -> list[Camera]:
     for n in range(frames):
         azimuth, elevation = 2 * math.pi * n / frames, 0.4
         back = np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
-        right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-        pose = np.eye(4)
-        pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, -np.cross(back, right), -back, 3 * back
-        out.append(Camera(f"v{n:03}", side, side, "SIMPLE_PINHOLE", (1.4 * side, side / 2, side / 2), pose))
+        out.append(Camera(f"v{n:03}", side, side, "SIMPLE_PINHOLE", (1.4 * side, side / 2, side / 2), looking_at(3 * back)))
     return out
 
 
-def frame_rates(device: str, tree: NerfTree, side: int, repeats: int, variants: list[tuple[tuple[int, int], int]]) -> dict[str, Any]:
-    """Milliseconds of a render of side x side pixels, mean over an orbit, for tile sizes and warps per program; and its difference from the CPU's."""
+def frame_rates(device: str, tree: NerfTree, side: int, repeats: int) -> dict[str, Any]:
+    """Milliseconds of a render of side x side pixels, mean over an orbit; and its difference from the CPU's."""
     from efficientnerf.backends.triton import tree as cuda_tree
 
     on_device = cuda_tree.device_tree(tree, device)
     cameras = orbit(side, 8)
-    row = on_device.sh.shape[1]
-    usual = (cuda_tree.TILE, cuda_tree.WARPS[row])
-    timed = []
-    for tile, warps in [usual, *variants]:
-        cuda_tree.TILE = tile
-        cuda_tree.WARPS[row] = warps
-        took = milliseconds(lambda: [cuda_tree.render_image(on_device, c, background=(1.0, 1.0, 1.0)) for c in cameras], device, repeats) / len(cameras)
-        timed.append({"tile": list(tile), "warps": warps, "ms": round(took, 4), "frames_per_second": round(1e3 / took, 1)})
-    cuda_tree.TILE, cuda_tree.WARPS[row] = usual
+    took = milliseconds(lambda: [cuda_tree.render_image(on_device, c, background=(1.0, 1.0, 1.0)) for c in cameras], device, repeats) / len(cameras)
     ours = cuda_tree.render_image(on_device, cameras[0]).colour.cpu().numpy()
     off = np.abs(ours - render(tree, cameras[0]).colour).max(axis=-1)
     return {
-        "pixels": [side, side], "voxels": len(tree.density_values), "bytes_on_device": on_device.bytes, "runs": timed,
+        "pixels": [side, side], "voxels": len(tree.density_values), "bytes_on_device": on_device.bytes, "ms": round(took, 4),
+        "frames_per_second": round(1e3 / took, 1),
         "difference_from_cpu": {"mean": float(off.mean()), "share_above_1e-3": float((off > 1e-3).mean()), "largest": float(off.max())},
     }  # fmt: skip
 
@@ -205,27 +217,18 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
     for number in range(steps):
         done = next(running)
         if number == steps // 2:
-            if device == "cuda":
-                torch.cuda.synchronize()
+            synchronise(device)
             started, samples = time.perf_counter(), 0
         samples += done.fine + done.valid
-    if device == "cuda":
-        torch.cuda.synchronize()
+    synchronise(device)
     took = time.perf_counter() - started
-    waits: Counter[str] = Counter()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        if device == "cuda":
-            torch.cuda.set_sync_debug_mode("warn")
+    with counted_waits(device) as waits:
         left_out = sum(next(running).left_out for _ in range(32))
-        if device == "cuda":
-            torch.cuda.set_sync_debug_mode("default")
-    waits.update(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "called a synchronizing" in str(w.message))
     timed = steps - steps // 2 - 1
     assert done is not None
     return {
         "steps_per_second": round(timed / took, 1), "samples_per_second": round(samples / took), "psnr": round(done.psnr, 2), "rays": done.rays,
-        "waits_in_32_steps": dict(waits), "rays_left_out_in_32_steps": left_out,
+        "waits_in_32_steps": waits, "rays_left_out_in_32_steps": left_out,
     }  # fmt: skip
 
 

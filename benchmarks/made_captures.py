@@ -8,7 +8,6 @@ share that is masked. Writes made_captures.json and .md; exit code 1 where any i
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -20,7 +19,7 @@ import numpy as np
 from benchmarks.scenes import captures
 from benchmarks.scenes.captures import MadeCapture
 from efficientnerf.training.settings import TrainSettings
-from pipeline.files import write_atomically
+from pipeline.files import read_json, write_atomically, write_json
 from pipeline.stage import Job
 from stages.io import scene
 from stages.poses.run import run as find_poses
@@ -127,14 +126,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
     given = parser.parse_args(arguments)
     table, about = given.out / "made_captures.json", {"width": given.width, "side": given.side, "seed": given.seed}
-    before = json.loads(table.read_text(encoding="utf-8")) if table.exists() else {}
+    before = read_json(table) if table.exists() else {}
     rows = dict(before["rows"]) if about.items() <= before.items() else {}  # of other kinds
     for name in given.kinds.split(","):
         rows[name] = measured(name, captures.captures()[name], given.work.resolve(), given.width, given.side, given.seed)
         print(f"{name}: {100 * rows[name]['masked']:.2f} % of the subject masked, {100 * rows[name]['masked_of_all']:.1f} % of all", flush=True)
     given.out.mkdir(parents=True, exist_ok=True)
     rows = {name: rows[name] for name in captures.captures() if name in rows}
-    write_atomically(table, (json.dumps({**about, "rows": rows}, indent=1) + "\n").encode())
+    write_json(table, {**about, "rows": rows})
     write_atomically(table.with_suffix(".md"), in_markdown(rows).encode())
     return 1 if any(row["masked"] > MOST_MASKED for row in rows.values()) else 0
 

@@ -5,12 +5,12 @@ there are none. Rows of several files (ours, peers') are shown in one table.
 """
 
 import hashlib
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import hardware
+from pipeline.files import read_json, write_json
 from stages.figures.plots import with_palette
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,7 +35,7 @@ def code_version(root: Path = ROOT) -> str:
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """The rows of a file; none where it is not there."""
-    return list(json.loads(path.read_text(encoding="utf-8"))["rows"]) if path.exists() else []
+    return list(read_json(path)["rows"]) if path.exists() else []
 
 
 def same_row(one: Mapping[str, Any], two: Mapping[str, Any]) -> bool:
@@ -50,11 +50,9 @@ def with_row(rows: Iterable[Mapping[str, Any]], row: Mapping[str, Any]) -> list[
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """The file of the rows, with the machine; replaced whole."""
-    from pipeline.files import write_atomically
-
     machine = {key: value for key, value in hardware("cpu").items() if key != "load"}  # each row has its own
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, (json.dumps({"machine": machine, "rows": list(rows)}, indent=1, allow_nan=False) + "\n").encode())
+    write_json(path, {"machine": machine, "rows": list(rows)})
 
 
 def in_markdown(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -13,26 +13,33 @@ import platform
 import resource
 import tempfile
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import pose_from_opengl
+from efficientnerf.geometry.cameras import closest_similarity, pose_from_opengl
 from stages.sfm.cameras import find_cameras
 from stages.sfm.reconstruction import Request
 
 ROOT = Path(__file__).resolve().parents[1]
+STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
 
 
 def aligned_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """(C,) distances after the best similarity (Umeyama 1991) from (C, 3) found to true centres, over the mean distance of the true ones
-    to their centroid."""
-    a, b = found - found.mean(0), true - true.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = (s * sign).sum() / (a**2).sum()
-    return np.asarray(np.linalg.norm(b - scale * a @ (u * sign @ vt).T, axis=1) / np.linalg.norm(b, axis=1).mean())
+    """(C,) distances after the best similarity from (C, 3) found to true centres, over the mean distance of the true ones to their centroid."""
+    away = closest_similarity(found, true).points(found) - true
+    return np.asarray(np.linalg.norm(away, axis=1) / np.linalg.norm(true - true.mean(0), axis=1).mean())
+
+
+def percent_off(found: Mapping[str, np.ndarray], true: Mapping[str, np.ndarray]) -> float | None:
+    """Root mean square of the errors of centres, by names, in per cent; None where fewer than four have the same name."""
+    names = sorted(found.keys() & true.keys())
+    if len(names) < 4:
+        return None
+    errors = aligned_errors(*(np.array([which[name] for name in names]) for which in (found, true)))
+    return round(100 * float(np.sqrt((errors**2).mean())), 3)
 
 
 def true_centres(path: Path) -> dict[str, np.ndarray]:
@@ -48,8 +55,8 @@ def processor_seconds() -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--photographs", type=Path, default=ROOT / "examples" / "still_life")
-    parser.add_argument("--truth", type=Path, default=ROOT / "tests" / "data" / "still_life_cameras.json")
+    parser.add_argument("--photographs", type=Path, default=STILL_LIFE)
+    parser.add_argument("--truth", type=Path, default=TRUTH)
     parser.add_argument("--no-truth", action="store_true", help="of photographs whose true cameras are not known")
     parser.add_argument("--out", type=Path, default=None)
     arguments = parser.parse_args()

@@ -16,6 +16,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import Any
 
 from benchmarks.machine import busy_seconds, processor
 from benchmarks.minutes import OURS, RESULTS, code_version, read_rows, same_row, show, with_row, write_rows
-from benchmarks.stage_runs import cost_of, read_json
+from pipeline.files import read_json
 from stages.artifacts import BakeOutputs, EvaluateOutputs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,14 +63,25 @@ def cameras_of(name: str, source: Path, read: Sequence[str], runs: Path) -> Path
     return run
 
 
+def cost_of(command: Sequence[str]) -> tuple[float, float]:
+    """Run a command: its seconds by the clock, and the processor seconds of all its threads and children."""
+    start = time.perf_counter()
+    child = subprocess.Popen(command)
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode != 0:
+        raise SystemExit(f"{shlex.join(command)}: exit code {child.returncode}")
+    return time.perf_counter() - start, used.ru_utime + used.ru_stime
+
+
 def row_of(name: str, poses: Path, run: Path, minutes: float, options: Sequence[str]) -> dict[str, Any]:
     """Copy the run of the cameras, train for so long, bake, evaluate, and read the figures."""
     shutil.rmtree(run, ignore_errors=True)
     shutil.copytree(poses, run, ignore=shutil.ignore_patterns(".lock"))
     load, busy = os.getloadavg(), busy_seconds()
-    cost = cost_of([*ENERF, "run", "--out", str(run), "--budget", f"{60 * minutes:g}s", "--until", "bake", "--quiet", *options])
+    seconds, cpu_seconds = cost_of([*ENERF, "run", "--out", str(run), "--budget", f"{60 * minutes:g}s", "--until", "bake", "--quiet", *options])
     now = busy_seconds()
-    others = None if busy is None or now is None else round((now - busy - cost["cpu_seconds"]) / cost["seconds"], 2)
+    others = None if busy is None or now is None else round((now - busy - cpu_seconds) / seconds, 2)
     settings = [word for each in EVALUATION for word in ("--set", each)]
     subprocess.run([*ENERF, "run", "--out", str(run), "--until", "evaluate", "--quiet", *settings], check=True)
     status = json.loads(subprocess.run([*ENERF, "status", str(run), "--json"], stdout=subprocess.PIPE, check=True).stdout)
@@ -81,7 +93,7 @@ def row_of(name: str, poses: Path, run: Path, minutes: float, options: Sequence[
         "megabytes": BakeOutputs.of_run(run).asset.stat().st_size / 1e6,
         "peak_mib": max(stage["peak_memory"] for key, stage in stages.items() if key != "evaluate") / 2**20,
         "seconds": stages["train"]["seconds"] + stages["bake"]["seconds"], "stage_seconds": {key: stage["seconds"] for key, stage in stages.items()},
-        "cpu_seconds": cost["cpu_seconds"], "load": load, "others": others, "processor": processor(),
+        "cpu_seconds": cpu_seconds, "load": load, "others": others, "processor": processor(),
         "versions": {library: version(library) for library in LIBRARIES},
     }  # fmt: skip
 

@@ -19,13 +19,12 @@ import numpy as np
 
 from benchmarks.machine import hardware
 from benchmarks.minutes import RESULTS, code_version
-from benchmarks.stage_runs import read_json
 from efficientnerf.asset.format import load
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.rendering import render
-from pipeline.files import write_atomically, write_json
+from pipeline.files import read_json, write_atomically, write_json
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.evaluate.views import evaluation_views, ground_truth
 from stages.formats.exporters.glb import gltf_from_capture

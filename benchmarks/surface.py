@@ -25,13 +25,12 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from efficientnerf.geometry.cameras import Camera, Similarity, pose_from_opengl, project
+from benchmarks.poses import TRUTH
+from efficientnerf.geometry.cameras import Camera, Similarity, closest_similarity, pose_from_opengl, project
 from efficientnerf.surface.mesh import face_vectors, sample
 from efficientnerf.surface.rasteriser import mesh_image
 from tests.still_life import true_mesh
 
-ROOT = Path(__file__).resolve().parents[1]
-CAMERAS = ROOT / "tests" / "data" / "still_life_cameras.json"
 SAMPLES = 200_000  # of each surface
 DISTANCES = (0.005, 0.01, 0.02)
 VIEWS = 2  # that have to see a sample
@@ -150,15 +149,6 @@ def image_scores(found: Surface, truth: Surface, cameras: Sequence[Camera], regi
     return {"iou": both / max(either, 1), "missed": (true - both) / max(true, 1), "added": (own - both) / max(own, 1), "depth": depth}
 
 
-def aligned(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity that takes points (N, 3) nearest to others, Umeyama 1991."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation, scale = (u * sign) @ vt, float((s * sign).sum() / (a**2).sum())
-    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
-
-
 def true_cameras(path: Path) -> dict[str, Camera]:
     """The cameras of a transforms.json, by the names of their images."""
     data = json.loads(path.read_text())
@@ -178,12 +168,11 @@ def truth_from_capture(run: Path, cameras: dict[str, Camera]) -> tuple[Similarit
     from stages.io.scene import load, views_of
 
     scene = load(PosesOutputs.of_run(run).folder)
-    known = [view for view in scene.views if Path(view.source_camera.name).name in cameras]
-    similarity = aligned(
-        np.array([view.source_camera.centre for view in known]), np.array([cameras[Path(view.source_camera.name).name].centre for view in known])
-    )
-    trained = [cameras[Path(view.source_camera.name).name] for view in views_of(scene, "train") if Path(view.source_camera.name).name in cameras]
-    return similarity, trained
+    stated = {Path(view.source_camera.name).name: view.source_camera.centre for view in scene.views}
+    known = [name for name in stated if name in cameras]
+    similarity = closest_similarity(*(np.array(centres) for centres in ([stated[name] for name in known], [cameras[name].centre for name in known])))
+    trained = [Path(view.source_camera.name).name for view in views_of(scene, "train")]
+    return similarity, [cameras[name] for name in trained if name in cameras]
 
 
 def region_of(run: Path, truth_from_capture: Similarity) -> Any:
@@ -212,7 +201,7 @@ def main() -> None:
     parser.add_argument("--mesh", type=Path, help="default: RUN/mesh/mesh.ply")
     parser.add_argument("--scene", help="kind of a made scene")
     parser.add_argument("--truth", type=Path, help="default: that of the still life")
-    parser.add_argument("--cameras", type=Path, default=CAMERAS)
+    parser.add_argument("--cameras", type=Path, default=TRUTH)
     parser.add_argument("--no-truth", action="store_true", help="of scenes whose surface is not known")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
@@ -245,7 +234,7 @@ def footprint(cameras: Sequence[Camera], middle: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(camera.centre - middle) / camera.intrinsics["fx"] for camera in cameras]))
 
 
-def measured(run: Path, mesh: Path, kind: str | None = None, truth: Path | None = None, cameras: Path = CAMERAS) -> dict[str, Any]:
+def measured(run: Path, mesh: Path, kind: str | None, truth: Path | None, cameras: Path) -> dict[str, Any]:
     """All figures of a run's mesh."""
     if kind is not None:
         from benchmarks.scenes.catalogue import recipes

@@ -1,12 +1,12 @@
 """Rows of peers for the table of quality over minutes: trained on a CPU for as long as we train, measured on the same test views with the same metric.
 
     python -m benchmarks.peers nerfacto --python ENVIRONMENT/bin/python --work FOLDER [--sets chair_800,object,gloss] [--minutes 1,5,10]
-                                        [--variants default,small] [--stride 8] [--threads 2] [--out benchmarks/results]
+                                        [--stride 8] [--threads 2] [--out benchmarks/results]
 
 A peer runs in an environment of its own (nerfacto: `pip install nerfstudio==1.1.5`) and reads a data set as Blender's, which made scenes are written as.
 What is behind its renders is white, as behind the test images; PSNR is of float images clipped to 0-1, then the mean over views: as ours. A peer takes
 minutes for what our renderer does in seconds, so only every stride-th row and column of each test view is rendered; SSIM needs whole images (--stride 1).
-Variants are the settings tried, so that a peer is tuned too: docs/experiments/peers.md. Writes peers.json; a row that is there is not measured again
+A peer has the settings that were the best of those tried: docs/experiments/peers.md. Writes peers.json; a row that is there is not measured again
 (--again). Then `python -m benchmarks.quality_over_minutes --minutes= ...` shows all rows together.
 """
 
@@ -26,20 +26,6 @@ from benchmarks.minutes import RESULTS, read_rows, same_row, with_row, write_row
 from benchmarks.quality_over_minutes import DATA, PEERS, source_of
 
 SCRIPTS = {"nerfacto": Path(__file__).with_name("nerfacto.py")}
-# docs/experiments/peers.md
-VARIANTS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "batch 1024": {"datamanager.train_num_rays_per_batch": 1024},
-    "small": {
-        "datamanager.train_num_rays_per_batch": 1024, "model.num_proposal_samples_per_ray": [96, 48], "model.num_nerf_samples_per_ray": 24,
-        "model.proposal_weights_anneal_max_num_iters": 200,
-    },
-    "smaller": {
-        "datamanager.train_num_rays_per_batch": 1024, "model.num_proposal_iterations": 1, "model.num_proposal_samples_per_ray": [96],
-        "model.proposal_net_args_list": [{"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": 128, "use_linear": False}],
-        "model.num_nerf_samples_per_ray": 24, "model.log2_hashmap_size": 17, "model.proposal_weights_anneal_max_num_iters": 200,
-    },
-}  # fmt: skip
 
 
 def as_blender(source: Path, folder: Path) -> Path:
@@ -102,8 +88,6 @@ def row_of(named: Mapping[str, Any], data: Path, out: Path, given: argparse.Name
     load = os.getloadavg()
     command = [str(given.python), str(SCRIPTS[given.peer]), str(data), str(out), "--minutes", f"{named['minutes']:g}", "--stride", str(given.stride)]
     command += ["--threads", str(given.threads)]
-    for name, value in VARIANTS[named["options"] or "default"].items():
-        command += ["--set", f"{name}={json.dumps(value)}"]
     threads = {name: str(given.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
     environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
     with open(out / "log.txt", "w", encoding="utf-8") as log:
@@ -126,7 +110,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--work", type=Path, required=True, help="folder for data sets, renders and logs")
     parser.add_argument("--sets", default="chair_800")
     parser.add_argument("--minutes", default="1,5,10")
-    parser.add_argument("--variants", default="default", help=f"with commas between: {', '.join(VARIANTS)}")
     parser.add_argument("--stride", type=int, default=8)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--data", type=Path, default=DATA)
@@ -139,13 +122,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         source, _ = source_of(name, given.data, given.scenes or given.work / "scenes")
         data = as_blender(source, given.work / "data" / name)
         for minutes in sorted(float(word) for word in given.minutes.split(",")):
-            for variant in given.variants.split(","):
-                named = {"method": given.peer, "set": name, "minutes": minutes, "options": "" if variant == "default" else variant}
-                if not given.again and any(same_row(row, named) for row in read_rows(path)):
-                    continue
-                row = row_of(named, data.resolve(), (given.work / given.peer / f"{name}-{minutes:g}m-{variant.replace(' ', '-')}").resolve(), given)
-                write_rows(path, with_row(read_rows(path), row))
-                print(f"{given.peer} ({variant}), {name}, {minutes:g} min: {row['psnr']:.2f} dB, {row['rays_per_second']:,.0f} rays/s", flush=True)
+            named = {"method": given.peer, "set": name, "minutes": minutes, "options": "smaller"}
+            if not given.again and any(same_row(row, named) for row in read_rows(path)):
+                continue
+            row = row_of(named, data.resolve(), (given.work / given.peer / f"{name}-{minutes:g}m").resolve(), given)
+            write_rows(path, with_row(read_rows(path), row))
+            print(f"{given.peer}, {name}, {minutes:g} min: {row['psnr']:.2f} dB, {row['rays_per_second']:,.0f} rays/s", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Train nerfstudio's nerfacto on a CPU for some minutes, and render the pixels of the test views that are asked for.
 
 Runs in nerfstudio's own environment, and imports nothing of this project: `benchmarks/peers/__main__.py` starts it. The settings are those that
-nerfstudio's documentation gives for scenes made in Blender; the learning rate reaches its end when the time is up, and `--set` changes any field of
-nerfacto's configuration. Nothing is evaluated on the way, no viewer runs and no checkpoint is written. Setting up and reading images are not counted.
+nerfstudio's documentation gives for scenes made in Blender, and SMALLER; the learning rate reaches its end when the time is up. Nothing is evaluated on
+the way, no viewer runs and no checkpoint is written. Setting up and reading images are not counted.
 """
 
 import argparse
@@ -17,11 +17,17 @@ from typing import Any
 import numpy as np
 import torch
 
+# Fewer rays and samples, one small proposal network: the best of four variants (docs/experiments/peers.md).
+SMALLER: dict[str, Any] = {
+    "datamanager.train_num_rays_per_batch": 1024, "model.num_proposal_iterations": 1, "model.num_proposal_samples_per_ray": (96,),
+    "model.proposal_net_args_list": ({"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": 128, "use_linear": False},),
+    "model.num_nerf_samples_per_ray": 24, "model.log2_hashmap_size": 17, "model.proposal_weights_anneal_max_num_iters": 200,
+}  # fmt: skip
 # https://docs.nerf.studio/nerfology/methods/nerfacto.html, for Blender's scenes
 SETTINGS: dict[str, Any] = {
     "model.implementation": "torch", "model.background_color": "white", "model.proposal_initial_sampler": "uniform", "model.near_plane": 2.0,
     "model.far_plane": 6.0, "model.camera_optimizer.mode": "off", "model.use_average_appearance_embedding": False, "model.use_appearance_embedding": False,
-    "model.distortion_loss_mult": 0.0, "model.disable_scene_contraction": True, "model.eval_num_rays_per_chunk": 4096,
+    "model.distortion_loss_mult": 0.0, "model.disable_scene_contraction": True, "model.eval_num_rays_per_chunk": 4096, **SMALLER,
 }  # fmt: skip
 OPERATORS = torch.library.Library("torchvision", "FRAGMENT")
 LIBRARIES = ("nerfstudio", "torch", "numpy")
@@ -36,8 +42,8 @@ def declare_operators() -> None:
             OPERATORS.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 
-def configured(data: Path, out: Path, settings: dict[str, Any]) -> Any:
-    """nerfacto's own configuration with these settings: names are those of its fields, with dots, from the pipeline's on."""
+def configured(data: Path, out: Path) -> Any:
+    """nerfacto's own configuration with SETTINGS: names are those of its fields, with dots, from the pipeline's on."""
     from nerfstudio.configs.method_configs import method_configs
     from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
@@ -49,14 +55,12 @@ def configured(data: Path, out: Path, settings: dict[str, Any]) -> Any:
     config.machine.device_type = "cpu"
     rays = config.pipeline.datamanager.train_num_rays_per_batch
     config.pipeline.datamanager = VanillaDataManagerConfig(dataparser=BlenderDataParserConfig(data=data, alpha_color="white"), train_num_rays_per_batch=rays)
-    for name, value in settings.items():
+    for name, value in SETTINGS.items():
         *parents, last = name.split(".")
         holder = config.pipeline
         for parent in parents:
             holder = getattr(holder, parent)
-        if not hasattr(holder, last):
-            raise SystemExit(f"--set {name}: nerfacto has no such setting")
-        setattr(holder, last, tuple(value) if isinstance(value, list) else value)
+        setattr(holder, last, value)
     return config
 
 
@@ -105,13 +109,11 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--stride", type=int, default=8)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="NAME=VALUE", help="a field of the pipeline's settings, its value as JSON")
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    settings = SETTINGS | {name: json.loads(value) for name, _, value in (text.partition("=") for text in given.sets)}
     given.out.mkdir(parents=True, exist_ok=True)
     declare_operators()
-    config = configured(given.data, given.out, settings)
+    config = configured(given.data, given.out)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup(test_mode="test")
     print("training", flush=True)
@@ -122,7 +124,7 @@ def main() -> None:
     rays = steps * trainer.pipeline.datamanager.get_train_rays_per_batch()
     report = {
         "steps": steps, "seconds": seconds, "rays_per_second": rays / seconds, "peak_mib": peak, "rendering_seconds": time.monotonic() - start,
-        "model_bytes": sum(tensor.numel() * tensor.element_size() for tensor in model.parameters()), "threads": given.threads, "settings": settings,
+        "model_bytes": sum(tensor.numel() * tensor.element_size() for tensor in model.parameters()), "threads": given.threads, "settings": SETTINGS,
         "versions": {name: version(name) for name in LIBRARIES},
     }  # fmt: skip
     (given.out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

@@ -1,11 +1,11 @@
 """OpenSplat on the cameras and photographs of a run, and our own Gaussians in the same minutes: PSNR of the same held-out views by the same renderer.
 
-    python -m benchmarks.peers.opensplat --binary opensplat --work FOLDER --minutes 5,10 [--variants default,short] [--out FILE] RUN=SOURCE [RUN=SOURCE ...]
+    python -m benchmarks.peers.opensplat --binary opensplat --work FOLDER --minutes 5,10 [--out FILE] RUN=SOURCE [RUN=SOURCE ...]
 
 RUN is a run whose poses are made, SOURCE the photographs that it was made from. OpenSplat is built outside of this repository (docs/experiments/peers.md). It
 reads the training photographs at working size, their cameras and the sparse points, all in the training frame, and is ended when its minutes have passed; the
 last Gaussians that it wrote count. Ours is `enerf run --budget`, which covers field, asset and Gaussians. Both begin once cameras are known, one after the
-other. Variants: `default`, OpenSplat's own options for 30,000 steps; `short`, its schedules made as short as the steps that fit, by a trial of half a minute.
+other. OpenSplat has its own options for 30,000 steps: with schedules made as short as the steps that fit it was worse (docs/experiments/peers.md).
 """
 
 import argparse
@@ -16,7 +16,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.minutes import OURS, RESULTS, code_version, read_rows, with_row, write_rows
-from benchmarks.stage_runs import read_json
 from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.rendering import render
 from efficientnerf.surface.mesh import PointCloud
-from pipeline.files import write_json
+from pipeline.files import read_json, write_json
 from stages.artifacts import EvaluateOutputs
 from stages.formats.exporters.cameras import transforms_from_scene
 from stages.formats.exporters.ply import write_points
@@ -37,24 +35,8 @@ from stages.formats.exporters.splats.ply import read_splats
 from stages.io import scene
 from stages.io.png import write_png
 
-TRIAL = 30.0  # seconds, of a trial that tells how fast steps are
-SAVES = 20  # of a training: what it has learned since the last is lost when it is ended
+SAVE_EVERY = 30  # steps: what it has learned since the last save is lost when it is ended
 BEHIND = (0.6130, 0.0101, 0.3984)  # OpenSplat's colour behind all Gaussians
-
-
-def _unchanged(steps: int) -> list[str]:
-    return ["-n", "30000"]
-
-
-def _short(steps: int) -> list[str]:
-    """Half resolution for a third of the steps, densified thirty times from a tenth of them on, a degree of harmonics each fifth, opacities never reset."""
-    return [
-        "-n", str(steps), "--num-downscales", "1", "--resolution-schedule", str(steps // 3), "--warmup-length", str(steps // 10),
-        "--refine-every", str(max(1, steps // 30)), "--sh-degree-interval", str(max(1, steps // 5)), "--reset-alpha-every", "100",
-    ]  # fmt: skip
-
-
-VARIANTS: dict[str, Callable[[int], list[str]]] = {"default": _unchanged, "short": _short}
 
 
 def write_project(poses: Path, folder: Path) -> None:
@@ -71,11 +53,11 @@ def write_project(poses: Path, folder: Path) -> None:
     write_points(PointCloud(points.xyz, np.tile([0.0, 0.0, 1.0], (len(points.xyz), 1)), points.rgb.astype(np.float32) / 255), folder / "points.ply")
 
 
-def trained(binary: Path, project: Path, out: Path, seconds: float, options: list[str], save_every: int) -> int:
+def trained(binary: Path, project: Path, out: Path, seconds: float) -> int:
     """Let OpenSplat train for so long; the last step that it reached. Its Gaussians are out/splat*.ply."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    command = [str(binary), str(project), "-o", str(out / "splat.ply"), "--keep-crs", "--cpu", "-s", str(save_every), *options]
+    command = [str(binary), str(project), "-o", str(out / "splat.ply"), "--keep-crs", "--cpu", "-s", str(SAVE_EVERY), "-n", "30000"]
     with open(out / "log.txt", "w", encoding="utf-8") as log:
         child = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
         try:
@@ -135,7 +117,6 @@ def main() -> None:
     parser.add_argument("--binary", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--minutes", default="5")
-    parser.add_argument("--variants", default="default,short")
     parser.add_argument("--out", type=Path, default=RESULTS / "opensplat.json")
     given = parser.parse_args()
     rows = read_rows(given.out)
@@ -144,13 +125,10 @@ def main() -> None:
         project, folder = given.work / run.name / "project", given.work / run.name
         write_project(run / "poses", project)
         for minutes in (float(word) for word in given.minutes.split(",")):
-            speed = trained(given.binary, project, folder / "trial", TRIAL, ["-n", "30000", "--num-downscales", "0"], 10**6) / TRIAL
-            steps = max(30, int(1.3 * speed * 60 * minutes))  # a third of them at half resolution
-            for variant in given.variants.split(","):
-                out, began, load = folder / f"{variant}-{minutes:g}", time.perf_counter(), os.getloadavg()[0]
-                reached = trained(given.binary, project, out, 60 * minutes, VARIANTS[variant](steps), max(10, steps // SAVES))
-                row = {"method": "OpenSplat", "set": run.name, "minutes": minutes, "options": variant, "steps": reached, "load": load}
-                rows = with_row(rows, row | {"seconds": time.perf_counter() - began} | quality(run / "poses", gaussians_of(out)))
+            out, began, load = folder / f"opensplat-{minutes:g}", time.perf_counter(), os.getloadavg()[0]
+            reached = trained(given.binary, project, out, 60 * minutes)
+            row = {"method": "OpenSplat", "set": run.name, "minutes": minutes, "options": "default", "steps": reached, "load": load}
+            rows = with_row(rows, row | {"seconds": time.perf_counter() - began} | quality(run / "poses", gaussians_of(out)))
             load = os.getloadavg()[0]
             row = {"method": OURS, "set": run.name, "minutes": minutes, "options": "", "load": load, "code": code_version()}
             rows = with_row(rows, row | ours(run, source, folder / f"ours-{minutes:g}", minutes))

@@ -17,6 +17,7 @@ from benchmarks.scenes.rendering import SUN
 from benchmarks.scenes.shapes import Box, Capsule, Ground, Material, Shape, Sphere
 from benchmarks.scenes.thin import garden, thicket
 from efficientnerf.geometry.cameras import Camera
+from tests.poses import looking_at
 
 GOLDEN = np.pi * (3 - np.sqrt(5))
 PHASE = {"train": 0.0, "val": 0.37, "test": 0.71}  # splits take other places on the same path
@@ -40,12 +41,7 @@ class Recipe:
 
 def look_at(name: str, centre: np.ndarray, target: np.ndarray, size: int, focal: float) -> Camera:
     """A pinhole camera; z of the world is up in its image."""
-    forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(forward, right), forward, centre
-    return Camera(name, size, 3 * size // 4, "SIMPLE_PINHOLE", (focal * size, size / 2, 3 * size / 8), pose)
+    return Camera(name, size, 3 * size // 4, "SIMPLE_PINHOLE", (focal * size, size / 2, 3 * size / 8), looking_at(centre, target))
 
 
 def cameras(recipe: Recipe, split: str, count: int, size: int) -> list[Camera]:

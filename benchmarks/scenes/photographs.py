@@ -16,6 +16,7 @@ import numba
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose, rays
+from tests.poses import looking_at
 
 TEXTURES, SIDE = 64, 1024  # textures, texels
 ROOM = 6.0  # m from the middle to the walls
@@ -149,11 +150,7 @@ def walk(count: int, width: int, rng: np.random.Generator) -> list[Camera]:
         radius, height = (3.0, 2.6, 2.2)[ring] + rng.normal(0, 0.08), (0.6, 1.2, 1.9)[ring] + rng.normal(0, 0.05)
         centre = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
         target = np.array([*rng.normal(0, 0.15, 2), 0.3 + rng.normal(0, 0.05)])
-        forward = (target - centre) / np.linalg.norm(target - centre)
-        right = np.cross(forward, [rng.normal(0, 0.02), rng.normal(0, 0.02), 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(forward, right), forward, centre
+        pose = looking_at(centre, target, [rng.normal(0, 0.02), rng.normal(0, 0.02), 1.0])
         lens = (FOCAL * width, width / 2, 3 * width / 8, RADIAL)
         cameras.append(Camera(f"photo_{n:04d}.jpg", width, 3 * width // 4, "SIMPLE_RADIAL", lens, pose))
     return cameras

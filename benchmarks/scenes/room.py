@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image
 
 from efficientnerf.geometry.cameras import Camera, rays
+from tests.poses import looking_at
 
 HALF = np.array([2.4, 1.8, 1.3])  # of the room, from its middle
 PILLARS = ((0.1, -0.1, 0.16), (-1.8, 1.1, 0.25), (1.8, -1.2, 0.2))  # x, y, half side
@@ -56,11 +57,8 @@ def cameras(count: int, width: int, height: int, model: str, params: tuple[float
         angle = 2 * np.pi * n / count
         centre = np.array([0.9 * np.cos(angle), 0.7 * np.sin(angle), 0.35 * np.sin(2.3 * n)])
         forward = np.array([-np.cos(angle + 0.4 * np.sin(n)), -np.sin(angle + 0.4 * np.sin(n)), 0.25 * np.cos(1.7 * n)])
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], -1)
+        pose = looking_at((0, 0, 0), forward)
+        pose[:3, 3] = centre
         made.append(Camera(f"room_{n:02d}.jpg", width, height, model, params, pose))
     return made
 
