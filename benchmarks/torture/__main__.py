@@ -10,13 +10,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from benchmarks.torture import processes, report, sources
+from benchmarks.torture import report, sources
 from benchmarks.torture.kills import Prepared, Rounds
-from benchmarks.torture.preparation import in_prepared_process, prepare, python_alone, wait_for
+from benchmarks.torture.preparation import in_prepared_process, prepare, records
 
 RESULT = Path(__file__).resolve().parents[1] / "results" / "torture.json"
 
@@ -39,7 +39,7 @@ def main() -> int:
         stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in each.seconds.items())
         print(f"{each.source.kind}: {len(each.operations)} file operations; {stages}", flush=True)
     lines = rounds(folder, prepared, given.kills, given.jobs, given.seed)
-    result = summary(lines, prepared) | report.circumstances(begun, python_alone=python_alone(), jobs=given.jobs, seed=given.seed)
+    result = summary(lines, prepared) | report.circumstances(begun, given.jobs, given.seed)
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     bad = result["runs_that_differ"] + result["wrong_ends"]
@@ -52,22 +52,17 @@ def main() -> int:
 
 def rounds(folder: Path, prepared: list[Prepared], kills: int, jobs: int, seed: int) -> list[dict[str, Any]]:
     """The records of all workers' rounds."""
-    books = [folder / f"book_{job}.jsonl" for job in range(jobs)]
 
-    def work(job: int) -> None:
+    def work(job: int, book: TextIO) -> None:
         # Workers begin with different sources.
         order = prepared[job % len(prepared) :] + prepared[: job % len(prepared)]
-        with books[job].open("w", encoding="utf-8") as book:
-            Rounds(folder / f"worker_{job}", order, seed * 1000 + job, book, python_alone=python_alone()).until(-(-kills // jobs))
+        Rounds(folder / f"worker_{job}", order, seed * 1000 + job, book).until(-(-kills // jobs))
 
-    if wait_for([processes.forked(lambda job=job: work(job)) for job in range(jobs)]):  # type: ignore[misc]
-        raise SystemExit("a worker failed")
-    return [json.loads(line) for book in books for line in book.read_text(encoding="utf-8").splitlines()]
+    return records(folder, jobs, work)
 
 
-def summary(lines: Iterable[dict[str, Any]], prepared: list[Prepared]) -> dict[str, Any]:
+def summary(lines: Sequence[dict[str, Any]], prepared: list[Prepared]) -> dict[str, Any]:
     """Counts of what was done, and all that was wrong."""
-    lines = list(lines)
     hits = [line for line in lines if line["event"] == "hit"]
     ended = [line for line in lines if line["event"] == "round"]
     kills = [hit for hit in hits if hit["signal"] == "KILL" or (hit["signal"] == "STOP" and hit["code"] == -9)]

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import json
 import os
 import shutil
 import signal
@@ -12,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from benchmarks.torture import processes
+from benchmarks.torture import processes, report
 from benchmarks.torture.comparison import differences, digests
 from benchmarks.torture.kills import Prepared
 from benchmarks.torture.processes import Child
@@ -49,12 +48,9 @@ def base(prepared: Prepared, scenario: str, run: Path) -> None:
 class Cases:
     """The cases of one worker. Records are written to `book`, an object on each line."""
 
-    def __init__(self, folder: Path, prepared: Sequence[Prepared], book: TextIO, *, python_alone: bool, workflow: Any = None) -> None:
-        """
-        python_alone  traps are those of `audit`
-        workflow      of the command line, that of `workflows.asset` by default
-        """
-        self.folder, self.book, self.python_alone, self.workflow = folder, book, python_alone, workflow
+    def __init__(self, folder: Path, prepared: Sequence[Prepared], book: TextIO, workflow: Any = None) -> None:
+        """workflow: of the command line, that of `workflows.asset` by default"""
+        self.folder, self.book, self.workflow = folder, book, workflow
         self.prepared = {each.source.kind: each for each in prepared}
         self.done = 0
         folder.mkdir(parents=True)
@@ -89,7 +85,7 @@ class Cases:
         about = {"error": errno.errorcode[case.errno], "reached": armed.fired, "failed": armed.failed, "code": child.code, "names": names}
         place = " ".join(armed.place[1:]).replace(str(run), "RUN")
         about |= {"place": place, "said": said.replace(str(run), "RUN")[:500]} if wrong else {}
-        self._write({"event": "case", **asdict(case), **about, "wrong": wrong})
+        report.record(self.book, {"event": "case", **asdict(case), **about, "wrong": wrong})
         return wrong
 
     def _after(self, prepared: Prepared, run: Path) -> list[str]:
@@ -123,7 +119,7 @@ class Cases:
                 ("status", ["status", str(run)], 0),
                 ("verify", ["verify", str(run)], 0),
             ):
-                child = processes.start(arguments, self.folder / f"errors_{how}_{name}.txt", armed, watched_by_python=self.python_alone, user=user)
+                child = processes.start(arguments, self.folder / f"errors_{how}_{name}.txt", armed, user=user)
                 codes[name] = child.end()
                 if child.code != good or "Traceback" in child.errors:
                     wrong.append(f"{name} ended with {child.code}: {child.errors.strip()[:300]}")
@@ -133,14 +129,10 @@ class Cases:
             shutil.rmtree(run)
             if wrong:
                 print(f"WRONG: read-only run folder ({how}): {'; '.join(wrong)}", flush=True)
-            self._write({"event": "read-only", "how": how, "codes": codes, "wrong": wrong})
+            report.record(self.book, {"event": "read-only", "how": how, "codes": codes, "wrong": wrong})
 
     def _start(self, arguments: Sequence[str], armed: Armed | None) -> Child:
-        return processes.start(arguments, self.folder / "errors.txt", armed, watched_by_python=self.python_alone, workflow=self.workflow)
-
-    def _write(self, record: dict[str, Any]) -> None:
-        self.book.write(json.dumps(record) + "\n")
-        self.book.flush()
+        return processes.start(arguments, self.folder / "errors.txt", armed, workflow=self.workflow)
 
 
 def _aside(run: Path, stage: str, case: Case) -> bool:

@@ -29,23 +29,20 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import astuple, fields
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from benchmarks.torture import processes, report
 from benchmarks.torture.cases import NEW, Case, Cases, base
 from benchmarks.torture.comparison import STAGES
 from benchmarks.torture.kills import Prepared
-from benchmarks.torture.preparation import in_prepared_process, prepare, python_alone, wait_for
+from benchmarks.torture.preparation import in_prepared_process, prepare, records, wait_for
 from benchmarks.torture.trap import Armed, Operation, Trap, operations
 
 RESULT = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EACCES, errno.EMFILE)
 OF_READING = (errno.EIO, errno.EACCES, errno.EMFILE)
-CASE = tuple(field.name for field in fields(Case))
-OPERATION = CASE[: CASE.index("errno")]
 DEADLY = (1, 2, 3, 5)  # the failing operation at which a run on a full disk is killed
 
 
@@ -56,9 +53,6 @@ def main() -> int:
     parser.add_argument("--stages", default=",".join((NEW, *STAGES)), help="of the Blender set; of the others it is poses")
     parser.add_argument("--share", type=int, default=1, help="one case in so many, for a look")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop then, and say how many cases are left; they come in a random order")
-    parser.add_argument(
-        "--done", type=Path, nargs="*", default=[], help="book_N.jsonl of an earlier call that was stopped: its cases count, and are not repeated"
-    )
     parser.add_argument("--json", type=Path, default=RESULT, help="where the result goes")
     parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless a case is wrong")
     given = parser.parse_args()
@@ -72,17 +66,9 @@ def main() -> int:
     cases, seen = planned(prepared, given.stages.split(","), logs)
     random.Random(0).shuffle(cases)
     cases = cases[: -(-len(cases) // given.share)]
-    former = [json.loads(line) for path in given.done for line in path.read_text(encoding="utf-8").splitlines()]
-    done = {tuple(line[name] for name in CASE) for line in former if line["event"] == "case"}
-    met = {which[: len(OPERATION)] for which in done}
-    cases = sorted((case for case in cases if astuple(case) not in done), key=lambda case: astuple(case)[: len(OPERATION)] in met)  # new operations first
     print(f"{len(cases)} cases", flush=True)
     lines = _all(cases, prepared, folder, given.jobs, given.minutes)
-    result = (
-        summary([*former, *lines], seen, len(done) + len(cases))
-        | {"of_earlier_calls": len(done)}
-        | report.circumstances(begun, python_alone=python_alone(), jobs=given.jobs, seed=0)
-    )
+    result = summary(lines, seen, len(cases)) | report.circumstances(begun, given.jobs, seed=0)
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     found = f"{result['cases']} cases at {result['operations_covered']} operations, {result['elapsed_seconds']:.0f} s: {len(result['wrong'])} wrong"
@@ -103,7 +89,7 @@ def _log_all(prepared: Sequence[Prepared], stages: Sequence[str], logs: Path) ->
         run = logs / "run"
         base(each, stage, run)
         armed = Armed(Trap(), run, each.source.folder, logs / "state", logs / f"{each.source.kind}_{stage}")
-        child = processes.start(each.source.arguments(run), logs / "errors.txt", armed, watched_by_python=python_alone())
+        child = processes.start(each.source.arguments(run), logs / "errors.txt", armed)
         if child.end() != 0:
             raise SystemExit(f"an undisturbed run ended with {child.code}: {child.errors}")
         shutil.rmtree(run)
@@ -153,24 +139,19 @@ def _of_kind(source: str, stage: str, kind: str, places: Sequence[Sequence[Opera
 def _all(cases: Sequence[Case], prepared: Sequence[Prepared], folder: Path, jobs: int, minutes: float) -> list[dict[str, Any]]:
     """Carry out all cases; the records."""
     until = time.monotonic() + 60 * minutes
-    books = [folder / f"book_{job}.jsonl" for job in range(jobs)]
 
-    def work(job: int) -> None:
-        with books[job].open("w", encoding="utf-8") as book:
-            worker = Cases(folder / f"worker_{job}", prepared, book, python_alone=python_alone())
-            if job == 0:
-                worker.read_only(prepared[0])
-            for case in itertools.takewhile(lambda _: time.monotonic() < until, cases[job::jobs]):
-                worker.carry_out(case)
+    def work(job: int, book: TextIO) -> None:
+        worker = Cases(folder / f"worker_{job}", prepared, book)
+        if job == 0:
+            worker.read_only(prepared[0])
+        for case in itertools.takewhile(lambda _: time.monotonic() < until, cases[job::jobs]):
+            worker.carry_out(case)
 
-    if wait_for([processes.forked(lambda job=job: work(job)) for job in range(jobs)]):  # type: ignore[misc]
-        raise SystemExit("a worker failed")
-    return [json.loads(line) for book in books for line in book.read_text(encoding="utf-8").splitlines()]
+    return records(folder, jobs, work)
 
 
-def summary(lines: Iterable[dict[str, Any]], seen: dict[str, dict[str, int]], planned: int) -> dict[str, Any]:
+def summary(lines: Sequence[dict[str, Any]], seen: dict[str, dict[str, int]], planned: int) -> dict[str, Any]:
     """Counts of what was done, and all that was wrong."""
-    lines = list({tuple(line.get(name) for name in ("event", "how", *CASE)): line for line in lines}.values())
     read_only = [line for line in lines if line["event"] == "read-only"]
     cases = [line for line in lines if line["event"] == "case"]
     reached = [case for case in cases if case["reached"]]

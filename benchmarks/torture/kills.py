@@ -10,7 +10,6 @@ time followed by the same command, until it is done; then its artifacts are comp
 Only SIGKILL counts as a kill; every fourth hit is another signal, of a stage that was killed before.
 """
 
-import json
 import random
 import shutil
 import signal
@@ -21,7 +20,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-from benchmarks.torture import processes
+from benchmarks.torture import processes, report
 from benchmarks.torture.comparison import Expected, differences
 from benchmarks.torture.processes import Child
 from benchmarks.torture.sources import Source
@@ -69,7 +68,6 @@ class Hit:
     stage: str = ""
     place: str = ""
     after: float = 0.0
-    progress: str = ""
     code: int = 0
     resumed: bool = False
     fresh: bool = False
@@ -79,12 +77,9 @@ class Hit:
 class Rounds:
     """The rounds of one worker. Hits and rounds are written to `book`, an object on each line."""
 
-    def __init__(self, folder: Path, prepared: Sequence[Prepared], seed: int, book: TextIO, *, python_alone: bool, workflow: Any = None) -> None:
-        """
-        python_alone  traps are those of `audit`
-        workflow      of the command line, that of `workflows.asset` by default
-        """
-        self.folder, self.prepared, self.book, self.python_alone, self.workflow = folder, prepared, book, python_alone, workflow
+    def __init__(self, folder: Path, prepared: Sequence[Prepared], seed: int, book: TextIO, workflow: Any = None) -> None:
+        """workflow: of the command line, that of `workflows.asset` by default"""
+        self.folder, self.prepared, self.book, self.workflow = folder, prepared, book, workflow
         self.random = random.Random(seed)
         self.kills = self.rounds = 0
         self.hits: Counter[str] = Counter()
@@ -109,7 +104,7 @@ class Rounds:
                 break
             self._hit(prepared, run, aim, fresh=fresh)
         wrong = self._end(prepared, run, fresh=fresh)
-        self._write({"event": "round", "round": self.rounds, "source": prepared.source.kind, "replaces": replaces, "fresh": fresh, "wrong": wrong})
+        report.record(self.book, {"event": "round", "round": self.rounds, "source": prepared.source.kind, "replaces": replaces, "fresh": fresh, "wrong": wrong})
         if not wrong:
             shutil.rmtree(run)
         self.rounds += 1
@@ -202,7 +197,7 @@ class Rounds:
             verified = processes.start(["verify", str(run)], self.folder / "verify.txt", workflow=self.workflow)
             if verified.end() != 0:
                 hit.wrong.append(f"verify ended with {verified.code}: {verified.errors.strip()[:300]}")
-        self._write({"event": "hit", **asdict(hit)})
+        report.record(self.book, {"event": "hit", **asdict(hit)})
 
     def _beside(self, child: Child, prepared: Prepared, run: Path) -> list[str]:
         """What a second run says while the first is stopped."""
@@ -212,15 +207,12 @@ class Rounds:
         return [] if second.end() == 5 else [f"a second run beside a stopped one ended with {second.code}: {second.errors.strip()[:300]}"]
 
     def _note(self, hit: Hit, child: Child, wrong: list[str]) -> None:
-        last = next((event for event in reversed(child.events) if event.get("event") == "progress" and event["stage"] == child.stage), None)
-        hit.progress = "" if last is None else f"{last.get('text', '')} {last.get('done', 0):g}/{last.get('total', 0):g}".strip()
         hit.resumed, hit.wrong = child.resumed, hit.wrong + wrong
         if wrong:
             print(f"WRONG: {hit}", flush=True)
 
     def _start(self, source: Source, run: Path, armed: Armed | None, *, fresh: bool) -> Child:
-        watched = {"watched_by_python": self.python_alone, "workflow": self.workflow}
-        child = processes.start(source.arguments(run), self.folder / "errors.txt", armed, fresh=fresh, **watched)
+        child = processes.start(source.arguments(run), self.folder / "errors.txt", armed, fresh=fresh, workflow=self.workflow)
         self.groups.append(child)
         return child
 
@@ -234,10 +226,6 @@ class Rounds:
         if wrong:
             print(f"WRONG: round {self.rounds} of {prepared.source.kind} in {run}: {'; '.join(wrong)}", flush=True)
         return wrong
-
-    def _write(self, record: dict[str, Any]) -> None:
-        self.book.write(json.dumps(record) + "\n")
-        self.book.flush()
 
 
 def _number(name: str) -> int:

@@ -3,9 +3,10 @@
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any, TextIO
 
 from benchmarks.torture import processes, sources, trap
 from benchmarks.torture.comparison import Expected, differences, expected
@@ -21,7 +22,7 @@ def in_prepared_process(folder: Path) -> None:
     if os.environ.get(READY):
         return
     library = trap.build(folder)
-    environment = {**processes.single_threaded_environment(library), READY: str(library or "python")}
+    environment = {**processes.single_threaded_environment(library), READY: "yes"}
     os.execve(sys.executable, [sys.executable, "-m", *_module(), *sys.argv[1:], "--folder", str(folder)], environment)
 
 
@@ -29,11 +30,6 @@ def _module() -> list[str]:
     spec = sys.modules["__main__"].__spec__
     assert spec is not None, "run it as python -m"
     return [spec.name.removesuffix(".__main__")]
-
-
-def python_alone() -> bool:
-    """Whether there is no compiler, and only the operations of Python are seen."""
-    return os.environ[READY] == "python"
 
 
 def undisturbed(source: Source, folder: Path) -> None:
@@ -61,7 +57,7 @@ def undisturbed(source: Source, folder: Path) -> None:
 
 
 def _complete(arguments: Sequence[str], place: Path, armed: Armed | None = None, *, fresh: bool = False) -> processes.Child:
-    child = processes.start(arguments, place / "errors.txt", armed, fresh=fresh, watched_by_python=python_alone())
+    child = processes.start(arguments, place / "errors.txt", armed, fresh=fresh)
     if child.end() != 0:
         raise SystemExit(f"an undisturbed run ended with {child.code}: {child.errors.strip()}")
     return child
@@ -89,6 +85,19 @@ def prepare(folder: Path, kinds: Sequence[str]) -> list[Prepared]:
     for source in made:
         processes.preload_modules((folder / "undisturbed" / source.kind / "modules").read_text(encoding="utf-8").splitlines())
     return [read(source, folder) for source in made]
+
+
+def records(folder: Path, jobs: int, work: Callable[[int, TextIO], None]) -> list[dict[str, Any]]:
+    """What so many workers write, each a process with a number and a book of its own: an object on each line. Raises SystemExit."""
+    books = [folder / f"book_{job}.jsonl" for job in range(jobs)]
+
+    def write(job: int) -> None:
+        with books[job].open("w", encoding="utf-8") as book:
+            work(job, book)
+
+    if wait_for([processes.forked(lambda job=job: write(job)) for job in range(jobs)]):  # type: ignore[misc]
+        raise SystemExit("a worker failed")
+    return [json.loads(line) for book in books for line in book.read_text(encoding="utf-8").splitlines()]
 
 
 def wait_for(workers: Sequence[int]) -> int:

@@ -5,6 +5,7 @@ command in a fresh process. Nothing here starts a thread: a fork of a process wi
 """
 
 import contextlib
+import ctypes
 import gc
 import importlib
 import json
@@ -28,6 +29,11 @@ FRESH_WATCHED = ("-c", "import sys; from benchmarks.torture.audit import arm; ar
 LIMIT = 300.0  # seconds for a run
 PACKAGES = ("pipeline", "stages", "efficientnerf", "workflows")
 LEFT_OUT = ("triton", "__main__", "pycolmap")  # in names of modules: no device here; structure from motion has threads of its own
+
+
+def python_alone() -> bool:
+    """Whether the library of trap.c is not loaded into this process: then only the operations of Python are seen, by `audit`."""
+    return not hasattr(ctypes.CDLL(None), "trap_arm")
 
 
 def single_threaded_environment(library: Path | None) -> dict[str, str]:
@@ -152,16 +158,14 @@ def start(
     armed: Armed | None = None,
     *,
     fresh: bool = False,
-    watched_by_python: bool = False,
     user: int | None = None,
     workflow: Any = None,
 ) -> Child:
     """Begin `enerf` with these arguments.
 
-    fresh              as the real command, in a new process
-    watched_by_python  a trap is that of `audit`
-    user               the number of the user to be, for a process of root
-    workflow           of a forked run's command line; that of `workflows.asset` by default
+    fresh     as the real command, in a new process
+    user      the number of the user to be, for a process of root
+    workflow  of a forked run's command line; that of `workflows.asset` by default
     """
     reading, writing = os.pipe()
     sys.stdout.flush()
@@ -178,9 +182,9 @@ def start(
                 os.setgid(user)
                 os.setuid(user)
             if fresh:
-                program = FRESH_WATCHED if watched_by_python and armed is not None else FRESH
+                program = FRESH_WATCHED if armed is not None and python_alone() else FRESH
                 os.execv(sys.executable, [sys.executable, *program, *arguments])
-            code = _run(arguments, armed, watched_by_python, workflow)
+            code = _run(arguments, armed, workflow)
         except KeyboardInterrupt:  # as Python itself ends
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGINT)
@@ -204,7 +208,7 @@ def _redirect(writing: int, errors_file: Path) -> None:
         os.close(source)
 
 
-def _run(arguments: Sequence[str], armed: Armed | None, watched_by_python: bool, workflow: Any) -> int:
+def _run(arguments: Sequence[str], armed: Armed | None, workflow: Any) -> int:
     """In the forked child."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -213,16 +217,12 @@ def _run(arguments: Sequence[str], armed: Armed | None, watched_by_python: bool,
     sys.stdout, sys.stderr = (open(descriptor, "w", encoding="utf-8", closefd=False) for descriptor in (1, 2))  # noqa: SIM115
     from workflows.cli.main import main
 
-    if armed is not None:
-        if watched_by_python:
-            from benchmarks.torture.audit import arm
+    if armed is not None and python_alone():
+        from benchmarks.torture.audit import arm
 
-            arm()
-        else:
-            import ctypes
-
-            if not ctypes.CDLL(None).trap_arm():
-                raise RuntimeError("the trap could not be armed")
+        arm()
+    elif armed is not None and not ctypes.CDLL(None).trap_arm():
+        raise RuntimeError("the trap could not be armed")
     try:
         return main(list(arguments), workflow)
     finally:
@@ -239,8 +239,6 @@ def preload() -> None:
             if not any(name in module.name for name in LEFT_OUT):
                 importlib.import_module(module.name)
     load_kernels()
-    gc.collect()
-    gc.freeze()
 
 
 def preload_modules(names: Sequence[str]) -> None:
@@ -250,16 +248,14 @@ def preload_modules(names: Sequence[str]) -> None:
             with contextlib.suppress(Exception):
                 importlib.import_module(name)
     load_kernels()
-    gc.collect()
-    gc.freeze()
 
 
 _loaded: set[int] = set()
 
 
 def load_kernels() -> None:
-    """Load kernels from numba's files. That starts the (empty) pool of one thread; OpenMP refuses to be used by children of the process
-    that did this, not by their children: see `forked`."""
+    """Load kernels from numba's files, and keep all that there is from the garbage collector. Loading starts the (empty) pool of one thread; OpenMP refuses to
+    be used by children of the process that did this, not by their children: see `forked`."""
     from numba.core.dispatcher import Dispatcher
 
     for module in [module for name, module in list(sys.modules.items()) if name.startswith("efficientnerf")]:
@@ -269,6 +265,8 @@ def load_kernels() -> None:
                 index = getattr(getattr(value, "_cache", None), "_cache_file", None)
                 for signature, *_ in [] if index is None else list(index._load_index()):
                     value.compile(signature)
+    gc.collect()
+    gc.freeze()
 
 
 def forked(work: Any) -> int:

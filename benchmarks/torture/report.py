@@ -1,22 +1,29 @@
-"""The circumstances of a result: machine, versions, date."""
+"""The records of workers, and the circumstances of a result: machine, versions, date."""
 
+import json
 import os
 import platform
 import subprocess
 import time
 from importlib.metadata import version
-from typing import Any
+from typing import Any, TextIO
 
 from benchmarks.machine import processor
-from benchmarks.torture.processes import ROOT
+from benchmarks.torture.processes import ROOT, python_alone
 
 LIBRARIES = ("torch", "numpy", "numba", "pycolmap", "av", "OpenEXR", "safetensors", "pillow", "filelock")
 
 
-def circumstances(begun: float, *, python_alone: bool, jobs: int, seed: int) -> dict[str, Any]:
+def record(book: TextIO, facts: dict[str, Any]) -> None:
+    """Add a line to a worker's book at once."""
+    book.write(json.dumps(facts) + "\n")
+    book.flush()
+
+
+def circumstances(begun: float, jobs: int, seed: int) -> dict[str, Any]:
     """`begun`: of the monotonic clock."""
     return {
-        "operations_seen": "those of Python alone, for want of a C compiler" if python_alone else "of all libraries (LD_PRELOAD)",
+        "operations_seen": "those of Python alone, for want of a C compiler" if python_alone() else "of all libraries (LD_PRELOAD)",
         "elapsed_seconds": round(time.monotonic() - begun, 1),
         "jobs": jobs,
         "seed": seed,

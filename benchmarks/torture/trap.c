@@ -131,10 +131,10 @@ static void act(void) {
     else syscall(SYS_kill, -leader, value); /* all of the run, as a terminal does */
 }
 
-/* Called before each operation; returns the errno to fail with, or 0. */
+/* Called before each operation; returns the errno to fail with, or 0. Kind 0 is no operation that counts. */
 static int meet(int kind, int folder, const char *name) {
     char path[2 * PATH_MAX], where[64];
-    if (!armed || inside) return 0;
+    if (!armed || inside || !kind) return 0;
     int saved = errno, result = 0;
     inside = 1;
     if (absolute(folder, name, path, sizeof path) && (below(path, run) || (kind == READ && below(path, source)))) {
@@ -162,9 +162,14 @@ static int meet(int kind, int folder, const char *name) {
     return result;
 }
 
-#define NEXT(type, name, ...) \
-    static type (*next)(__VA_ARGS__); \
-    if (!next) next = (type(*)(__VA_ARGS__))dlsym(RTLD_NEXT, #name)
+static int kind_of(int flags) {
+    if (flags & O_DIRECTORY) return 0; /* to list it, or to sync it */
+    return (flags & O_ACCMODE) == O_RDONLY ? READ : OPEN;
+}
+
+#define NEXT(type, name, parameters) \
+    static type(*next) parameters; \
+    if (!next) next = (type(*) parameters)dlsym(RTLD_NEXT, #name)
 #define FAIL(kind, folder, path, value) \
     do { \
         int why = meet(kind, folder, path); \
@@ -174,165 +179,59 @@ static int meet(int kind, int folder, const char *name) {
         } \
     } while (0)
 
-static int kind_of(int flags) {
-    if (flags & O_DIRECTORY) return 0; /* to list it, or to sync it */
-    return (flags & O_ACCMODE) == O_RDONLY ? READ : OPEN;
-}
+#define OPENS(name, parameters, folder, ...) \
+    int name parameters { \
+        NEXT(int, name, parameters); \
+        mode_t mode = 0; \
+        if (flags & (O_CREAT | __O_TMPFILE)) { \
+            va_list list; \
+            va_start(list, flags); \
+            mode = va_arg(list, mode_t); \
+            va_end(list); \
+        } \
+        FAIL(kind_of(flags), folder, path, -1); \
+        return next(__VA_ARGS__, mode); \
+    }
+OPENS(open, (const char *path, int flags, ...), AT_FDCWD, path, flags)
+OPENS(open64, (const char *path, int flags, ...), AT_FDCWD, path, flags)
+OPENS(openat, (int folder, const char *path, int flags, ...), folder, folder, path, flags)
+OPENS(openat64, (int folder, const char *path, int flags, ...), folder, folder, path, flags)
 
-#define MODE \
-    mode_t mode = 0; \
-    if (flags & (O_CREAT | __O_TMPFILE)) { \
-        va_list list; \
-        va_start(list, flags); \
-        mode = va_arg(list, mode_t); \
-        va_end(list); \
+/* A function of the C library: its type, name, (parameters) and (arguments); the kind, folder and path of the operation; what it returns where that fails. */
+#define STEP(type, name, parameters, arguments, kind, folder, path, failed) \
+    type name parameters { \
+        NEXT(type, name, parameters); \
+        FAIL(kind, folder, path, failed); \
+        return next arguments; \
     }
 
-#define OPENS(name) \
-    int name(const char *path, int flags, ...) { \
-        NEXT(int, name, const char *, int, ...); \
-        MODE \
-        if (kind_of(flags)) FAIL(kind_of(flags), AT_FDCWD, path, -1); \
-        return next(path, flags, mode); \
-    }
-#define OPENS_AT(name) \
-    int name(int folder, const char *path, int flags, ...) { \
-        NEXT(int, name, int, const char *, int, ...); \
-        MODE \
-        if (kind_of(flags)) FAIL(kind_of(flags), folder, path, -1); \
-        return next(folder, path, flags, mode); \
-    }
-OPENS(open)
-OPENS(open64)
-OPENS_AT(openat)
-OPENS_AT(openat64)
+STEP(int, __open_2, (const char *path, int flags), (path, flags), kind_of(flags), AT_FDCWD, path, -1)
+STEP(int, __open64_2, (const char *path, int flags), (path, flags), kind_of(flags), AT_FDCWD, path, -1)
+STEP(int, creat, (const char *path, mode_t mode), (path, mode), OPEN, AT_FDCWD, path, -1)
+STEP(FILE *, fopen, (const char *path, const char *mode), (path, mode), mode[0] == 'r' && !strchr(mode, '+') ? READ : OPEN, AT_FDCWD, path, NULL)
+STEP(FILE *, fopen64, (const char *path, const char *mode), (path, mode), mode[0] == 'r' && !strchr(mode, '+') ? READ : OPEN, AT_FDCWD, path, NULL)
 
-#define CHECKED_OPENS(name) \
-    int name(const char *path, int flags) { \
-        NEXT(int, name, const char *, int); \
-        if (kind_of(flags)) FAIL(kind_of(flags), AT_FDCWD, path, -1); \
-        return next(path, flags); \
-    }
-CHECKED_OPENS(__open_2)
-CHECKED_OPENS(__open64_2)
+STEP(ssize_t, write, (int fd, const void *data, size_t size), (fd, data, size), WRITE, fd, NULL, -1)
+STEP(ssize_t, writev, (int fd, const struct iovec *parts, int count), (fd, parts, count), WRITE, fd, NULL, -1)
+STEP(ssize_t, pwrite, (int fd, const void *data, size_t size, off_t at), (fd, data, size, at), WRITE, fd, NULL, -1)
+STEP(ssize_t, pwrite64, (int fd, const void *data, size_t size, off64_t at), (fd, data, size, at), WRITE, fd, NULL, -1)
+STEP(size_t, fwrite, (const void *data, size_t size, size_t count, FILE *file), (data, size, count, file), WRITE, fileno(file), NULL, 0)
+STEP(ssize_t, sendfile, (int to, int from, off_t *at, size_t size), (to, from, at, size), WRITE, to, NULL, -1)
+STEP(ssize_t, sendfile64, (int to, int from, off64_t *at, size_t size), (to, from, at, size), WRITE, to, NULL, -1)
+STEP(ssize_t, copy_file_range, (int from, off64_t *at, int to, off64_t *there, size_t size, unsigned flags), (from, at, to, there, size, flags),
+     WRITE, to, NULL, -1)
+STEP(int, ftruncate, (int fd, off_t size), (fd, size), WRITE, fd, NULL, -1)
+STEP(int, ftruncate64, (int fd, off64_t size), (fd, size), WRITE, fd, NULL, -1)
 
-int creat(const char *path, mode_t mode) {
-    NEXT(int, creat, const char *, mode_t);
-    FAIL(OPEN, AT_FDCWD, path, -1);
-    return next(path, mode);
-}
+STEP(int, fsync, (int fd), (fd), FSYNC, fd, NULL, -1)
+STEP(int, fdatasync, (int fd), (fd), FSYNC, fd, NULL, -1)
 
-#define FOPENS(name) \
-    FILE *name(const char *path, const char *mode) { \
-        NEXT(FILE *, name, const char *, const char *); \
-        FAIL(mode[0] == 'r' && !strchr(mode, '+') ? READ : OPEN, AT_FDCWD, path, NULL); \
-        return next(path, mode); \
-    }
-FOPENS(fopen)
-FOPENS(fopen64)
-
-ssize_t write(int fd, const void *data, size_t size) {
-    NEXT(ssize_t, write, int, const void *, size_t);
-    FAIL(WRITE, fd, NULL, -1);
-    return next(fd, data, size);
-}
-ssize_t writev(int fd, const struct iovec *parts, int count) {
-    NEXT(ssize_t, writev, int, const struct iovec *, int);
-    FAIL(WRITE, fd, NULL, -1);
-    return next(fd, parts, count);
-}
-ssize_t pwrite(int fd, const void *data, size_t size, off_t at) {
-    NEXT(ssize_t, pwrite, int, const void *, size_t, off_t);
-    FAIL(WRITE, fd, NULL, -1);
-    return next(fd, data, size, at);
-}
-ssize_t pwrite64(int fd, const void *data, size_t size, off64_t at) {
-    NEXT(ssize_t, pwrite64, int, const void *, size_t, off64_t);
-    FAIL(WRITE, fd, NULL, -1);
-    return next(fd, data, size, at);
-}
-size_t fwrite(const void *data, size_t size, size_t count, FILE *file) {
-    NEXT(size_t, fwrite, const void *, size_t, size_t, FILE *);
-    FAIL(WRITE, fileno(file), NULL, 0);
-    return next(data, size, count, file);
-}
-ssize_t sendfile(int to, int from, off_t *at, size_t size) {
-    NEXT(ssize_t, sendfile, int, int, off_t *, size_t);
-    FAIL(WRITE, to, NULL, -1);
-    return next(to, from, at, size);
-}
-ssize_t sendfile64(int to, int from, off64_t *at, size_t size) {
-    NEXT(ssize_t, sendfile64, int, int, off64_t *, size_t);
-    FAIL(WRITE, to, NULL, -1);
-    return next(to, from, at, size);
-}
-ssize_t copy_file_range(int from, off64_t *at, int to, off64_t *there, size_t size, unsigned flags) {
-    NEXT(ssize_t, copy_file_range, int, off64_t *, int, off64_t *, size_t, unsigned);
-    FAIL(WRITE, to, NULL, -1);
-    return next(from, at, to, there, size, flags);
-}
-int ftruncate(int fd, off_t size) {
-    NEXT(int, ftruncate, int, off_t);
-    FAIL(WRITE, fd, NULL, -1);
-    return next(fd, size);
-}
-int ftruncate64(int fd, off64_t size) {
-    NEXT(int, ftruncate64, int, off64_t);
-    FAIL(WRITE, fd, NULL, -1);
-    return next(fd, size);
-}
-int fsync(int fd) {
-    NEXT(int, fsync, int);
-    FAIL(FSYNC, fd, NULL, -1);
-    return next(fd);
-}
-int fdatasync(int fd) {
-    NEXT(int, fdatasync, int);
-    FAIL(FSYNC, fd, NULL, -1);
-    return next(fd);
-}
-int rename(const char *from, const char *to) {
-    NEXT(int, rename, const char *, const char *);
-    FAIL(RENAME, AT_FDCWD, from, -1);
-    return next(from, to);
-}
-int renameat(int from_folder, const char *from, int to_folder, const char *to) {
-    NEXT(int, renameat, int, const char *, int, const char *);
-    FAIL(RENAME, from_folder, from, -1);
-    return next(from_folder, from, to_folder, to);
-}
-int renameat2(int from_folder, const char *from, int to_folder, const char *to, unsigned flags) {
-    NEXT(int, renameat2, int, const char *, int, const char *, unsigned);
-    FAIL(RENAME, from_folder, from, -1);
-    return next(from_folder, from, to_folder, to, flags);
-}
-int mkdir(const char *path, mode_t mode) {
-    NEXT(int, mkdir, const char *, mode_t);
-    FAIL(MKDIR, AT_FDCWD, path, -1);
-    return next(path, mode);
-}
-int mkdirat(int folder, const char *path, mode_t mode) {
-    NEXT(int, mkdirat, int, const char *, mode_t);
-    FAIL(MKDIR, folder, path, -1);
-    return next(folder, path, mode);
-}
-int unlink(const char *path) {
-    NEXT(int, unlink, const char *);
-    FAIL(UNLINK, AT_FDCWD, path, -1);
-    return next(path);
-}
-int unlinkat(int folder, const char *path, int flags) {
-    NEXT(int, unlinkat, int, const char *, int);
-    FAIL(flags & AT_REMOVEDIR ? RMDIR : UNLINK, folder, path, -1);
-    return next(folder, path, flags);
-}
-int remove(const char *path) {
-    NEXT(int, remove, const char *);
-    FAIL(UNLINK, AT_FDCWD, path, -1);
-    return next(path);
-}
-int rmdir(const char *path) {
-    NEXT(int, rmdir, const char *);
-    FAIL(RMDIR, AT_FDCWD, path, -1);
-    return next(path);
-}
+STEP(int, rename, (const char *from, const char *to), (from, to), RENAME, AT_FDCWD, from, -1)
+STEP(int, renameat, (int folder, const char *from, int other, const char *to), (folder, from, other, to), RENAME, folder, from, -1)
+STEP(int, renameat2, (int folder, const char *from, int other, const char *to, unsigned flags), (folder, from, other, to, flags), RENAME, folder, from, -1)
+STEP(int, mkdir, (const char *path, mode_t mode), (path, mode), MKDIR, AT_FDCWD, path, -1)
+STEP(int, mkdirat, (int folder, const char *path, mode_t mode), (folder, path, mode), MKDIR, folder, path, -1)
+STEP(int, unlink, (const char *path), (path), UNLINK, AT_FDCWD, path, -1)
+STEP(int, unlinkat, (int folder, const char *path, int flags), (folder, path, flags), flags & AT_REMOVEDIR ? RMDIR : UNLINK, folder, path, -1)
+STEP(int, remove, (const char *path), (path), UNLINK, AT_FDCWD, path, -1)
+STEP(int, rmdir, (const char *path), (path), RMDIR, AT_FDCWD, path, -1)

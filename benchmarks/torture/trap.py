@@ -78,14 +78,9 @@ class Armed:
         values = [self.state, self.log or "", self.run, self.source, trap.stage, trap.action, mask(trap.kinds), mask(trap.fault_kinds), trap.number, trap.errno]
         self.environment = {f"TRAP_{name}": str(value) for name, value in zip(NAMES, [*values, int(trap.lasting), trap.deadly], strict=True)}
 
-    def _read(self) -> tuple[int, int, int, bytes]:
-        seen, fired, failed, path = _STATE.unpack(self.state.read_bytes()[: _STATE.size])
-        return seen, fired, failed, path
-
-    @property
-    def seen(self) -> int:
-        """Operations of the trap's stage and kinds."""
-        return self._read()[0]
+    def _read(self) -> tuple[int, int, bytes]:
+        _seen, fired, failed, path = _STATE.unpack(self.state.read_bytes()[: _STATE.size])
+        return fired, failed, path
 
     def disarm(self) -> None:
         """No operation is the one that is meant from now on."""
@@ -94,17 +89,17 @@ class Armed:
 
     @property
     def fired(self) -> bool:
-        return bool(self._read()[1])
+        return bool(self._read()[0])
 
     @property
     def failed(self) -> int:
         """Operations that were let fail."""
-        return self._read()[2]
+        return self._read()[1]
 
     @property
     def place(self) -> tuple[str, str, str]:
         """Stage, kind and path of the operation that was hit; empty before."""
-        stage, kind, path = [*os.fsdecode(self._read()[3].split(b"\0")[0]).split("\t", 2), "", "", ""][:3]
+        stage, kind, path = [*os.fsdecode(self._read()[2].split(b"\0")[0]).split("\t", 2), "", "", ""][:3]
         return stage, kind, path
 
 

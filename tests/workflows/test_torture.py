@@ -28,7 +28,7 @@ def toy(toys: Path, tmp_path: Path) -> tuple[Prepared, Workflow]:
     place.mkdir()
     armed = Armed(Trap(), place / "run", toys, place / "state", place / "log")
     for run, more, watch in (("run", (), armed), ("older", ("--set", "poses.repeat=2"), None)):
-        child = processes.start(source.arguments(place / run, *more), place / "errors", watch, watched_by_python=True, workflow=workflow)
+        child = processes.start(source.arguments(place / run, *more), place / "errors", watch, workflow=workflow)
         assert child.end() == 0, child.errors
     wanted = Expected(digests(place / "run", STAGES), names(place / "run"))
     return Prepared(source, wanted, child.seconds, trap.operations(place / "log"), place / "older"), workflow
@@ -37,7 +37,7 @@ def toy(toys: Path, tmp_path: Path) -> tuple[Prepared, Workflow]:
 def test_killed_and_signalled_toy_runs_end_in_the_same_artifacts(toy: tuple[Prepared, Workflow], tmp_path: Path) -> None:
     prepared, workflow = toy
     with (tmp_path / "book").open("w") as book:
-        rounds = Rounds(tmp_path / "rounds", [prepared], 5, book, python_alone=True, workflow=workflow)
+        rounds = Rounds(tmp_path / "rounds", [prepared], 5, book, workflow=workflow)
         for number in range(20):  # a quick run has ended before most of its moments
             if number >= 2 and rounds.kills >= 4:
                 break
@@ -63,7 +63,7 @@ FAULTS = (
 def test_failing_operations_of_toy_runs_lose_nothing(toy: tuple[Prepared, Workflow], tmp_path: Path) -> None:
     prepared, workflow = toy
     with (tmp_path / "book").open("w") as book:
-        cases = Cases(tmp_path / "cases", [prepared], book, python_alone=True, workflow=workflow)
+        cases = Cases(tmp_path / "cases", [prepared], book, workflow=workflow)
         for where, *operation in FAULTS:
             assert cases.carry_out(Case("toy", where if where in STAGES else NEW, where, *operation)) == []
     assert all(json.loads(line)["reached"] for line in (tmp_path / "book").read_text().splitlines())
