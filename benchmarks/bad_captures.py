@@ -11,7 +11,6 @@ import argparse
 import json
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,11 +22,11 @@ import numpy as np
 
 from benchmarks.machine import hardware
 from benchmarks.poses import STILL_LIFE, TRUTH, percent_off, true_centres
+from benchmarks.project import ENERF, RESULTS, ROOT
 from benchmarks.scenes import room
+from pipeline.files import write_json
 from stages.io.pictures import opened, rgb_and_alpha
 
-ROOT = Path(__file__).resolve().parents[1]
-ENERF = (sys.executable, "-m", "workflows.cli.main")
 MOST_ERROR = 1.0  # % of the mean distance of the cameras from their middle, root mean square
 ENOUGH = 0.75  # share of the photographs that can be placed, from which a capture without a diagnosis counts
 Pictures = dict[str, np.ndarray]  # by name; BGR
@@ -216,7 +215,6 @@ class Row:
     registered: int = 0
     centre_rms_percent: float | None = None
     problems: list[str] = field(default_factory=list)
-    said: str = ""
     seconds: float = 0.0
     right: bool = False
 
@@ -234,7 +232,6 @@ def measured(capture: Capture, count: int, work: Path) -> Row:
     started = time.monotonic()
     done = subprocess.run([*ENERF, "run", str(folder), "--out", str(run), "--until", "poses"], capture_output=True, text=True, check=False, cwd=ROOT)
     row.seconds, row.exit_code = round(time.monotonic() - started, 1), done.returncode
-    row.said = (done.stdout + done.stderr)[-6000:]
     verdicts = [run / "poses" / "verdict.json", *sorted((run / ".work").rglob("verdict.json"))]
     diagnosis = ""
     for verdict in [path for path in verdicts if path.exists()][:1]:
@@ -244,7 +241,7 @@ def measured(capture: Capture, count: int, work: Path) -> Row:
         row.centre_rms_percent = _error(run, capture) if done.returncode == 0 else None
     placeable = len(capture.placeable(names))
     placed = row.centre_rms_percent is not None and row.centre_rms_percent <= MOST_ERROR and row.registered >= ENOUGH * placeable
-    row.right = "Traceback" not in row.said and (placed or any(word in diagnosis for word in capture.diagnoses))
+    row.right = "Traceback" not in done.stdout + done.stderr and (placed or any(word in diagnosis for word in capture.diagnoses))
     return row
 
 
@@ -288,7 +285,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--only", default="", help="names, with commas between; rows of others stay in the table")
     parser.add_argument("--photographs", type=int, default=36)
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
+    parser.add_argument("--out", type=Path, default=RESULTS)
     given = parser.parse_args()
     wanted = {name.strip() for name in given.only.split(",") if name.strip()}
     given.out.mkdir(parents=True, exist_ok=True)
@@ -300,9 +297,7 @@ def main() -> None:
         row = rows[capture.name] = measured(capture, given.photographs, given.work.resolve())
         print(f"{row.capture}: {row.grade or row.exit_code}, {'right' if row.right else 'WRONG'}", flush=True)
         ordered = [rows[each.name] for each in CAPTURES if each.name in rows]
-        kept = [{key: value for key, value in vars(row).items() if key != "said"} for row in ordered]
-        document = {"machine": hardware("cpu"), "photographs": given.photographs, "rows": kept}
-        table.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_json(table, {"machine": hardware("cpu"), "photographs": given.photographs, "rows": [vars(row) for row in ordered]})
         table.with_suffix(".md").write_text(in_markdown(ordered), encoding="utf-8")
 
 

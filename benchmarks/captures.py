@@ -22,16 +22,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import hardware
-from benchmarks.minutes import code_version
 from benchmarks.poses import percent_off, true_centres
+from benchmarks.project import DATA, ENERF, RESULTS, code_version
 from pipeline.files import read_json, write_atomically, write_json
 from pipeline.run import NAME as RUN_FILE
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
 from workflows.asset import NAMES as STAGES
+from workflows.cli.device import has_cuda
 
-ROOT = Path(__file__).resolve().parents[1]
-DATA = ROOT.parent / "shared" / "data"
-RESULTS = ROOT / "benchmarks" / "results"
 FILE = "captures"
 SETS = {  # photographs alone, whatever cameras lie beside them
     "still_life": "sample_photos", "banana_photos": "banana_photos", "fern": "fern_4/images_4", "lund_door": "lund_door_colmap/images",
@@ -59,7 +57,7 @@ def sources_of(sets: Sequence[str], paths: Sequence[Path], data: Path) -> dict[s
 def run_capture(source: Path, run: Path, options: Sequence[str]) -> str | None:
     """Run all stages, or those that are left; why it failed, or None. Without the source a run goes on from its poses."""
     sources = [str(source)] if source.exists() else []
-    command = [sys.executable, "-m", "workflows.cli.main", "run", *sources, "--out", str(run), "--json", *options]
+    command = [*ENERF, "run", *sources, "--out", str(run), "--json", *options]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode == 0:
         return None
@@ -229,7 +227,7 @@ def measure(name: str, source: Path, run: Path, given: argparse.Namespace) -> di
     picture = given.out / FILE / f"{name}.webp"
     about = {"error": error, "date": datetime.date.today().isoformat(), "code": None, "options": " ".join(options), "machine": None}
     if not given.from_runs:
-        about |= {"code": code_version(), "machine": {key: value for key, value in hardware(given.hardware).items() if key != "load"}}
+        about |= {"code": code_version(), "machine": hardware(given.hardware)}
     return {**about, **row, "picture": f"{FILE}/{picture.name}" if write_picture(run, picture) else None}
 
 
@@ -270,7 +268,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     given = parser().parse_args(arguments)
-    given.hardware = given.device if given.device in ("cpu", "cuda") else "cuda" if _has_cuda() else "cpu"
+    given.hardware = given.device if given.device in ("cpu", "cuda") else "cuda" if has_cuda() else "cpu"
     given.out.mkdir(parents=True, exist_ok=True)
     before = read_rows(given.before) if given.before else {}
     rows, table, measured = read_rows(given.out / f"{FILE}.json"), given.out / f"{FILE}.json", {}
@@ -289,12 +287,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lines = worse_than(before, measured)
     print(*lines, sep="\n", flush=True)
     return 1 if lines or any(row["error"] for row in measured.values()) else 0
-
-
-def _has_cuda() -> bool:
-    from workflows.cli.device import has_cuda
-
-    return has_cuda()
 
 
 if __name__ == "__main__":

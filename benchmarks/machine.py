@@ -7,8 +7,6 @@ from typing import Any
 
 from pipeline.executors.cores import affinity
 
-STAT = Path("/proc/stat")
-
 
 def processor() -> str:
     """The processor's name, with its family and model: names such as AMD EPYC leave the generation open."""
@@ -16,15 +14,15 @@ def processor() -> str:
         lines = Path("/proc/cpuinfo").read_text().split("\n\n", 1)[0].splitlines()
     except OSError:
         lines = []
-    said = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
-    name = said.get("model name") or platform.processor() or "unknown"
-    return f"{name}, family {said['cpu family']}, model {said['model']}" if {"cpu family", "model"} <= said.keys() else name
+    facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    name = facts.get("model name") or platform.processor() or "unknown"
+    return f"{name}, family {facts['cpu family']}, model {facts['model']}" if {"cpu family", "model"} <= facts.keys() else name
 
 
 def busy_seconds() -> float | None:
     """Seconds that the processors have worked since the machine began, for whatever program; None where the system does not say."""
     try:
-        user, nice, system, _idle, _wait, interrupts, soft = (int(word) for word in STAT.read_text().split("\n", 1)[0].split()[1:8])
+        user, nice, system, _idle, _wait, interrupts, soft = (int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:8])
     except (OSError, ValueError):
         return None
     return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")
@@ -37,6 +35,4 @@ def hardware(device: str) -> dict[str, Any]:
         import torch  # programs that choose their cores do so before they load it
 
         found["device"] = torch.cuda.get_device_name()
-    if hasattr(os, "getloadavg"):
-        found["load"] = [round(x, 2) for x in os.getloadavg()]
-    return found
+    return found | {"load": [round(x, 2) for x in os.getloadavg()]}

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.project import RESULTS
 from benchmarks.scenes import captures
 from benchmarks.scenes.captures import MadeCapture
 from efficientnerf.training.settings import TrainSettings
@@ -26,7 +27,6 @@ from stages.poses.run import run as find_poses
 from stages.poses.settings import PosesSettings
 from stages.train.priors import Prior, mask_uncovered_cells
 
-ROOT = Path(__file__).resolve().parents[1]
 MOST_MASKED = 0.01  # of the subject's voxels: at the borders of photographs the middle of a voxel may be in view of fewer than the point in it
 COLUMNS = (
     "capture",
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--side", type=int, default=128, help="density voxels along a side")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
+    parser.add_argument("--out", type=Path, default=RESULTS)
     given = parser.parse_args(arguments)
     table, about = given.out / "made_captures.json", {"width": given.width, "side": given.side, "seed": given.seed}
     before = read_json(table) if table.exists() else {}

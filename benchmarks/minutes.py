@@ -4,7 +4,6 @@ A row is a mapping: `method`, `set`, `minutes` and `options` name it; `code` is 
 there are none. Rows of several files (ours, peers') are shown in one table.
 """
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,24 +12,11 @@ from benchmarks.machine import hardware
 from pipeline.files import read_json, write_json
 from stages.figures.plots import with_palette
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
 OURS = "efficientnerf"
-PACKAGES = ("pipeline", "efficientnerf", "stages", "workflows")
 OTHERS = 0.1  # cores that other programs may take of a row that counts as undisturbed
 NAMED_BY = ("method", "set", "minutes", "options")
 COLUMNS = ("scene", "method", "minutes", "PSNR / dB", "SSIM", "MB", "peak MiB", "seconds", "pixels")
 BEGIN, END = "<!-- begin quality over minutes -->", "<!-- end quality over minutes -->"
-
-
-def code_version(root: Path = ROOT) -> str:
-    """Twelve digits of the SHA-256 of all Python sources and presets of the four packages."""
-    digest = hashlib.sha256()
-    for package in PACKAGES:
-        for path in sorted((root / package).rglob("*")):
-            if path.suffix in (".py", ".toml") and "__pycache__" not in path.parts:
-                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:12]
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
@@ -50,9 +36,8 @@ def with_row(rows: Iterable[Mapping[str, Any]], row: Mapping[str, Any]) -> list[
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """The file of the rows, with the machine; replaced whole."""
-    machine = {key: value for key, value in hardware("cpu").items() if key != "load"}  # each row has its own
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, {"machine": machine, "rows": list(rows)})
+    write_json(path, {"machine": hardware("cpu"), "rows": list(rows)})
 
 
 def in_markdown(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -1,6 +1,6 @@
 """Accuracy and speed of finding cameras from the sample photographs.
 
-    python benchmarks/poses.py [--photographs FOLDER] [--truth FILE.json | --no-truth] [--out benchmarks/results/poses_cpu.json]
+    python -m benchmarks.poses [--photographs FOLDER] [--truth FILE.json | --no-truth] [--out benchmarks/results/poses_cpu.json]
 
 Prints, and saves as the row of the folder's name: photographs registered, RMS and largest error of the camera centres after a similarity
 alignment, in per cent of their mean distance to the centroid, the camera model, seconds, processor seconds and the load average before and after.
@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.project import ROOT
 from efficientnerf.geometry.cameras import closest_similarity, pose_from_opengl
 from stages.sfm.cameras import find_cameras
 from stages.sfm.reconstruction import Request
 
-ROOT = Path(__file__).resolve().parents[1]
 STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
 
 

@@ -5,7 +5,7 @@
 
 Each row is a run of its own, from the source, with `enerf run --budget`. Cameras found from photographs are found once and copied: they are no part of the
 minutes. A row is written as soon as it is measured; with the same code and options it is not measured again, and one that was broken off begins anew.
-Writes quality_over_minutes.json, and a table and a plot of it with the rows of peers (benchmarks/peers.py) beside it; --readme replaces what stands between
+Writes quality_over_minutes.json, and a table and a plot of it with the rows of peers (`benchmarks.peers`) beside it; --readme replaces what stands between
 the marks in a document. Made scenes are written to FOLDER/scenes where they are not there: `python -m benchmarks.scenes`.
 """
 
@@ -23,12 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import busy_seconds, processor
-from benchmarks.minutes import OURS, RESULTS, code_version, read_rows, same_row, show, with_row, write_rows
+from benchmarks.minutes import OURS, read_rows, same_row, show, with_row, write_rows
+from benchmarks.project import DATA, ENERF, RESULTS, ROOT, code_version
 from pipeline.files import read_json
 from stages.artifacts import BakeOutputs, EvaluateOutputs
 
-ROOT = Path(__file__).resolve().parents[1]
-DATA = ROOT.parent / "shared" / "data"
 SETS = ("chair_800", "fern_4", "still_life", "object", "court", "window", "gloss")
 MADE = {"object": (), "court": (), "window": ("--as", "llff"), "gloss": ()}  # kinds of made scenes, and how they are read
 MADE_VIEWS = {"size": 400, "train": 60, "val": 10, "test": 20}
@@ -39,7 +38,6 @@ EVALUATION = (
     "evaluate.field_views=1", "evaluate.strips=off", "evaluate.captured_path_frames=off", "evaluate.field_background_rays=1", "mesh.texture=off",
     "splats.make=off",
 )  # fmt: skip
-ENERF = (sys.executable, "-m", "workflows.cli.main")
 LIBRARIES = ("torch", "numba", "numpy")
 
 

@@ -34,10 +34,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import processor
+from benchmarks.project import PACKAGES, ROOT
 from pipeline.executors.cores import VARIABLES
 
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = tuple(str(ROOT / name) + os.sep for name in ("pipeline", "stages", "efficientnerf", "workflows"))
+OURS = tuple(str(ROOT / name) + os.sep for name in PACKAGES)
 INTERVAL = 0.005  # seconds between two looks
 CORES = (4, 8, 16, 64)
 # STREAM's triad on all of a machine's cores, bytes a second: two channels of DDR4-3200 (laptop) and of DDR5-5600 (desktop), eight of DDR4-3200 (server)
@@ -130,7 +130,7 @@ class Watch:
 def _innermost(frame: FrameType | None) -> str:
     while frame is not None:
         path = frame.f_code.co_filename
-        if path.startswith(PACKAGES):
+        if path.startswith(OURS):
             return f"{Path(path).relative_to(ROOT).with_suffix('').as_posix()} {frame.f_code.co_qualname}"
         frame = frame.f_back
     return "libraries"

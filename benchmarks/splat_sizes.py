@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import hardware
-from benchmarks.minutes import RESULTS, code_version
+from benchmarks.project import RESULTS, code_version
 from efficientnerf.asset.format import load
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Similarity

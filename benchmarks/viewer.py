@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import processor
-from benchmarks.minutes import RESULTS
+from benchmarks.project import RESULTS
 from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.asset.captured import captured_of
 from efficientnerf.asset.format import describe, load

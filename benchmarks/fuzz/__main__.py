@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.fuzz import campaign, nursery, worker
-from benchmarks.fuzz.reader import ROOT
+from benchmarks.project import ROOT
 
-RESULT = ROOT / "benchmarks" / "results" / "fuzz.json"
 LIBRARIES = ("atheris", "msgspec", "numpy", "pillow", "pillow-heif", "safetensors", "torch")
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fuzz import safetensors_bytes
-from benchmarks.fuzz.reader import ROOT, Opened, Reader
+from benchmarks.fuzz.reader import Opened, Reader
+from benchmarks.project import ROOT
 
 SIZE = 12  # pixels along a side of a picture
 
@@ -83,4 +84,4 @@ def open_asset(folder: Path) -> Opened:
     return Opened(read, (("inspect", str(path)), ("inspect", str(path), "--json")))
 
 
-READERS = {"asset": Reader("asset", "the asset, every layout", seeds, changed, open_asset, refusals=("FormatError", "PipelineError"))}
+READERS = (Reader("asset", "the asset, every layout", seeds, changed, open_asset, refusals=("FormatError", "PipelineError")),)

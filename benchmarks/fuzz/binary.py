@@ -53,8 +53,3 @@ def changed_bytes(rng: Random, data: bytes, alphabet: bytes | None = None, begin
         else:
             del out[at:]
     return bytes(out[:LARGEST])
-
-
-def spliced(rng: Random, data: bytes, other: bytes) -> bytes:
-    """The front of one file and the back of another."""
-    return (data[: rng.randrange(len(data) + 1)] + other[rng.randrange(len(other) + 1) :])[:LARGEST]

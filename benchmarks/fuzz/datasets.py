@@ -1,6 +1,8 @@
 """Readers of posed data sets: a small folder in each format, of which one file is the input."""
 
 import io
+import json
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -10,10 +12,10 @@ from random import Random
 import numpy as np
 
 from benchmarks.fuzz import binary, json_text, lines
-from benchmarks.fuzz.reader import Opened, Reader
+from benchmarks.fuzz.reader import Opened, Read, Reader
 from tests.stages import captures, exports
 
-COUNT = 3  # images of a data set
+COUNT = 4  # images of a data set, of which one may be left out
 EVERY = 100  # of so many inputs one goes through the command line: a whole poses stage takes as long as a hundred of them
 NGP = {"is_fisheye": False, "k1": 0.01}
 
@@ -36,36 +38,34 @@ def read_source(folder: Path, data: bytes) -> None:
         assert capture.bounds is None or np.isfinite(capture.bounds).all(), "bounds that are not finite"
 
 
-def _commands(folder: Path) -> tuple[tuple[tuple[str, ...], ...], Callable[[bytes], None]]:
-    """Describing the source, and the poses stage on it, in a new run each time."""
-    run = folder.parent / "run"
-    return (
-        ("inspect", str(folder)),
-        ("inspect", str(folder), "--json"),
-        ("inspect", str(folder)),
-        ("run", str(folder), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet"),
-    ), lambda data: shutil.rmtree(run, ignore_errors=True)
+def with_poses(read: Read, source: Path, *commands: tuple[str, ...]) -> Opened:
+    """A reader of the source, with commands and the poses stage, in a new run each time."""
+    run = source.parent / "run"
+    stage = ("run", str(source), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet")
+    return Opened(read, (*commands, stage), lambda data: shutil.rmtree(run, ignore_errors=True))
 
 
-def _opened(write: Callable[..., Path], name: str) -> Callable[[Path], Opened]:
+def open_file(write: Callable[..., Path], name: str) -> Callable[[Path], Opened]:
+    """A reader of one file of the data set that `write` writes."""
+
     def opened(folder: Path) -> Opened:
         source = folder / "source"
         write(source, captures.cameras(COUNT))
         path = source / name
-        commands, prepare = _commands(source)
 
         def read(data: bytes) -> None:
             path.write_bytes(data)
             read_source(source, data)
 
-        return Opened(read, commands, prepare)
+        inspect = ("inspect", str(source))
+        return with_poses(read, source, inspect, (*inspect, "--json"), inspect)
 
     return opened
 
 
-def _bytes_of(write: Callable[..., Path], name: str, **more: object) -> bytes:
+def _bytes_of(write: Callable[..., Path], name: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        return (write(Path(folder) / "source", captures.cameras(COUNT), **more) / name).read_bytes()
+        return (write(Path(folder) / "source", captures.cameras(COUNT)) / name).read_bytes()
 
 
 def _shorter(data: bytes) -> bytes:
@@ -78,8 +78,6 @@ def _shorter(data: bytes) -> bytes:
 
 def transforms_seeds() -> list[bytes]:
     """The dialects in one file each; images lie where nerfstudio's are."""
-    import json
-
     nerfstudio = json.loads(_bytes_of(captures.nerfstudio, "transforms.json"))
     ngp = json.loads(_bytes_of(captures.instant_ngp, "transforms.json")) | NGP
     blender = {"camera_angle_x": 0.76, "frames": captures.frames(captures.cameras(COUNT), "./images", "")}
@@ -103,15 +101,9 @@ def transforms_seeds() -> list[bytes]:
 def npy_seeds() -> list[bytes]:
     rows = captures.llff_rows(captures.cameras(COUNT))
     made = []
-    for array, options in (
-        (rows, {}),
-        (rows.astype(">f8"), {}),
-        (rows.astype(np.float32), {}),
-        (np.asfortranarray(rows), {}),
-        (rows.round().astype(np.int64), {}),
-    ):
+    for array in (rows, rows.astype(">f8"), rows.astype(np.float32), np.asfortranarray(rows), rows.round().astype(np.int64)):
         out = io.BytesIO()
-        np.save(out, array, **options)
+        np.save(out, array)
         made.append(out.getvalue())
     for version in ((2, 0), (3, 0)):
         out = io.BytesIO()
@@ -129,8 +121,6 @@ _NPY_WORDS = [b"'<f8'", b"'<f4'", b"'|O'", b"'<U9999999'", b"'<c16'", b"'<M8[s]'
 
 def npy_changed(rng: Random, data: bytes) -> bytes:
     """The header's values, numbers of the array, or bytes."""
-    import re
-
     head = 10 + int.from_bytes(data[8:10], "little") if data[:6] == b"\x93NUMPY" and len(data) > 10 else 0
     kind = rng.random()
     if kind < 0.35 and head:
@@ -146,24 +136,11 @@ def npy_changed(rng: Random, data: bytes) -> bytes:
     return binary.changed_bytes(rng, data, end=None if rng.random() < 0.5 else max(head, 16))
 
 
-_READERS = [
-    Reader("transforms", "transforms.json, three dialects", transforms_seeds, json_text.changed, _opened(captures.nerfstudio, "transforms.json"), every=EVERY),
-    Reader("poses_bounds", "poses_bounds.npy of LLFF", npy_seeds, npy_changed, _opened(captures.llff, "poses_bounds.npy"), every=EVERY),
-]
-for _suffix, _write, _changed in ((".bin", captures.colmap_bin, binary.changed_bytes), (".txt", captures.colmap_txt, lines.changed)):
-    for _part in ("cameras", "images", "points3D"):
-        _name = f"sparse/0/{_part}{_suffix}"
-        _READERS.append(
-            Reader(
-                f"colmap_{_part}_{_suffix[1:]}",
-                f"COLMAP's {_part}{_suffix}",
-                lambda write=_write, name=_name: [_shorter(_bytes_of(write, name))],  # type: ignore[misc]
-                _changed,
-                _opened(_write, _name),
-                every=EVERY,
-                share=1 / 3,
-            )
-        )
+def _reader(name: str, what: str, write: Callable[..., Path], file: str, changed: Callable[[Random, bytes], bytes], share: float) -> Reader:
+    """A reader of one file of the data set that `write` writes."""
+    return Reader(name, what, lambda: [_shorter(_bytes_of(write, file))], changed, open_file(write, file), every=EVERY, share=share)
+
+
 # Of exports of other programs the file that states the cameras.
 EXPORTED = {
     "polycam": ("polycam", "keyframes/corrected_cameras/img_2.json", "a camera of Polycam"),
@@ -188,16 +165,17 @@ def _exported(how: str) -> Callable[..., Path]:
     return lambda folder, made=None: exports.EXPORTS[how][1](folder)[0]
 
 
-for _reader, (_how, _name, _what) in EXPORTED.items():
-    _READERS.append(
-        Reader(
-            _reader,
-            _what,
-            lambda how=_how, name=_name: [_bytes_of(_exported(how), name)],  # type: ignore[misc]
-            _BY_SUFFIX.get(Path(_name).suffix, lines.changed),
-            _opened(_exported(_how), _name),
-            every=EVERY,
-            share=0.1,
-        )
-    )
-READERS = {reader.name: reader for reader in _READERS}
+TRANSFORMS = open_file(captures.nerfstudio, "transforms.json")
+READERS = (
+    Reader("transforms", "transforms.json, three dialects", transforms_seeds, json_text.changed, TRANSFORMS, every=EVERY),
+    Reader("poses_bounds", "poses_bounds.npy of LLFF", npy_seeds, npy_changed, open_file(captures.llff, "poses_bounds.npy"), every=EVERY),
+    *(
+        _reader(f"colmap_{part}_{kind}", f"COLMAP's {part}.{kind}", write, f"sparse/0/{part}.{kind}", changed, 1 / 3)
+        for kind, write, changed in (("bin", captures.colmap_bin, binary.changed_bytes), ("txt", captures.colmap_txt, lines.changed))
+        for part in ("cameras", "images", "points3D")
+    ),
+    *(
+        _reader(name, what, _exported(how), file, _BY_SUFFIX.get(Path(file).suffix, lines.changed), 0.1)
+        for name, (how, file, what) in EXPORTED.items()
+    ),
+)

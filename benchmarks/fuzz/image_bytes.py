@@ -1,5 +1,6 @@
 """Pictures in the formats that cameras and programs write, and mutations that know their structure: EXIF blocks, chunks, TIFF directories."""
 
+import importlib.util
 import io
 import struct
 import zlib
@@ -27,8 +28,8 @@ def exif_block(order: str = "<", orientation: int = 6) -> bytes:
     return exif.tobytes()
 
 
-def seeds(heif: bool) -> dict[str, bytes]:
-    """Small valid pictures of each kind, by a name that ends in the extension that it is given."""
+def seeds() -> list[bytes]:
+    """Small valid pictures of each kind; of HEIF where it can be written here."""
     from PIL import Image
 
     rng = np.random.default_rng(3)
@@ -46,23 +47,26 @@ def seeds(heif: bool) -> dict[str, bytes]:
         image.save(out, kind, **options)
         return out.getvalue()
 
-    made = {
-        "a.jpg": saved(rgb, "JPEG", exif=exif), "b.jpg": saved(grey, "JPEG", exif=other), "c.jpg": saved(rgb, "JPEG", progressive=True),
-        "d.jpg": saved(rgb.convert("CMYK"), "JPEG"), "a.png": saved(rgb, "PNG", exif=exif), "b.png": saved(rgba, "PNG"), "c.png": saved(deep, "PNG"),
-        "d.png": saved(rgb.quantize(16), "PNG", transparency=3), "e.png": saved(grey.convert("1"), "PNG"), "f.png": saved(rgb, "PNG", exif=other),
-        "g.png": saved(rgba.convert("LA"), "PNG"), "a.tif": saved(rgb, "TIFF", exif=exif), "b.tif": saved(real, "TIFF"), "c.tif": saved(deep, "TIFF"),
-        "d.tif": saved(whole, "TIFF"), "e.tif": saved(rgb, "TIFF", compression="tiff_lzw"), "f.tif": saved(rgba, "TIFF", compression="tiff_adobe_deflate"),
-        "g.tif": saved(rgb, "TIFF", compression="jpeg"), "h.tif": saved(grey.convert("1"), "TIFF", compression="group4"),
-        "a.webp": saved(rgb, "WEBP", exif=exif), "b.webp": saved(rgba, "WEBP", lossless=True), "a.bmp": saved(rgb, "BMP"),
-        # other formats under the name of a known one
-        "gif.png": saved(rgb.quantize(8), "GIF"), "ppm.png": saved(rgb, "PPM"), "tga.jpg": saved(rgb, "TGA"), "ico.png": saved(rgba, "ICO"),
-        "pdf.jpg": saved(rgb, "PDF"), "eps.png": saved(rgb, "EPS"), "jp2.png": saved(rgb, "JPEG2000"), "dds.png": saved(rgba, "DDS"),
-        "sgi.png": saved(rgb, "SGI"), "pcx.tif": saved(rgb, "PCX"),
-        "gif2.webp": saved(grey, "GIF", save_all=True, append_images=[grey]), "tiff.jpg": saved(rgb, "TIFF"),
-        "png.jpg": saved(rgb, "PNG"),
-    }  # fmt: skip
-    if heif:
-        made |= {"a.heic": saved(rgb, "HEIF", exif=exif), "b.heic": saved(rgba, "HEIF"), "heif.png": saved(rgb, "HEIF")}
+    made = [
+        saved(rgb, "JPEG", exif=exif), saved(grey, "JPEG", exif=other), saved(rgb, "JPEG", progressive=True),
+        saved(rgb.convert("CMYK"), "JPEG"), saved(rgb, "PNG", exif=exif), saved(rgba, "PNG"), saved(deep, "PNG"),
+        saved(rgb.quantize(16), "PNG", transparency=3), saved(grey.convert("1"), "PNG"), saved(rgb, "PNG", exif=other),
+        saved(rgba.convert("LA"), "PNG"), saved(rgb, "TIFF", exif=exif), saved(real, "TIFF"), saved(deep, "TIFF"),
+        saved(whole, "TIFF"), saved(rgb, "TIFF", compression="tiff_lzw"), saved(rgba, "TIFF", compression="tiff_adobe_deflate"),
+        saved(rgb, "TIFF", compression="jpeg"), saved(grey.convert("1"), "TIFF", compression="group4"),
+        saved(rgb, "WEBP", exif=exif), saved(rgba, "WEBP", lossless=True), saved(rgb, "BMP"),
+        # other formats, under the name of a PNG
+        saved(rgb.quantize(8), "GIF"), saved(rgb, "PPM"), saved(rgb, "TGA"), saved(rgba, "ICO"),
+        saved(rgb, "PDF"), saved(rgb, "EPS"), saved(rgb, "JPEG2000"), saved(rgba, "DDS"),
+        saved(rgb, "SGI"), saved(rgb, "PCX"),
+        saved(grey, "GIF", save_all=True, append_images=[grey]), saved(rgb, "TIFF"),
+        saved(rgb, "PNG"),
+    ]  # fmt: skip
+    if importlib.util.find_spec("pillow_heif") is not None:
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
+        made += [saved(rgb, "HEIF", exif=exif), saved(rgba, "HEIF"), saved(rgb, "HEIF")]
     return made
 
 

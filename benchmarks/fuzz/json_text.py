@@ -5,12 +5,11 @@ import re
 from random import Random
 from typing import Any
 
-from benchmarks.fuzz.binary import changed_bytes
+from benchmarks.fuzz.binary import LARGEST, changed_bytes
 from benchmarks.fuzz.values import MARK, RAW, TEXTS, hostile, unlike
 
 _MARKED = re.compile(f'"{MARK}(\\d+)@@"')
 _TOKENS = b'0123456789-.eE+[]{},:"\\ \n\tntf'
-_LARGEST = 1 << 20  # bytes of an input
 
 
 def parsed(data: bytes) -> Any:
@@ -24,7 +23,7 @@ def parsed(data: bytes) -> Any:
 def written(document: Any) -> bytes:
     """The text of a document, marks replaced by what they stand for; lone surrogates as bytes that are no UTF-8 at times."""
     text = _MARKED.sub(lambda found: RAW[int(found[1]) % len(RAW)], json.dumps(document))
-    return text.encode("utf-8", "surrogatepass")[:_LARGEST]
+    return text.encode("utf-8", "surrogatepass")[:LARGEST]
 
 
 def changed(rng: Random, data: bytes) -> bytes:

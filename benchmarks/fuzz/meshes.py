@@ -5,14 +5,13 @@ import hashlib
 import json
 import re
 import struct
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
 from benchmarks.fuzz import json_text, lines
 from benchmarks.fuzz.binary import changed_bytes
-from benchmarks.fuzz.reader import Opened, Reader
+from benchmarks.fuzz.reader import Opened, Reader, bytes_of
 from benchmarks.fuzz.runs import run_in
 
 PAGE = "report.html"
@@ -51,15 +50,11 @@ def seeds(suffix: str) -> Callable[[], list[bytes]]:
         from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
         from tests.stages.io.meshes import Y_DOWN, block
 
-        mesh, found = block(), []
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"a{suffix}"
-            if suffix in MESH_EXPORTERS:
-                MESH_EXPORTERS[suffix](mesh, path, Y_DOWN)
-                found.append(path.read_bytes())
-            if suffix in POINT_EXPORTERS:
-                POINT_EXPORTERS[suffix](PointCloud(mesh.vertices, mesh.normals, mesh.colours), path, Y_DOWN)
-                found.append(path.read_bytes())
+        mesh, found, name = block(), [], f"a{suffix}"
+        if suffix in MESH_EXPORTERS:
+            found.append(bytes_of(lambda path: MESH_EXPORTERS[suffix](mesh, path, Y_DOWN), name))
+        if suffix in POINT_EXPORTERS:
+            found.append(bytes_of(lambda path: POINT_EXPORTERS[suffix](PointCloud(mesh.vertices, mesh.normals, mesh.colours), path, Y_DOWN), name))
         others = {".ply": [POLYGONS], ".stl": [SOLID], ".obj": [BLOCKS], ".glb": [placed(found[0])] if suffix == ".glb" else []}
         return [*found, *others.get(suffix, [])]
 
@@ -120,7 +115,9 @@ def stl_changed(rng: Random, data: bytes) -> bytes:
     return found if count < 0 or rng.random() < 0.4 else found[:80] + count.to_bytes(4, "little") + found[84 : 84 + 50 * count]
 
 
-def open_mesh(suffix: str) -> Callable[[Path], Opened]:
+def open_described(suffix: str) -> Callable[[Path], Opened]:
+    """A file that `inspect` describes."""
+
     def opened(folder: Path) -> Opened:
         from workflows.inspection.describe import describe
 
@@ -132,7 +129,7 @@ def open_mesh(suffix: str) -> Callable[[Path], Opened]:
             json.dumps(found, allow_nan=False)
             assert 0 < found.get("vertices", 1) <= len(data), "more vertices than bytes"
 
-        return Opened(read, (("inspect", str(path)), ("inspect", str(path), "--json")), lambda data: path.write_bytes(data) and None)
+        return Opened(read, (("inspect", str(path)), ("inspect", str(path), "--json")))
 
     return opened
 
@@ -140,9 +137,7 @@ def open_mesh(suffix: str) -> Callable[[Path], Opened]:
 def page_seeds() -> list[bytes]:
     from workflows.report.signature import write_page
 
-    with tempfile.TemporaryDirectory() as folder:
-        write_page(Path(folder) / PAGE, b"<!doctype html>\n<title>a run</title>\n<p>24 dB</p>\n")
-        return [(Path(folder) / PAGE).read_bytes()]
+    return [bytes_of(lambda path: write_page(path, b"<!doctype html>\n<title>a run</title>\n<p>24 dB</p>\n"), PAGE)]
 
 
 def page_changed(rng: Random, data: bytes) -> bytes:
@@ -168,17 +163,14 @@ def open_page(folder: Path) -> Opened:
         if not is_as_written(path):
             raise CorruptArtifact(f"{path}: altered", (PAGE,))
 
-    return Opened(read, (("verify", str(run)), ("report", str(run)), ("status", str(run))), lambda data: path.write_bytes(data) and None)
+    return Opened(read, (("verify", str(run)), ("report", str(run)), ("status", str(run))))
 
 
-READERS = {
-    reader.name: reader
-    for reader in (
-        Reader("glb", "GLB of meshes", seeds(".glb"), glb_changed, open_mesh(".glb")),
-        Reader("ply", "PLY of meshes and points", seeds(".ply"), ply_changed, open_mesh(".ply")),
-        Reader("obj", "OBJ", seeds(".obj"), lines.changed, open_mesh(".obj"), share=0.5),
-        Reader("stl", "STL", seeds(".stl"), stl_changed, open_mesh(".stl"), share=0.25),
-        Reader("xyz", "XYZ", seeds(".xyz"), lines.changed, open_mesh(".xyz"), share=0.25),
-        Reader("page", "pages of a run", page_seeds, page_changed, open_page, share=0.25),
-    )
-}
+READERS = (
+    Reader("glb", "GLB of meshes", seeds(".glb"), glb_changed, open_described(".glb")),
+    Reader("ply", "PLY of meshes and points", seeds(".ply"), ply_changed, open_described(".ply")),
+    Reader("obj", "OBJ", seeds(".obj"), lines.changed, open_described(".obj"), share=0.5),
+    Reader("stl", "STL", seeds(".stl"), stl_changed, open_described(".stl"), share=0.25),
+    Reader("xyz", "XYZ", seeds(".xyz"), lines.changed, open_described(".xyz"), share=0.25),
+    Reader("page", "pages of a run", page_seeds, page_changed, open_page, share=0.25),
+)

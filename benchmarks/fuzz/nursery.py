@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.fuzz import worker
-from benchmarks.fuzz.reader import ROOT, commanded, judged, quiet
+from benchmarks.fuzz.reader import commanded, judged, quiet
+from benchmarks.project import ROOT
 
 MEMORY = "/dev/shm"  # files there are written ten times as fast as on a disk
 STUCK = 180.0  # seconds without a new input after which a worker is ended: it does not answer to signals

@@ -1,32 +1,17 @@
 """Readers of photographs and masks."""
 
 import json
-import shutil
 from pathlib import Path
-from random import Random
 
 import numpy as np
 
 from benchmarks.fuzz import image_bytes
+from benchmarks.fuzz.datasets import COUNT, open_file, with_poses
 from benchmarks.fuzz.reader import Opened, Reader
 from tests.stages import captures
 
 # The name that an input is given, by its first bytes: formats that hide under another extension are among the seeds.
 _BY_HEAD = {b"\x89PNG": ".png", b"\xff\xd8": ".jpg", b"II*\0": ".tif", b"MM\0*": ".tif", b"RIFF": ".webp", b"BM": ".bmp", b"\0\0\0": ".heic"}
-
-
-def reads_heif() -> bool:
-    """Whether HEIF can be written here, for the seeds."""
-    try:
-        import pillow_heif
-    except ImportError:
-        return False
-    pillow_heif.register_heif_opener()
-    return True
-
-
-def seeds() -> list[bytes]:
-    return list(image_bytes.seeds(reads_heif()).values())
 
 
 def _suffix(data: bytes) -> str:
@@ -61,29 +46,13 @@ def opened(folder: Path) -> Opened:
     return Opened(read, (("inspect", str(source)), ("inspect", str(source), "--json")))
 
 
-def open_posed(folder: Path) -> Opened:
-    """A posed data set of which one image is the input, read by its importer; the poses stage on it through the command line."""
-    source, run = folder / "source", folder / "run"
-    captures.nerfstudio(source, captures.cameras(4))
-    path = source / "images" / "img_0.png"
-
-    def read(data: bytes) -> None:
-        from benchmarks.fuzz.datasets import read_source
-
-        path.write_bytes(data)
-        read_source(source, data)
-
-    command = ("run", str(source), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet")
-    return Opened(read, (command,), lambda data: shutil.rmtree(run, ignore_errors=True))
-
-
 def open_mask(folder: Path) -> Opened:
     """Both ways in which masks are read: for structure from motion and for the working images."""
     from stages.io import photo, working_images
     from stages.io.capture import Photo
     from stages.io.pictures import UnreadableImage
 
-    source, run = folder / "source", folder / "run"
+    source = folder / "source"
     captures.nerfstudio(source, captures.cameras(COUNT))
     document = json.loads((source / "transforms.json").read_text())
     document["frames"][0]["mask_path"] = "mask.png"
@@ -103,11 +72,7 @@ def open_mask(folder: Path) -> Opened:
         if refused is not None:
             raise refused
 
-    command = ("run", str(source), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet")
-    return Opened(read, (command,), lambda data: shutil.rmtree(run, ignore_errors=True))
-
-
-COUNT = 4
+    return with_poses(read, source)
 
 
 def mask_seeds() -> list[bytes]:
@@ -135,26 +100,27 @@ def mask_seeds() -> list[bytes]:
         base = Image.fromarray(pixels)
         (Image.fromarray(pixels.astype(np.uint16) * 257) if mode == "I;16" else base.convert(mode)).save(out, kind)
         made.append(out.getvalue())
-    return [*made, *seeds()[:3]]  # the last three of another size
+    return [*made, *image_bytes.seeds()[:3]]  # the last three of another size
 
 
-def changed(rng: Random, data: bytes) -> bytes:
-    return image_bytes.changed(rng, data)
-
-
-READERS = {
-    reader.name: reader
-    for reader in (
-        Reader(
-            "images",
-            "photographs with EXIF: JPEG, PNG, TIFF, WEBP, BMP, HEIF, others under a wrong name",
-            seeds,
-            changed,
-            opened,
-            ("UnreadableImage",),
-            every=200,
-        ),
-        Reader("posed_images", "an image of a posed data set", seeds, changed, open_posed, every=400, share=0.2),
-        Reader("masks", "masks of photographs", mask_seeds, changed, open_mask, ("UnreadableImage", "PipelineError"), every=200),
-    )
-}
+READERS = (
+    Reader(
+        "images",
+        "photographs with EXIF: JPEG, PNG, TIFF, WEBP, BMP, HEIF, others under a wrong name",
+        image_bytes.seeds,
+        image_bytes.changed,
+        opened,
+        ("UnreadableImage",),
+        every=200,
+    ),
+    Reader(
+        "posed_images",
+        "an image of a posed data set",
+        image_bytes.seeds,
+        image_bytes.changed,
+        open_file(captures.nerfstudio, "images/img_0.png"),
+        every=100,
+        share=0.2,
+    ),
+    Reader("masks", "masks of photographs", mask_seeds, image_bytes.changed, open_mask, ("UnreadableImage", "PipelineError"), every=200),
+)

@@ -12,6 +12,7 @@ import os
 import re
 import signal
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -19,12 +20,13 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
+from benchmarks.project import PACKAGES, ROOT
+
 LIMIT = 5.0  # seconds of processor time for an input
 WAITING = 60.0  # seconds for one that waits, as for a pipe that nobody writes to; other programs may keep the machine busy for some
 LONGEST = 1500  # characters of a message
 CODES = {0, 2, 3, 4, 5, 6}  # that a file may lead to; 130 and 143 are signals'
-OURS = tuple(str(ROOT / package) + os.sep for package in ("pipeline", "stages", "efficientnerf", "workflows"))
+OURS = tuple(str(ROOT / package) + os.sep for package in PACKAGES)
 
 Read = Callable[[bytes], None]
 
@@ -63,6 +65,13 @@ class Reader:
     refusals: tuple[str, ...] = ("PipelineError",)
     every: int = 50
     share: float = 1.0
+
+
+def bytes_of(write: Callable[[Path], object], name: str = "file") -> bytes:
+    """What a function writes to a new file."""
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
 
 
 class Hang(BaseException):

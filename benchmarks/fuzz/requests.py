@@ -128,11 +128,8 @@ def open_path(folder: Path) -> Opened:
     return Opened(read, (command,), lambda data: shutil.rmtree(out, ignore_errors=True))
 
 
-READERS = {
-    reader.name: reader
-    for reader in (
-        Reader("config", "TOML configurations", lambda: [CONFIG], toml_text.changed, open_config),
-        Reader("options", "--set and --budget", lambda: OPTIONS, lines.changed, open_options, share=0.25),
-        Reader("camera_path", "camera paths", path_seeds, json_text.changed, open_path, every=100),
-    )
-}
+READERS = (
+    Reader("config", "TOML configurations", lambda: [CONFIG], toml_text.changed, open_config),
+    Reader("options", "--set and --budget", lambda: OPTIONS, lines.changed, open_options, share=0.25),
+    Reader("camera_path", "camera paths", path_seeds, json_text.changed, open_path, every=100),
+)

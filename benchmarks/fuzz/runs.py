@@ -14,7 +14,8 @@ from random import Random
 from typing import Any
 
 from benchmarks.fuzz import json_text, safetensors_bytes
-from benchmarks.fuzz.reader import ROOT, Opened, Reader
+from benchmarks.fuzz.reader import Opened, Reader
+from benchmarks.project import ROOT
 from tests.stages import captures
 
 REPORTS = {
@@ -87,14 +88,6 @@ def _open_run(run: Path) -> None:
     from workflows.cli.target import open_run
 
     open_run(run).plain()
-
-
-def _status(run: Path) -> None:
-    from pipeline.decide import survey
-    from workflows.asset import STAGES
-    from workflows.cli.target import open_run
-
-    survey(STAGES, open_run(run))
 
 
 def _manifest(run: Path) -> None:
@@ -232,19 +225,16 @@ def _reports(name: str) -> Reader:
 
 
 _STATUS = (("status", "RUN"), ("status", "RUN", "--json"))
-READERS = {
-    reader.name: reader
-    for reader in (
-        Reader("run", "run.json", seed_of("run.json"), json_text.changed,
-               opened("run.json", _open_run, *_STATUS, ("run", "--out", "RUN", "--dry-run"), ("report", "RUN"), ("inspect", "RUN"))),
-        Reader("manifest", "manifest.json of an artifact", seed_of("poses/manifest.json"), manifest_changed,
-               opened("poses/manifest.json", _manifest, *_STATUS, ("verify", "RUN"), ("report", "RUN"), ("inspect", "RUN"))),
-        Reader("lock", ".lock.json, who writes a run", lock_seeds, json_text.changed, opened(".lock.json", _lock, *_STATUS)),
-        Reader("hashes", ".cache/hashes.json", hashes_seeds, json_text.changed, opened(".cache/hashes.json", _hashes, *_STATUS)),
-        Reader("scene", "scene.json, the cameras of a run", scene_seeds, json_text.changed,
-               opened("poses/scene.json", _scene, ("inspect", "RUN"), ("inspect", "RUN", "--json"), ("export", "RUN", "--to", "OUT.json"), *_STATUS)),
-        Reader("points", "points.safetensors of a run", seed_of("poses/points.safetensors"), safetensors_bytes.changed,
-               opened("poses/points.safetensors", _points, ("inspect", "RUN")), share=0.25),
-        *(_reports(name) for name in REPORTS),
-    )
-}  # fmt: skip
+READERS = (
+    Reader("run", "run.json", seed_of("run.json"), json_text.changed,
+           opened("run.json", _open_run, *_STATUS, ("run", "--out", "RUN", "--dry-run"), ("report", "RUN"), ("inspect", "RUN"))),
+    Reader("manifest", "manifest.json of an artifact", seed_of("poses/manifest.json"), manifest_changed,
+           opened("poses/manifest.json", _manifest, *_STATUS, ("verify", "RUN"), ("report", "RUN"), ("inspect", "RUN"))),
+    Reader("lock", ".lock.json, who writes a run", lock_seeds, json_text.changed, opened(".lock.json", _lock, *_STATUS)),
+    Reader("hashes", ".cache/hashes.json", hashes_seeds, json_text.changed, opened(".cache/hashes.json", _hashes, *_STATUS)),
+    Reader("scene", "scene.json, the cameras of a run", scene_seeds, json_text.changed,
+           opened("poses/scene.json", _scene, ("inspect", "RUN"), ("inspect", "RUN", "--json"), ("export", "RUN", "--to", "OUT.json"), *_STATUS)),
+    Reader("points", "points.safetensors of a run", seed_of("poses/points.safetensors"), safetensors_bytes.changed,
+           opened("poses/points.safetensors", _points, ("inspect", "RUN")), share=0.25),
+    *(_reports(name) for name in REPORTS),
+)  # fmt: skip

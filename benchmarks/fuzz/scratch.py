@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fuzz import datasets, json_text, lines, safetensors_bytes
-from benchmarks.fuzz.reader import Opened, Reader
+from benchmarks.fuzz.reader import Opened, Reader, bytes_of
 
 QUICK = {"iterations": 13, "sample_batch_size": 256, "log2_hashmap_size": 8, "occupancy_resolution": 4}
 
@@ -48,10 +48,7 @@ def checkpoint_seeds() -> list[bytes]:
     from stages.io.field_file import write_tensors
 
     t = dataclasses.replace(_trainer(), step=STEP)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "checkpoint.safetensors"
-        write_tensors(state_of(t), {"step": STEP, "seconds": 1.5}, path)
-        return [path.read_bytes()]
+    return [bytes_of(lambda path: write_tensors(state_of(t), {"step": STEP, "seconds": 1.5}, path))]
 
 
 def field_changed(rng: Random, data: bytes) -> bytes:
@@ -114,10 +111,7 @@ def field_seeds() -> list[bytes]:
 
     t = _trainer()
     exposure = Exposure(torch.zeros(2, 3), torch.zeros(1, 4), torch.zeros(2, dtype=torch.int64))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "field.safetensors"
-        save_model(t.model, 1.0, 5.0, path, (["images/a.png", "images/b.png"], exposure), t.schedule)
-        return [path.read_bytes()]
+    return [bytes_of(lambda path: save_model(t.model, 1.0, 5.0, path, (["images/a.png", "images/b.png"], exposure), t.schedule))]
 
 
 def open_field(folder: Path) -> Opened:
@@ -204,19 +198,16 @@ def open_blocks(folder: Path) -> Opened:
 
 
 def note_seeds() -> list[bytes]:
-    made = []
-    with tempfile.TemporaryDirectory() as folder:
-        _write_note(Path(folder))
-        made.append((Path(folder) / "view_00000.json").read_bytes())
-    return made
+    return [bytes_of(_write_note)]
 
 
-def _write_note(folder: Path) -> None:
+def _write_note(path: Path) -> None:
     from stages.scratch import note
 
-    for name in ("a.png", "b.png"):
-        (folder / name).write_bytes(b"pixels")
-    note(folder / "view_00000.json", {"name": "a", "asset": {"psnr": 20.5, "width": 4, "ssim": None}}, [folder / "a.png", folder / "b.png"])
+    files = [path.with_name(name) for name in ("a.png", "b.png")]
+    for file in files:
+        file.write_bytes(b"pixels")
+    note(path, {"name": "a", "asset": {"psnr": 20.5, "width": 4, "ssim": None}}, files)
 
 
 def note_changed(rng: Random, data: bytes) -> bytes:
@@ -235,11 +226,12 @@ def open_note(folder: Path) -> Opened:
     """What a stage noted of a piece that is done."""
     from stages.scratch import noted
 
-    _write_note(folder)
+    path = folder / "view_00000.json"
+    _write_note(path)
 
     def read(data: bytes) -> None:
-        (folder / "view_00000.json").write_bytes(data)
-        value = noted(folder / "view_00000.json", dict[str, str | dict[str, int | float | None] | None], lambda text: text.encode())
+        path.write_bytes(data)
+        value = noted(path, dict[str, str | dict[str, int | float | None] | None], lambda text: text.encode())
         assert value is None or isinstance(value, dict), "a value of another type"
 
     return Opened(read)
@@ -299,15 +291,12 @@ def open_refinement(folder: Path) -> Opened:
     return Opened(read)
 
 
-READERS = {
-    reader.name: reader
-    for reader in (
-        Reader("checkpoint", "checkpoints of a training run", checkpoint_seeds, field_changed, open_checkpoint),
-        Reader("field", "field.safetensors, the trained field", field_seeds, field_changed, open_field, share=0.25),
-        Reader("log", "log.jsonl of a training run", log_seeds, log_changed, open_log, share=0.25),
-        Reader("schedule", "schedule.json of a time budget", schedule_seeds, json_text.changed, open_schedule, share=0.25),
-        Reader("blocks", "arrays that a bake goes on from", datasets.npy_seeds, datasets.npy_changed, open_blocks, share=0.25),
-        Reader("note", "notes of what a stage has done", note_seeds, note_changed, open_note, share=0.25),
-        Reader("refinement", "checkpoints of a bake's refinement", refinement_seeds, refinement_changed, open_refinement, share=0.25),
-    )
-}
+READERS = (
+    Reader("checkpoint", "checkpoints of a training run", checkpoint_seeds, field_changed, open_checkpoint),
+    Reader("field", "field.safetensors, the trained field", field_seeds, field_changed, open_field, share=0.25),
+    Reader("log", "log.jsonl of a training run", log_seeds, log_changed, open_log, share=0.25),
+    Reader("schedule", "schedule.json of a time budget", schedule_seeds, json_text.changed, open_schedule, share=0.25),
+    Reader("blocks", "arrays that a bake goes on from", datasets.npy_seeds, datasets.npy_changed, open_blocks, share=0.25),
+    Reader("note", "notes of what a stage has done", note_seeds, note_changed, open_note, share=0.25),
+    Reader("refinement", "checkpoints of a bake's refinement", refinement_seeds, refinement_changed, open_refinement, share=0.25),
+)

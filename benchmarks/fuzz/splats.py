@@ -1,19 +1,16 @@
 """3D Gaussians that `inspect` describes: SPZ, SOG, and the PLY of 3DGS."""
 
 import io
-import json
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 from random import Random
 
 from benchmarks.fuzz import json_text
 from benchmarks.fuzz.binary import changed_bytes
-from benchmarks.fuzz.meshes import glb_changed, ply_changed
-from benchmarks.fuzz.reader import Opened, Reader
+from benchmarks.fuzz.meshes import glb_changed, open_described, ply_changed
+from benchmarks.fuzz.reader import Reader, bytes_of
 
 HEADER = 16  # bytes of SPZ: magic, version, number, degree, bits, flags, 0
 
@@ -24,13 +21,8 @@ def seeds(suffix: str) -> Callable[[], list[bytes]]:
         from stages.formats.exporters.writing import CAPTURE_IS_Z_UP
         from tests.stages.formats.gaussians import scattered
 
-        found = []
-        with tempfile.TemporaryDirectory() as folder:
-            for degree in (0, 1, 3):
-                path = Path(folder) / f"a{suffix}"
-                SPLAT_EXPORTERS[suffix](scattered(40, degree), path, CAPTURE_IS_Z_UP)
-                found.append(path.read_bytes())
-        return found
+        write = SPLAT_EXPORTERS[suffix]
+        return [bytes_of(lambda path, n=degree: write(scattered(40, n), path, CAPTURE_IS_Z_UP), f"a{suffix}") for degree in (0, 1, 3)]  # type: ignore[misc]
 
     return made
 
@@ -77,27 +69,9 @@ def sog_changed(rng: Random, data: bytes) -> bytes:
     return out.getvalue()
 
 
-def open_splats(suffix: str) -> Callable[[Path], Opened]:
-    def opened(folder: Path) -> Opened:
-        from workflows.inspection.describe import describe
-
-        path = folder / f"a{suffix}"
-
-        def read(data: bytes) -> None:
-            path.write_bytes(data)
-            json.dumps(describe(path), allow_nan=False)
-
-        return Opened(read, (("inspect", str(path)), ("inspect", str(path), "--json")), lambda data: path.write_bytes(data) and None)
-
-    return opened
-
-
-READERS = {
-    reader.name: reader
-    for reader in (
-        Reader("spz", "SPZ of 3D Gaussians", seeds(".spz"), spz_changed, open_splats(".spz")),
-        Reader("sog", "SOG of 3D Gaussians", seeds(".sog"), sog_changed, open_splats(".sog")),
-        Reader("splats_ply", "PLY of 3D Gaussians", seeds(".ply"), ply_changed, open_splats(".ply"), share=0.25),
-        Reader("splats_glb", "GLB of 3D Gaussians", seeds(".glb"), glb_changed, open_splats(".glb"), share=0.25),
-    )
-}
+READERS = (
+    Reader("spz", "SPZ of 3D Gaussians", seeds(".spz"), spz_changed, open_described(".spz")),
+    Reader("sog", "SOG of 3D Gaussians", seeds(".sog"), sog_changed, open_described(".sog")),
+    Reader("splats_ply", "PLY of 3D Gaussians", seeds(".ply"), ply_changed, open_described(".ply"), share=0.25),
+    Reader("splats_glb", "GLB of 3D Gaussians", seeds(".glb"), glb_changed, open_described(".glb"), share=0.25),
+)

@@ -4,4 +4,4 @@ from benchmarks.fuzz import assets, datasets, meshes, pictures, requests, runs, 
 from benchmarks.fuzz.reader import Reader
 
 MODULES = (assets, datasets, meshes, pictures, requests, runs, scratch, splats)
-READERS: dict[str, Reader] = {name: reader for module in MODULES for name, reader in module.READERS.items()}
+READERS: dict[str, Reader] = {reader.name: reader for module in MODULES for reader in module.READERS}

@@ -78,19 +78,7 @@ class Tally:
             self._keep(found, data, arguments)
 
     def _keep(self, found: Outcome, data: bytes, command: tuple[str, ...] | None) -> None:
-        known = self.findings.setdefault(
-            found.key,
-            {
-                "by": found.by,
-                "place": found.place,
-                "text": found.text,
-                "trace": found.trace,
-                "count": 0,
-                "index": self.index,
-                "command": command,
-                "data": data.hex(),
-            },
-        )
+        known = self.findings.setdefault(found.key, {**vars(found), "count": 0, "command": command, "data": data.hex()})
         known["count"] += 1
         if len(data) * 2 < len(known["data"]):
             known["data"] = data.hex()

@@ -22,34 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.minutes import RESULTS, read_rows, same_row, with_row, write_rows
-from benchmarks.quality_over_minutes import DATA, PEERS, source_of
+from benchmarks.minutes import read_rows, same_row, with_row, write_rows
+from benchmarks.project import DATA, RESULTS
+from benchmarks.quality_over_minutes import PEERS, source_of
+from benchmarks.scenes.__main__ import as_blender
 
 SCRIPTS = {"nerfacto": Path(__file__).with_name("nerfacto.py")}
-
-
-def as_blender(source: Path, folder: Path) -> Path:
-    """The data set with a transforms file for each split, as Blender's data sets have them; one that is so already is returned as it is.
-
-    Raises SystemExit for images without alpha and for cameras that this form cannot hold.
-    """
-    if (source / "transforms_test.json").exists():
-        return source
-    document = json.loads((source / "transforms.json").read_text(encoding="utf-8"))
-    if document["fl_x"] != document["fl_y"] or (document["cx"], document["cy"]) != (document["w"] / 2, document["h"] / 2):
-        raise SystemExit(f"{source}: its cameras are not those of a Blender data set: square pixels, centred")
-    frames = {frame["file_path"]: frame["transform_matrix"] for frame in document["frames"]}
-    folder.mkdir(parents=True, exist_ok=True)
-    for split in ("train", "test"):
-        angle = 2 * math.atan(document["w"] / 2 / document["fl_x"])
-        listed = [{"file_path": f"./{name.removesuffix('.png')}", "transform_matrix": frames[name]} for name in document[f"{split}_filenames"]]
-        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": listed}), encoding="utf-8")
-        for name in document[f"{split}_filenames"]:
-            (folder / name).parent.mkdir(exist_ok=True)
-            shutil.copyfile(source / name, folder / name)
-            if _pixels(folder / name).shape[2] != 4:
-                raise SystemExit(f"{source / name}: no alpha; what is behind it cannot be made white")
-    return folder
 
 
 def _pixels(path: Path) -> np.ndarray:

@@ -14,7 +14,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.minutes import OURS, RESULTS, code_version, read_rows, with_row, write_rows
+from benchmarks.minutes import OURS, read_rows, with_row, write_rows
+from benchmarks.project import ENERF, RESULTS, code_version
 from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.rendering import render
@@ -105,7 +105,7 @@ def ours(run: Path, source: Path, out: Path, minutes: float) -> dict[str, Any]:
     shutil.copytree(run / "poses", out / "poses")
     shutil.copyfile(run / "run.json", out / "run.json")
     with open(out / "log.txt", "w", encoding="utf-8") as log:
-        command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(out), "--budget", f"{minutes:g}m"]
+        command = [*ENERF, "run", str(source), "--out", str(out), "--budget", f"{minutes:g}m"]
         subprocess.run([*command, "--until", "evaluate"], stdout=log, stderr=subprocess.STDOUT, check=True)
     report = read_json(EvaluateOutputs.of_run(out).metrics)
     return {"asset": report["asset"]["psnr"], "psnr": report["splats"]["psnr"], "ssim": report["splats"]["ssim"], "views": len(report["views"])}

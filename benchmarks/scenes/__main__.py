@@ -12,7 +12,9 @@ FOLDER/drawn_000 and so on are scenes that seeds draw (`benchmarks.scenes.drawn`
 
 import argparse
 import json
+import math
 import os
+import shutil
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -78,6 +80,32 @@ def write_scene(recipe: Recipe, folder: Path, counts: dict[str, int], size: int,
         "frames": [{"file_path": camera.name, "transform_matrix": opengl_from_pose(camera.world_from_camera).tolist()} for camera in every],
     }  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def as_blender(source: Path, folder: Path) -> Path:
+    """The data set with a transforms file for each split, as Blender's data sets have them; one that is so already is returned as it is.
+
+    Raises SystemExit for images without alpha and for cameras that this form cannot hold.
+    """
+    import cv2
+
+    if (source / "transforms_test.json").exists():
+        return source
+    document = json.loads((source / "transforms.json").read_text(encoding="utf-8"))
+    if document["fl_x"] != document["fl_y"] or (document["cx"], document["cy"]) != (document["w"] / 2, document["h"] / 2):
+        raise SystemExit(f"{source}: its cameras are not those of a Blender data set: square pixels, centred")
+    frames = {frame["file_path"]: frame["transform_matrix"] for frame in document["frames"]}
+    folder.mkdir(parents=True, exist_ok=True)
+    for split in ("train", "test"):
+        angle = 2 * math.atan(document["w"] / 2 / document["fl_x"])
+        listed = [{"file_path": f"./{name.removesuffix('.png')}", "transform_matrix": frames[name]} for name in document[f"{split}_filenames"]]
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": listed}), encoding="utf-8")
+        for name in document[f"{split}_filenames"]:
+            (folder / name).parent.mkdir(exist_ok=True)
+            shutil.copyfile(source / name, folder / name)
+            if cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED).shape[2] != 4:
+                raise SystemExit(f"{source / name}: no alpha; what is behind it cannot be made white")
+    return folder
 
 
 def write_drawn(folder: Path, seed: int, counts: dict[str, int], size: int) -> None:

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.scenes.catalogue import BLUE, DARK, GREEN, RED, STONE, WOOD, look_at
+from benchmarks.scenes.catalogue import look_at
 from benchmarks.scenes.rendering import image, nearest
-from benchmarks.scenes.shapes import Box, Capsule, Ground, Material, Shape, Sphere
+from benchmarks.scenes.shapes import BLUE, DARK, GREEN, RED, STONE, WOOD, Box, Capsule, Ground, Material, Shape, Sphere, point
 from benchmarks.scenes.thin import plant
 from efficientnerf.geometry.cameras import Camera, project, rays
 
@@ -96,7 +96,7 @@ def _gamepad() -> MadeCapture:
 def _headphones() -> MadeCapture:
     plain = Material(BLACK, specular=(0.2, 20.0))
     bow = [np.array([0.09 * np.cos(a), 0.09 * np.sin(a), 0.03]) for a in np.linspace(0, np.pi, 9)]
-    band = [Capsule(_three(a), _three(b), 0.012, plain) for a, b in pairwise(bow)]
+    band = [Capsule(point(*a), point(*b), 0.012, plain) for a, b in pairwise(bow)]
     cups = [Capsule((x, -0.01, 0.035), (x, -0.03, 0.035), 0.034, plain) for x in (-0.09, 0.09)]
     return MadeCapture((*band, *cups), (table(Material(WOOD)), *room(5.0)), tuple(ring(26, 0.6, 0.35)))
 
@@ -213,11 +213,6 @@ def captures() -> dict[str, MadeCapture]:
         "gamepad": _gamepad(), "headphones": _headphones(), "bare_table": _bare_table(), "mirror": _mirror(), "far_room": _far_room(), "arc": _arc(),
         "strays": _strays(), "drone": _drone(), "two_scales": _two_scales(), "corridor": _corridor(), "before_black": _before_black(), "sill": _sill(),
     }  # fmt: skip
-
-
-def _three(point: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = point.tolist()
-    return x, y, z
 
 
 def cameras(capture: MadeCapture, width: int) -> list[Camera]:

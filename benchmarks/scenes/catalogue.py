@@ -14,16 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.scenes.rendering import SUN
-from benchmarks.scenes.shapes import Box, Capsule, Ground, Material, Shape, Sphere
+from benchmarks.scenes.shapes import BLUE, DARK, GOLDEN, GREEN, RED, STONE, WOOD, Box, Capsule, Ground, Material, Shape, Sphere
 from benchmarks.scenes.thin import garden, thicket
 from efficientnerf.geometry.cameras import Camera
 from tests.poses import looking_at
 
-GOLDEN = np.pi * (3 - np.sqrt(5))
 PHASE = {"train": 0.0, "val": 0.37, "test": 0.71}  # splits take other places on the same path
 
-RED, GREEN, BLUE = ((0.70, 0.10, 0.08), (0.85, 0.35, 0.15)), ((0.08, 0.40, 0.12), (0.45, 0.60, 0.15)), ((0.06, 0.14, 0.50), (0.30, 0.55, 0.80))
-STONE, WOOD, DARK = ((0.42, 0.38, 0.33), (0.66, 0.61, 0.54)), ((0.40, 0.22, 0.10), (0.62, 0.40, 0.22)), ((0.06, 0.06, 0.07), (0.14, 0.14, 0.16))
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,10 @@
 import numpy as np
 
 from benchmarks.scenes.catalogue import Recipe, dome
-from benchmarks.scenes.shapes import Box, Capsule, Disc, Material, Shape, Sphere
+from benchmarks.scenes.shapes import Box, Capsule, Disc, Material, Shape, Sphere, point
 
 MIDDLE = (0.0, 0.0, 0.45)
 PATTERNS = ("noise", "noise", "checks", "stripes", "plain")
-Point = tuple[float, float, float]
 
 
 def drawn(seed: int) -> Recipe:
@@ -26,24 +25,19 @@ def drawn(seed: int) -> Recipe:
 def _shape(rng: np.random.Generator) -> Shape:
     """One shape within 0.6 of the axis."""
     angle, away = rng.uniform(0, 2 * np.pi), 0.6 * np.sqrt(rng.random())
-    at = _point(away * np.cos(angle), away * np.sin(angle), rng.uniform(0.05, 0.75))
+    at = point(away * np.cos(angle), away * np.sin(angle), rng.uniform(0.05, 0.75))
     material, kind = _material(rng), rng.integers(4)
     if kind == 0:
         return Sphere(at, rng.uniform(0.08, 0.28), material)
     if kind == 1:
-        return Box(at, _point(*rng.uniform(0.05, 0.25, 3)), material, heading=rng.uniform(0, 90))
+        return Box(at, point(*rng.uniform(0.05, 0.25, 3)), material, heading=rng.uniform(0, 90))
     if kind == 2:
-        return Capsule(at, _point(*(np.array(at) + rng.uniform(-0.35, 0.35, 3))), rng.uniform(0.02, 0.1), material)
-    return Disc(at, _point(*rng.normal(size=3)), rng.uniform(0.1, 0.3), material)
+        return Capsule(at, point(*(np.array(at) + rng.uniform(-0.35, 0.35, 3))), rng.uniform(0.02, 0.1), material)
+    return Disc(at, point(*rng.normal(size=3)), rng.uniform(0.1, 0.3), material)
 
 
 def _material(rng: np.random.Generator) -> Material:
-    first, second = (_point(*rng.uniform(0.02, 0.9, 3) ** 1.5) for _ in range(2))
+    first, second = (point(*rng.uniform(0.02, 0.9, 3) ** 1.5) for _ in range(2))
     specular = (rng.uniform(0.1, 0.6), rng.uniform(10, 80)) if rng.random() < 0.4 else (0.0, 1.0)
     mirror = rng.uniform(0.05, 0.3) if rng.random() < 0.1 else 0.0
     return Material((first, second), str(rng.choice(PATTERNS)), rng.uniform(3, 12), specular, mirror)
-
-
-def _point(*values: float) -> Point:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

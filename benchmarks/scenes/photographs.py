@@ -4,7 +4,7 @@
 
 Boxes and balls on the floor of a room, all with textures of noise, shapes and letters; three walks round them at different heights. A lens with radial
 distortion (SIMPLE_RADIAL, k1 -0.04), noise of 2 levels, exposures that differ by 4 %, JPEG of quality 93, no EXIF data. FOLDER/transforms.json has the true
-cameras, as `benchmarks/poses.py --truth` takes them. The same arguments give the same photographs.
+cameras, as `benchmarks.poses --truth` takes them. The same arguments give the same photographs.
 """
 
 import argparse

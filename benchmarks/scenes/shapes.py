@@ -6,20 +6,35 @@ from typing import Protocol
 import numpy as np
 
 NEAREST = 1e-4  # an intersection nearer than this is the surface that the ray starts on
+GOLDEN = np.pi * (3 - np.sqrt(5))  # the golden angle
+Point = tuple[float, float, float]
+Colours = tuple[Point, Point]  # linear RGB
+RED: Colours = ((0.70, 0.10, 0.08), (0.85, 0.35, 0.15))
+GREEN: Colours = ((0.08, 0.40, 0.12), (0.45, 0.60, 0.15))
+BLUE: Colours = ((0.06, 0.14, 0.50), (0.30, 0.55, 0.80))
+STONE: Colours = ((0.42, 0.38, 0.33), (0.66, 0.61, 0.54))
+WOOD: Colours = ((0.40, 0.22, 0.10), (0.62, 0.40, 0.22))
+DARK: Colours = ((0.06, 0.06, 0.07), (0.14, 0.14, 0.16))
+CLAY: Colours = ((0.50, 0.22, 0.12), (0.66, 0.34, 0.20))
+
+
+def point(*values: float) -> Point:
+    """Three numbers, of an array perhaps, as shapes hold them."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 @dataclass(frozen=True)
 class Material:
     """Two colours, mixed by a pattern, and how the surface reflects.
 
-    colours   two linear RGB colours
     pattern   "plain", "noise", "checks" or "stripes"
     scale     repetitions of the pattern for a world unit
     specular  Phong highlight's strength and exponent
     mirror    share of the reflected environment, 0 to 1
     """
 
-    colours: tuple[tuple[float, float, float], tuple[float, float, float]]
+    colours: Colours
     pattern: str = "plain"
     scale: float = 4.0
     specular: tuple[float, float] = (0.0, 1.0)
@@ -46,7 +61,7 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class Sphere:
-    centre: tuple[float, float, float]
+    centre: Point
     radius: float
     material: Material
 
@@ -66,8 +81,8 @@ class Sphere:
 class Box:
     """A box turned about the vertical axis by `heading` degrees."""
 
-    centre: tuple[float, float, float]
-    half: tuple[float, float, float]
+    centre: Point
+    half: Point
     material: Material
     heading: float = 0.0
 
@@ -102,8 +117,8 @@ class Box:
 class Capsule:
     """All points within `radius` of the segment from `a` to `b`: a rod, or a thin wire."""
 
-    a: tuple[float, float, float]
-    b: tuple[float, float, float]
+    a: Point
+    b: Point
     radius: float
     material: Material
 
@@ -134,8 +149,8 @@ class Capsule:
 class Disc:
     """A flat disc without thickness, seen from both sides: a leaf."""
 
-    centre: tuple[float, float, float]
-    axis: tuple[float, float, float]
+    centre: Point
+    axis: Point
     radius: float
     material: Material
 

@@ -4,12 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Box, Capsule, Disc, Material, Shape, Sphere
-
-GREEN, STONE = ((0.08, 0.40, 0.12), (0.45, 0.60, 0.15)), ((0.42, 0.38, 0.33), (0.66, 0.61, 0.54))
-RED, BLUE, CLAY = ((0.70, 0.10, 0.08), (0.85, 0.35, 0.15)), ((0.06, 0.14, 0.50), (0.30, 0.55, 0.80)), ((0.50, 0.22, 0.12), (0.66, 0.34, 0.20))
-GOLDEN = np.pi * (3 - np.sqrt(5))
-Point = tuple[float, float, float]
+from benchmarks.scenes.shapes import BLUE, CLAY, GOLDEN, GREEN, RED, STONE, Box, Capsule, Disc, Material, Point, Shape, Sphere, point
 
 # Strokes of letters in a square of one by one, from the lower left.
 LETTERS: dict[str, tuple[tuple[float, float, float, float], ...]] = {
@@ -19,11 +14,6 @@ LETTERS: dict[str, tuple[tuple[float, float, float, float], ...]] = {
     "N": ((0, 0, 0, 1), (0, 1, 0.7, 0), (0.7, 0, 0.7, 1)),
     "T": ((0.35, 0, 0.35, 1), (0, 1, 0.7, 1)),
 }  # fmt: skip
-
-
-def _point(*values: float) -> Point:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def plant(at: tuple[float, float], stems: int, leaves: int, seed: int) -> list[Shape]:
@@ -36,7 +26,7 @@ def plant(at: tuple[float, float], stems: int, leaves: int, seed: int) -> list[S
         lean, height = rng.uniform(0.08, 0.26), rng.uniform(0.5, 0.8)
         top = np.array([x + lean * np.cos(angle), y + lean * np.sin(angle), height])
         foot = np.array([x, y, 0.2])
-        out.append(Capsule(_point(*foot), _point(*top), 0.007, Material(GREEN, "plain")))
+        out.append(Capsule(point(*foot), point(*top), 0.007, Material(GREEN, "plain")))
         for leaf in range(leaves):
             along = 0.35 + 0.65 * (leaf + 0.5) / leaves
             turn = GOLDEN * leaf + angle
@@ -44,7 +34,7 @@ def plant(at: tuple[float, float], stems: int, leaves: int, seed: int) -> list[S
             radius = rng.uniform(0.035, 0.055)
             centre = foot + along * (top - foot) + radius * away
             out.append(
-                Disc(_point(*centre), _point(*(np.cross(away, [-away[1], away[0], 0.0]) + rng.normal(0, 0.2, 3))), radius, Material(GREEN, "noise", 14.0))
+                Disc(point(*centre), point(*(np.cross(away, [-away[1], away[0], 0.0]) + rng.normal(0, 0.2, 3))), radius, Material(GREEN, "noise", 14.0))
             )
     return out
 
@@ -57,9 +47,9 @@ def wire_ball(centre: Point, radius: float, wire: float, rings: int) -> list[Sha
         turn = np.pi * ring / rings
         first, second = np.array([np.cos(turn), np.sin(turn), 0.0]), np.array([0.0, 0.0, 1.0])
         places = [np.array(centre) + radius * (np.cos(a) * first + np.sin(a) * second) for a in 2 * np.pi * np.arange(25) / 24]
-        out += [Capsule(_point(*a), _point(*b), wire, steel) for a, b in pairwise(places)]
+        out += [Capsule(point(*a), point(*b), wire, steel) for a, b in pairwise(places)]
     flat = [np.array(centre) + radius * np.array([np.cos(a), np.sin(a), 0.0]) for a in 2 * np.pi * np.arange(25) / 24]
-    return out + [Capsule(_point(*a), _point(*b), wire, steel) for a, b in pairwise(flat)]
+    return out + [Capsule(point(*a), point(*b), wire, steel) for a, b in pairwise(flat)]
 
 
 def fence(start: Point, end: Point, height: float, bars: int, bar: float) -> list[Shape]:
@@ -69,9 +59,9 @@ def fence(start: Point, end: Point, height: float, bars: int, bar: float) -> lis
     uprights: list[Shape] = []
     for share in np.linspace(0, 1, bars):
         foot = a + share * (b - a)
-        uprights.append(Capsule(_point(*foot), _point(foot[0], foot[1], foot[2] + height), bar, paint))
+        uprights.append(Capsule(point(*foot), point(foot[0], foot[1], foot[2] + height), bar, paint))
     heights = [np.array([0.0, 0.0, share * height]) for share in np.linspace(0.1, 0.95, 4)]
-    rails = [Capsule(_point(*(a + up)), _point(*(b + up)), bar, paint) for up in heights]
+    rails = [Capsule(point(*(a + up)), point(*(b + up)), bar, paint) for up in heights]
     return [*uprights, *rails]
 
 
@@ -83,7 +73,7 @@ def word(text: str, start: Point, heading: float, size: float, stroke: float) ->
     for number, letter in enumerate(text):
         origin = np.array(start) + 0.95 * size * number * along
         for x, y, u, v in LETTERS[letter]:
-            out.append(Capsule(_point(*(origin + size * (x * along + y * up))), _point(*(origin + size * (u * along + v * up))), stroke, paint))
+            out.append(Capsule(point(*(origin + size * (x * along + y * up))), point(*(origin + size * (u * along + v * up))), stroke, paint))
     return out
 
 

@@ -14,11 +14,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from benchmarks.project import RESULTS
 from benchmarks.torture import report, sources
 from benchmarks.torture.kills import Prepared, Rounds
 from benchmarks.torture.preparation import in_prepared_process, prepare, records
-
-RESULT = Path(__file__).resolve().parents[1] / "results" / "torture.json"
 
 
 def main() -> int:
@@ -27,7 +26,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="how many runs at a time")
     parser.add_argument("--sources", default=",".join(sources.KINDS))
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--json", type=Path, default=RESULT, help="where the result goes")
+    parser.add_argument("--json", type=Path, default=RESULTS / "torture.json", help="where the result goes")
     parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless a run is wrong")
     given = parser.parse_args()
     folder = given.folder or Path(tempfile.mkdtemp(prefix="torture-"))

@@ -33,6 +33,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from benchmarks.project import RESULTS
 from benchmarks.torture import processes, report
 from benchmarks.torture.cases import NEW, Case, Cases, base
 from benchmarks.torture.comparison import STAGES
@@ -40,7 +41,6 @@ from benchmarks.torture.kills import Prepared
 from benchmarks.torture.preparation import in_prepared_process, prepare, records, wait_for
 from benchmarks.torture.trap import Armed, Operation, Trap, operations
 
-RESULT = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EACCES, errno.EMFILE)
 OF_READING = (errno.EIO, errno.EACCES, errno.EMFILE)
 DEADLY = (1, 2, 3, 5)  # the failing operation at which a run on a full disk is killed
@@ -53,7 +53,7 @@ def main() -> int:
     parser.add_argument("--stages", default=",".join((NEW, *STAGES)), help="of the Blender set; of the others it is poses")
     parser.add_argument("--share", type=int, default=1, help="one case in so many, for a look")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop then, and say how many cases are left; they come in a random order")
-    parser.add_argument("--json", type=Path, default=RESULT, help="where the result goes")
+    parser.add_argument("--json", type=Path, default=RESULTS / "faults.json", help="where the result goes")
     parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless a case is wrong")
     given = parser.parse_args()
     folder = given.folder or Path(tempfile.mkdtemp(prefix="faults-"))

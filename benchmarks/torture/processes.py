@@ -21,13 +21,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.project import PACKAGES, ROOT
 from benchmarks.torture.trap import Armed
 
-ROOT = Path(__file__).resolve().parents[2]
 FRESH = ("-m", "workflows.cli.main")
 FRESH_WATCHED = ("-c", "import sys; from benchmarks.torture.audit import arm; arm(); from workflows.cli.main import main; sys.exit(main())")
 LIMIT = 300.0  # seconds for a run
-PACKAGES = ("pipeline", "stages", "efficientnerf", "workflows")
 LEFT_OUT = ("triton", "__main__", "pycolmap")  # in names of modules: no device here; structure from motion has threads of its own
 
 

@@ -9,7 +9,8 @@ from importlib.metadata import version
 from typing import Any, TextIO
 
 from benchmarks.machine import processor
-from benchmarks.torture.processes import ROOT, python_alone
+from benchmarks.project import ROOT
+from benchmarks.torture.processes import python_alone
 
 LIBRARIES = ("torch", "numpy", "numba", "pycolmap", "av", "OpenEXR", "safetensors", "pillow", "filelock")
 

@@ -1,19 +1,14 @@
 """The sources of the runs, as small as every stage can bear."""
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+from benchmarks.project import ROOT
+from benchmarks.scenes.__main__ import as_blender, write_scene
+from benchmarks.scenes.catalogue import recipes
 
-from benchmarks.scenes.__main__ import write_scene
-from benchmarks.scenes.catalogue import cameras, recipes
-from benchmarks.scenes.rendering import image
-from efficientnerf.geometry.cameras import opengl_from_pose
-
-PHOTOGRAPHS = Path(__file__).resolve().parents[2] / "examples" / "still_life"
 KINDS = ("photographs", "blender", "llff")
 
 # The preset tiny, smaller still; every stage keeps its checkpoints, previews and files.
@@ -48,7 +43,7 @@ def make(kind: str, folder: Path, photographs: int = 6) -> Source:
     place = folder / kind
     if kind == "photographs":
         place.mkdir(parents=True)
-        for path in sorted(PHOTOGRAPHS.glob("*.jpg"))[:photographs]:
+        for path in sorted((ROOT / "examples" / "still_life").glob("*.jpg"))[:photographs]:
             shutil.copyfile(path, place / path.name)
         return Source(kind, place, (*options(), "--jobs", "2"))  # stages side by side, which so small a run would not have
     if kind == "llff":
@@ -56,21 +51,7 @@ def make(kind: str, folder: Path, photographs: int = 6) -> Source:
         (place / "transforms.json").unlink()
         return Source(kind, place, ("--as", "llff", *options()))
     if kind == "blender":
-        _write_blender(place)
-        return Source(kind, place, ("--as", "blender", *options()))
+        made = folder / "object"
+        write_scene(recipes()["object"], made, {"train": 6, "val": 0, "test": 2}, 48, 1)
+        return Source(kind, as_blender(made, place), ("--as", "blender", *options()))
     raise ValueError(f"kind {kind!r}: expected one of {', '.join(KINDS)}")
-
-
-def _write_blender(folder: Path) -> None:
-    from PIL import Image
-
-    recipe = recipes()["object"]
-    for split, count in (("train", 6), ("test", 2)):
-        views = cameras(recipe, split, count, 48)
-        (folder / split).mkdir(parents=True)
-        frames = []
-        for number, camera in enumerate(views):
-            Image.fromarray(image(recipe.shapes, camera, supersample=1, alpha=True)).save(folder / split / f"r_{number}.png")
-            frames.append({"file_path": f"./{split}/r_{number}", "transform_matrix": opengl_from_pose(camera.world_from_camera).tolist()})
-        angle = 2 * float(np.arctan(0.5 * views[0].width / views[0].intrinsics["fx"]))
-        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}), encoding="utf-8")
