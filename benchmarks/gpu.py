@@ -112,7 +112,7 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
     if part == "trees":
         import gpu_tree
 
-        return {f"degree_{n}": gpu_tree.tree_rates("cuda", gpu_kernels.shell(384, n), 800, 8, 2048, 20, 2048) for n in (0, 2)}
+        return {f"degree_{n}": gpu_tree.tree_rates("cuda", gpu_kernels.shell(384, n), 800, 8, 2048, 20) for n in (0, 2)}
     if part == "paper":
         return gpu_kernels.paper_rates("cuda", 300, 400, 40)
     if part == "asset":

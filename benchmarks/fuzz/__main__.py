@@ -4,7 +4,6 @@ import argparse
 import functools
 import importlib.metadata
 import importlib.util
-import json
 import platform
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from typing import Any
 from benchmarks.fuzz import campaign, nursery, worker
 from benchmarks.project import ROOT
 
-LIBRARIES = ("atheris", "msgspec", "numpy", "pillow", "pillow-heif", "safetensors", "torch")
+LIBRARIES = ("atheris", "msgspec", "numpy", "pillow_heif", "safetensors", "torch")
 
 
 def main() -> int:
@@ -34,8 +33,7 @@ def main() -> int:
         return 2
     if given.file is not None:
         return _again(given.readers[0], given.file)
-    found: dict[str, dict[str, Any]] = {}
-
+    wrong = False
     local, all_nurseries = threading.local(), []
 
     def begin() -> None:
@@ -50,13 +48,13 @@ def main() -> int:
     with ThreadPoolExecutor(given.jobs, initializer=begin) as threads:
         for done in as_completed([threads.submit(fuzz, name) for name in given.readers or READERS]):
             name, result = done.result()
-            found[name] = result
+            wrong = wrong or bool(result["findings"])
             _tell(name, result, given.findings)
             if given.json is not None:
-                write(given.json, {name: result}, given.seed, coverage)
+                write(given.json, name, result, given.seed, coverage)
     for each in all_nurseries:
         each.close()
-    return 1 if any(each["findings"] for each in found.values()) else 0
+    return int(wrong)
 
 
 def _arguments() -> argparse.Namespace:
@@ -68,7 +66,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="readers at a time")
     parser.add_argument("--shrink", type=float, default=5.0, metavar="SECONDS", help="to make the input of a finding smaller")
     parser.add_argument("--findings", type=Path, default=ROOT / "build" / "fuzz", metavar="DIR", help="where the inputs of findings go")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="result to write; is added to what it holds")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="result to write; what it holds of other readers stays")
     parser.add_argument("--file", type=Path, metavar="FILE", help="try this one input on READER")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -111,38 +109,32 @@ def _tell(name: str, found: dict[str, Any], folder: Path) -> None:
         print(f"    {each['by']} at {each['place']} ({each['count']}): {path}", flush=True)
 
 
-def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: bool) -> None:
-    """Add what was found to the file of results."""
+def write(path: Path, name: str, found: dict[str, Any], seed: int, coverage: bool) -> None:
+    """Put what was found of a reader into the file of results; what it holds of other readers stays."""
+    from benchmarks.fuzz.reader import LIMIT
     from benchmarks.fuzz.table import READERS
     from benchmarks.machine import processor
+    from pipeline.files import read_json, write_json
 
-    versions = {}
-    for name in LIBRARIES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    former = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"readers": {}, "seeds": [], "versions": {}}
-    now = {
+    readers = dict(read_json(path)["readers"]) if path.exists() else {}
+    readers[name] = {
+        **found,
+        "findings": [{key: one[key] for key in ("by", "place", "count")} for one in found["findings"]],
+        "seed": seed,
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "guided_by": f"coverage (atheris): {campaign.GUIDED:.0%} of the inputs" if coverage else "outcomes",
     }
-    readers = dict(former["readers"])
-    for name, each in found.items():
-        entry = {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]], **now}
-        readers[name] = campaign.added(readers[name], entry) if name in readers else entry
     result = {
         "machine": processor(),
         "python": platform.python_version(),
-        "versions": {**former["versions"], **versions},
-        "seeds": sorted({*former["seeds"], seed}),
+        "versions": {library: importlib.metadata.version(library) for library in LIBRARIES if importlib.util.find_spec(library) is not None},
         "inputs": sum(each["inputs"] for each in readers.values()),
         "findings": sum(len(each["findings"]) for each in readers.values()),
-        "limit_s": 5.0,
-        "room_mib": worker.EXTRA_MEMORY // 2**20,
-        "readers": {name: readers[name] for name in READERS if name in readers},
+        "limit_s": LIMIT,
+        "memory_mib": worker.EXTRA_MEMORY // 2**20,
+        "readers": {reader: readers[reader] for reader in READERS if reader in readers},
     }
-    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_json(path, result)
 
 
 if __name__ == "__main__":

@@ -90,20 +90,6 @@ def summed(name: str, parts: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def added(former: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """The results of two campaigns on the same reader as one; findings are those of `now`, for those of before may have been mended."""
-    inputs, seconds = former["inputs"] + now["inputs"], former["cpu_seconds"] + now["cpu_seconds"]
-    return {
-        **now,
-        "inputs": inputs,
-        **{key: former[key] + now[key] for key in ("accepted", "command_lines")},
-        **{key: _counts((former[key], now[key])) for key in ("refused", "exit_codes")},
-        **{key: max(former[key], now[key]) for key in ("slowest_s", "peak_rss_mib", "rss_before_mib")},
-        "inputs_per_cpu_s": round(inputs / max(seconds, 1e-9)),
-        "cpu_seconds": round(seconds, 1),
-    }
-
-
 def _counts(parts: Iterable[dict[str, int]]) -> dict[str, int]:
     total = Counter[str]()
     for part in parts:
