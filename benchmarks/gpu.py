@@ -1,7 +1,7 @@
 """Benchmarks on a CUDA device: tests, kernels, renders, rays of tree training, training steps, a bake and the pipeline; written to
 benchmarks/results/gpu.json after each part.
 
-    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,renders,trees,training,asset,pipeline,paper] [--seconds 570] [--preset standard]
+    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,renders,trees,training,asset,pipeline] [--seconds 570] [--preset standard]
                              [--asset FILE] [--json FILE]
 
 Prints a line and ends where torch has no CUDA device. Each part runs in a process of its own, because an error on a device can break what follows it;
@@ -25,7 +25,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 # Seconds at most. Most of the tests' time is compilation of kernels.
-PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "trees": 60.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
+PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "trees": 60.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0}
 TESTS = ["tests/efficientnerf", "tests/benchmarks/paper", "--ignore=tests/efficientnerf/backends/test_cuda_builds.py", "-k",
          "cuda or readback or device or gpu"]  # fmt: skip
 METHOD = ["torch", "triton", "numba", "scipy", "safetensors", "msgspec", "platformdirs"]
@@ -113,8 +113,6 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
         import gpu_tree
 
         return {f"degree_{n}": gpu_tree.tree_rates("cuda", gpu_kernels.shell(384, n), 800, 8, 2048, 20) for n in (0, 2)}
-    if part == "paper":
-        return gpu_kernels.paper_rates("cuda", 300, 400, 40)
     if part == "asset":
         return gpu_asset.asset_rates(
             "cuda", steps=2000, side=400, views=60, resolution=256, pixels=1_000_000, refine_steps=160, rays=32768, sample_batch_size=2**18

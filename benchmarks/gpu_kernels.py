@@ -1,4 +1,4 @@
-"""The parts *kernels*, *renders*, *training* and *paper* of benchmarks/gpu.py. Sizes are arguments, so that the code runs without a device too."""
+"""The parts *kernels*, *renders* and *training* of benchmarks/gpu.py. Sizes are arguments, so that the code runs without a device too."""
 
 from __future__ import annotations
 
@@ -230,17 +230,3 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
         "steps_per_second": round(timed / took, 1), "samples_per_second": round(samples / took), "psnr": round(done.psnr, 2), "rays": done.rays,
         "waits_in_32_steps": waits, "rays_left_out_in_32_steps": left_out,
     }  # fmt: skip
-
-
-def paper_rates(device: str, steps: int, side: int, views: int, **changes: Any) -> dict[str, Any]:
-    """`training_rates` of the rows of table 5, and of uniform sampling, with the settings of the preset paper-n4 but for a short warm-up."""
-    from benchmarks.paper.tables import IMPORTANCE, LARGE, NERF
-    from workflows.cli.resolve import read_preset
-
-    rows: dict[str, dict[str, Any]] = {
-        "nerf": NERF, "uniform": {**NERF, "sampling": "uniform"}, "sh": {"sampling": "hierarchical", **IMPORTANCE, **LARGE},
-        "light": {"sampling": "hierarchical", **IMPORTANCE}, "valid": {"sampling": "valid", **IMPORTANCE}, "n4": {},
-    }  # fmt: skip
-    preset = read_preset("paper-n4").table["train"]
-    short = {"occupancy_warmup_steps": steps // 4, "precrop_steps": 0, "occupancy_beta": 0.5}  # with the paper's 0.1 so few steps prune little
-    return {name: training_rates(device, steps, side, views, **{**preset, **short, **row, **changes}) for name, row in rows.items()}

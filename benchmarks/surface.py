@@ -1,6 +1,6 @@
 """A mesh against the true one: accuracy, completeness, F-scores, normals, silhouettes and depth.
 
-    python -m benchmarks.surface RUN [--mesh FILE] [--scene KIND | --truth FILE.ply | --no-truth] [--cameras FILE.json] [--out RESULTS.json]
+    python -m benchmarks.surface RUN [--mesh FILE] [--scene KIND | --truth FILE.ply] [--cameras FILE.json] [--out RESULTS.json]
 
 RUN's mesh (or FILE, in the capture's frame) against a true mesh in the frame of the true cameras. Without --truth and --scene these are the still life's.
 --scene KIND takes a made scene's (`benchmarks.scenes`), whose capture's frame is that of its shapes. Frames are aligned by the camera centres (a similarity,
@@ -8,8 +8,7 @@ Umeyama 1991), never by the surfaces. Both surfaces are sampled evenly by area. 
 of the training cameras see them on their own mesh: nothing is known of the rest. Distances are from sample to surface, in units of the true frame; one of them
 is the footprint of a pixel: the median over the cameras of the distance of the truth's middle over the focal length.
 
-Beside these stand the run's own figures, where it has them: of the mesh's silhouettes over the asset's (mesh/report.json), and of textured mesh, colours at
-vertices and asset against held-back photographs (evaluate/metrics.json). --no-truth writes these alone. --out adds the run to a file of results by name.
+--out adds the run to a file of results by name.
 """
 
 from __future__ import annotations
@@ -202,31 +201,13 @@ def main() -> None:
     parser.add_argument("--scene", help="kind of a made scene")
     parser.add_argument("--truth", type=Path, help="default: that of the still life")
     parser.add_argument("--cameras", type=Path, default=TRUTH)
-    parser.add_argument("--no-truth", action="store_true", help="of scenes whose surface is not known")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    result = {} if given.no_truth else measured(given.run, given.mesh or given.run / "mesh" / "mesh.ply", given.scene, given.truth, given.cameras)
-    result |= own_figures(given.run)
+    result = measured(given.run, given.mesh or given.run / "mesh" / "mesh.ply", given.scene, given.truth, given.cameras)
     print(json.dumps(result, indent=1))
     if given.out:
         known = json.loads(given.out.read_text()) if given.out.is_file() else {}
         given.out.write_text(json.dumps(known | {given.run.resolve().name: result}, indent=1) + "\n")
-
-
-def own_figures(run: Path) -> dict[str, Any]:
-    """What a run's reports say of its mesh: silhouettes over the asset's, and PSNR and SSIM of held-back views beside the asset's."""
-    from stages.artifacts import EvaluateOutputs, MeshOutputs
-
-    out: dict[str, Any] = {}
-    if (path := MeshOutputs.of_run(run).report).is_file():
-        report = json.loads(path.read_text())
-        names = ("faces", "silhouette_iou", "pixels_missed", "pixels_added", "depth_difference", "views_checked")
-        out["asset"] = {name: report[name] for name in names if name in report}
-    if (path := EvaluateOutputs.of_run(run).metrics).is_file():
-        metrics = json.loads(path.read_text())
-        if metrics["mesh"] is not None:
-            out["held_back"] = {"asset_psnr": metrics["asset"]["psnr"], **metrics["mesh"]}
-    return out
 
 
 def footprint(cameras: Sequence[Camera], middle: np.ndarray) -> float:

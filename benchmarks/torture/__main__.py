@@ -1,52 +1,34 @@
 """Kill runs many times and compare what they make with undisturbed runs; see kills.py.
 
-python -m benchmarks.torture [--kills 30] [--jobs 1] [--sources photographs,blender,llff] [--json FILE]
+python -m benchmarks.torture [--kills 30] [--jobs 1] [--sources blender,photographs,llff] [--json FILE]
 """
 
 import argparse
-import json
-import shutil
 import sys
-import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from benchmarks.project import RESULTS
-from benchmarks.torture import report, sources
+from benchmarks.torture import report
 from benchmarks.torture.kills import Prepared, Rounds
-from benchmarks.torture.preparation import in_prepared_process, prepare, records
+from benchmarks.torture.preparation import begin, end, records
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=30, help="how many SIGKILLs; other signals come on top")
-    parser.add_argument("--jobs", type=int, default=1, help="how many runs at a time")
-    parser.add_argument("--sources", default=",".join(sources.KINDS))
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--json", type=Path, default=RESULTS / "torture.json", help="where the result goes")
-    parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless a run is wrong")
-    given = parser.parse_args()
-    folder = given.folder or Path(tempfile.mkdtemp(prefix="torture-"))
-    folder.mkdir(parents=True, exist_ok=True)
-    in_prepared_process(folder)
-    begun = time.monotonic()
-    prepared = prepare(folder, given.sources.split(","))
+    given, prepared = begin(parser, "torture")
     for each in prepared:
         stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in each.seconds.items())
         print(f"{each.source.kind}: {len(each.operations)} file operations; {stages}", flush=True)
-    lines = rounds(folder, prepared, given.kills, given.jobs, given.seed)
-    result = summary(lines, prepared) | report.circumstances(begun, given.jobs, given.seed)
-    given.json.parent.mkdir(parents=True, exist_ok=True)
-    given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    lines = rounds(given.folder, prepared, given.kills, given.jobs, given.seed)
+    result = summary(lines, prepared) | report.circumstances(given.begun, given.jobs, given.seed)
     bad = result["runs_that_differ"] + result["wrong_ends"]
     print(f"{result['kills']} kills and {result['other_signals']} other signals in {result['rounds']} rounds, {result['elapsed_seconds']:.0f} s; "
           f"{len(result['runs_that_differ'])} runs differ, {len(result['wrong_ends'])} wrong ends; {given.json}")  # fmt: skip
-    if not bad:
-        shutil.rmtree(folder, ignore_errors=True)
-    return 1 if bad else 0
+    return end(given, result, bool(bad))
 
 
 def rounds(folder: Path, prepared: list[Prepared], kills: int, jobs: int, seed: int) -> list[dict[str, Any]]:

@@ -1,6 +1,6 @@
 """Let file operations of a run fail, each of them in turn, and see what the run says, what it leaves, and what the next run makes of that.
 
-    python -m benchmarks.torture.faults [--jobs 1] [--sources photographs,blender,llff] [--json FILE]
+    python -m benchmarks.torture.faults [--jobs 1] [--sources blender,photographs,llff] [--json FILE]
 
 A case is one operation of one stage, which fails with one of ENOSPC, EIO, EROFS, EACCES, EMFILE, once or with all that follow. The stage replaces an
 older artifact; those before and after it are there. Then
@@ -21,24 +21,21 @@ operation in every stage.
 import argparse
 import errno
 import itertools
-import json
 import random
 import re
 import shutil
 import sys
-import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from benchmarks.project import RESULTS
 from benchmarks.torture import processes, report
 from benchmarks.torture.cases import NEW, Case, Cases, base
 from benchmarks.torture.comparison import STAGES
 from benchmarks.torture.kills import Prepared
-from benchmarks.torture.preparation import in_prepared_process, prepare, records, wait_for
+from benchmarks.torture.preparation import begin, end, records, wait_for
 from benchmarks.torture.trap import Armed, Operation, Trap, operations
 
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EACCES, errno.EMFILE)
@@ -48,34 +45,21 @@ DEADLY = (1, 2, 3, 5)  # the failing operation at which a run on a full disk is 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=1, help="how many runs at a time")
-    parser.add_argument("--sources", default="blender,photographs,llff")
     parser.add_argument("--stages", default=",".join((NEW, *STAGES)), help="of the Blender set; of the others it is poses")
-    parser.add_argument("--share", type=int, default=1, help="one case in so many, for a look")
+    parser.add_argument("--share", type=int, default=1, help="one case in so many")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop then, and say how many cases are left; they come in a random order")
-    parser.add_argument("--json", type=Path, default=RESULTS / "faults.json", help="where the result goes")
-    parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless a case is wrong")
-    given = parser.parse_args()
-    folder = given.folder or Path(tempfile.mkdtemp(prefix="faults-"))
-    folder.mkdir(parents=True, exist_ok=True)
-    in_prepared_process(folder)
-    begun = time.monotonic()
-    prepared = prepare(folder, given.sources.split(","))
-    logs = folder / "logs"
+    given, prepared = begin(parser, "faults")
+    logs = given.folder / "logs"
     wait_for([processes.forked(lambda: _log_all(prepared, given.stages.split(","), logs))])
     cases, seen = planned(prepared, given.stages.split(","), logs)
     random.Random(0).shuffle(cases)
     cases = cases[: -(-len(cases) // given.share)]
     print(f"{len(cases)} cases", flush=True)
-    lines = _all(cases, prepared, folder, given.jobs, given.minutes)
-    result = summary(lines, seen, len(cases)) | report.circumstances(begun, given.jobs, seed=0)
-    given.json.parent.mkdir(parents=True, exist_ok=True)
-    given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    lines = _all(cases, prepared, given.folder, given.jobs, given.minutes)
+    result = summary(lines, seen, len(cases)) | report.circumstances(given.begun, given.jobs, seed=0)
     found = f"{result['cases']} cases at {result['operations_covered']} operations, {result['elapsed_seconds']:.0f} s: {len(result['wrong'])} wrong"
     print(f"{found}; {given.json}")
-    if not result["wrong"]:
-        shutil.rmtree(folder, ignore_errors=True)
-    return 1 if result["wrong"] else 0
+    return end(given, result, bool(result["wrong"]))
 
 
 def _scenarios(prepared: Sequence[Prepared], stages: Sequence[str]) -> list[tuple[Prepared, str]]:

@@ -67,10 +67,8 @@ class Hit:
     whom: str
     stage: str = ""
     place: str = ""
-    after: float = 0.0
     code: int = 0
     resumed: bool = False
-    fresh: bool = False
     wrong: list[str] = field(default_factory=list)
 
 
@@ -121,7 +119,7 @@ class Rounds:
         name = self.random.choice(METHODS if aim in self.killed else METHODS[:1])  # killed before it meets anything else
         moment = "time" if name == "STOP" or self.random.random() < 0.4 else "call"
         whom = "leader" if name == "TERM" or (name == "KILL" and self.random.random() < 0.3) else "group"
-        hit = Hit(self.rounds, prepared.source.kind, aim, name, moment, whom, fresh=fresh)
+        hit = Hit(self.rounds, prepared.source.kind, aim, name, moment, whom)
         armed, due = self._moment(prepared, run, hit)
         child = self._start(prepared.source, run, armed, fresh=fresh)
         while child.alive() and not due(child) and not (armed and armed.fired):
@@ -131,7 +129,6 @@ class Rounds:
             if child.code != 0:
                 self._note(hit, child, [f"it ended with {child.code} before it was hit: {child.errors.strip()[:300]}"])
             return  # it was done before the moment came
-        hit.after = time.monotonic() - child.began
         if armed and armed.fired:
             stage, kind, path = armed.place
             hit.place = f"{kind} {stage}: {Path(path).name}"

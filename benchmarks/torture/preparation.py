@@ -1,20 +1,49 @@
 """What comes before the first disturbance: sources, undisturbed runs, and a process that has everything imported."""
 
+import argparse
 import json
 import os
+import shutil
 import sys
+import tempfile
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
 
+from benchmarks.project import RESULTS
 from benchmarks.torture import processes, sources, trap
 from benchmarks.torture.comparison import Expected, differences, expected
 from benchmarks.torture.kills import Prepared
 from benchmarks.torture.sources import Source
 from benchmarks.torture.trap import Armed, Operation, Trap
+from pipeline.files import write_json
 
 READY = "TORTURE_READY"
+
+
+def begin(parser: argparse.ArgumentParser, name: str) -> tuple[argparse.Namespace, list[Prepared]]:
+    """The options, with those of all torments, and the undisturbed runs; where the results go is NAME.json."""
+    parser.add_argument("--jobs", type=int, default=1, help="how many runs at a time")
+    parser.add_argument("--sources", default=",".join(sources.KINDS))
+    parser.add_argument("--json", type=Path, default=RESULTS / f"{name}.json", help="where the result goes")
+    parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless something is wrong")
+    given = parser.parse_args()
+    given.folder = given.folder or Path(tempfile.mkdtemp(prefix=f"{name}-"))
+    given.folder.mkdir(parents=True, exist_ok=True)
+    in_prepared_process(given.folder)
+    given.begun = time.monotonic()
+    return given, prepare(given.folder, given.sources.split(","))
+
+
+def end(given: argparse.Namespace, result: dict[str, Any], wrong: bool) -> int:
+    """Write the result, and remove the runs where all is right; the exit code."""
+    given.json.parent.mkdir(parents=True, exist_ok=True)
+    write_json(given.json, result)
+    if not wrong:
+        shutil.rmtree(given.folder, ignore_errors=True)
+    return int(wrong)
 
 
 def in_prepared_process(folder: Path) -> None:
@@ -23,13 +52,7 @@ def in_prepared_process(folder: Path) -> None:
         return
     library = trap.build(folder)
     environment = {**processes.single_threaded_environment(library), READY: "yes"}
-    os.execve(sys.executable, [sys.executable, "-m", *_module(), *sys.argv[1:], "--folder", str(folder)], environment)
-
-
-def _module() -> list[str]:
-    spec = sys.modules["__main__"].__spec__
-    assert spec is not None, "run it as python -m"
-    return [spec.name.removesuffix(".__main__")]
+    os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:], "--folder", str(folder)], environment)
 
 
 def undisturbed(source: Source, folder: Path) -> None:

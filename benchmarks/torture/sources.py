@@ -9,7 +9,7 @@ from benchmarks.project import ROOT
 from benchmarks.scenes.__main__ import as_blender, write_scene
 from benchmarks.scenes.catalogue import recipes
 
-KINDS = ("photographs", "blender", "llff")
+KINDS = ("blender", "photographs", "llff")
 
 # The preset tiny, smaller still; every stage keeps its checkpoints, previews and files.
 SETTINGS = (
