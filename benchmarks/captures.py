@@ -1,6 +1,6 @@
 """Whole captures: photographs to all deliverables with default settings, what came of each, and a picture of each. To be run before a default is changed.
 
-    python -m benchmarks.captures --runs FOLDER [--sets controller,bonsai] [--data FOLDER] [--preset NAME] [--iterations N] [--set KEY=VALUE]... [--device cuda]
+    python -m benchmarks.captures --runs FOLDER [--sets controller,bonsai] [--data FOLDER] [--preset NAME] [--set KEY=VALUE]... [--device cuda]
     python -m benchmarks.captures --from FOLDER [--sets controller,bonsai]
     python -m benchmarks.captures --runs FOLDER SOURCE [SOURCE ...]
 
@@ -234,8 +234,7 @@ def measure(name: str, source: Path, run: Path, given: argparse.Namespace) -> di
 def options_of(given: argparse.Namespace) -> list[str]:
     """Those of `enerf run`."""
     options = [word for key in ("preset", "device", "budget") if getattr(given, key) for word in (f"--{key}", getattr(given, key))]
-    sets = [*([] if given.iterations is None else [f"train.iterations={given.iterations}"]), *given.set]
-    return [*options, *(word for each in sets for word in ("--set", each))]
+    return [*options, *(word for each in given.set for word in ("--set", each))]
 
 
 def worse_than(before: Mapping[str, Mapping[str, Any]], rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -259,7 +258,6 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--out", type=Path, default=RESULTS)
     made.add_argument("--before", type=Path, help="a captures.json that no asset may be worse than")
     made.add_argument("--preset")
-    made.add_argument("--iterations", type=int, help="of training, for quick runs")
     made.add_argument("--budget")
     made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     made.add_argument("--device", choices=("auto", "cpu", "cuda"))

@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks.fuzz import campaign, nursery, worker
 from benchmarks.project import ROOT
 
-LIBRARIES = ("atheris", "msgspec", "numpy", "pillow_heif", "safetensors", "torch")
+LIBRARIES = ("msgspec", "numpy", "pillow", "pillow-heif", "safetensors", "torch")
 
 
 def main() -> int:
@@ -127,7 +127,7 @@ def write(path: Path, name: str, found: dict[str, Any], seed: int, coverage: boo
     result = {
         "machine": processor(),
         "python": platform.python_version(),
-        "versions": {library: importlib.metadata.version(library) for library in LIBRARIES if importlib.util.find_spec(library) is not None},
+        "versions": {library: importlib.metadata.version(library) for library in (*LIBRARIES, *(["atheris"] if coverage else []))},
         "inputs": sum(each["inputs"] for each in readers.values()),
         "findings": sum(len(each["findings"]) for each in readers.values()),
         "limit_s": LIMIT,

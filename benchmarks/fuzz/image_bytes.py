@@ -1,6 +1,5 @@
 """Pictures in the formats that cameras and programs write, and mutations that know their structure: EXIF blocks, chunks, TIFF directories."""
 
-import importlib.util
 import io
 import struct
 import zlib
@@ -29,9 +28,11 @@ def exif_block(order: str = "<", orientation: int = 6) -> bytes:
 
 
 def seeds() -> list[bytes]:
-    """Small valid pictures of each kind; of HEIF where it can be written here."""
+    """Small valid pictures of each kind."""
+    import pillow_heif
     from PIL import Image
 
+    pillow_heif.register_heif_opener()
     rng = np.random.default_rng(3)
     w, h = SIZE
     rgb = Image.fromarray(rng.integers(0, 256, (h, w, 3), np.uint8))
@@ -47,7 +48,7 @@ def seeds() -> list[bytes]:
         image.save(out, kind, **options)
         return out.getvalue()
 
-    made = [
+    return [
         saved(rgb, "JPEG", exif=exif), saved(grey, "JPEG", exif=other), saved(rgb, "JPEG", progressive=True),
         saved(rgb.convert("CMYK"), "JPEG"), saved(rgb, "PNG", exif=exif), saved(rgba, "PNG"), saved(deep, "PNG"),
         saved(rgb.quantize(16), "PNG", transparency=3), saved(grey.convert("1"), "PNG"), saved(rgb, "PNG", exif=other),
@@ -61,13 +62,8 @@ def seeds() -> list[bytes]:
         saved(rgb, "SGI"), saved(rgb, "PCX"),
         saved(grey, "GIF", save_all=True, append_images=[grey]), saved(rgb, "TIFF"),
         saved(rgb, "PNG"),
+        saved(rgb, "HEIF", exif=exif), saved(rgba, "HEIF"), saved(rgb, "HEIF"),
     ]  # fmt: skip
-    if importlib.util.find_spec("pillow_heif") is not None:
-        import pillow_heif
-
-        pillow_heif.register_heif_opener()
-        made += [saved(rgb, "HEIF", exif=exif), saved(rgba, "HEIF"), saved(rgb, "HEIF")]
-    return made
 
 
 def changed(rng: Random, data: bytes) -> bytes:

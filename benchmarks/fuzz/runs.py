@@ -15,7 +15,6 @@ from typing import Any
 
 from benchmarks.fuzz import json_text, safetensors_bytes
 from benchmarks.fuzz.reader import Opened, Reader
-from benchmarks.project import ROOT
 from tests.stages import captures
 
 REPORTS = {
@@ -193,23 +192,7 @@ def _decisions(run: Path) -> tuple[Any, list[Any]]:
 def _page(run: Path) -> None:
     from workflows.report import page
 
-    environment = page.jinja2.Environment
-    page.jinja2.Environment = _environment  # compiling the template takes longer than all the rest
-    try:
-        page.page(*_decisions(run)).encode("utf-8")
-    finally:
-        page.jinja2.Environment = environment
-
-
-@cache
-def _compiled(autoescape: bool, **options: Any) -> Any:
-    import jinja2
-
-    return jinja2.environment.Environment(loader=jinja2.FileSystemLoader(ROOT / "workflows" / "report"), autoescape=autoescape, **options)
-
-
-def _environment(loader: Any, autoescape: bool, **options: Any) -> Any:
-    return _compiled(autoescape, **options)
+    page.page(*_decisions(run)).encode("utf-8")
 
 
 def _reports(name: str) -> Reader:

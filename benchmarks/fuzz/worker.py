@@ -42,7 +42,7 @@ class Tally:
         self.codes: Counter[str] = Counter()
         self.findings: dict[tuple[str, str], dict[str, Any]] = {}
         self.slowest = 0.0
-        self.note = open(folder / NOTE, "wb")  # noqa: SIM115 (as long as this process)
+        self.note = os.open(folder / NOTE, os.O_WRONLY | os.O_CREAT)  # a descriptor, open as long as this process
         self.before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
     def outcome(self, data: bytes) -> Outcome:
@@ -50,8 +50,8 @@ class Tally:
 
     def try_input(self, data: bytes) -> Outcome:
         """Read an input, at times through the command line too."""
-        self.note.truncate(0)
-        os.pwrite(self.note.fileno(), b"%020d\n%b" % (self.index, data), 0)
+        os.truncate(self.note, 0)
+        os.pwrite(self.note, b"%020d\n%b" % (self.index, data), 0)
         begin = time.process_time()
         found = self.outcome(data)
         spent = time.process_time() - begin

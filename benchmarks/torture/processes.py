@@ -16,7 +16,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,14 +101,14 @@ class Child:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.pid, number) if group else os.kill(self.pid, number)
 
-    def end(self, limit: float = LIMIT) -> int:
-        """Wait for the end; the exit code, negative for a signal. What takes longer than the limit is killed: exit code -9, and `hung` in its errors."""
+    def end(self) -> int:
+        """Wait for the end; the exit code, negative for a signal. What takes longer than LIMIT is killed: exit code -9, and `hung` in its errors."""
         while self.alive():
             self.listen(0.02)
-            if time.monotonic() - self.began > limit:
+            if time.monotonic() - self.began > LIMIT:
                 self.signal(signal.SIGKILL, group=True)
                 with open(self.errors_file, "a", encoding="utf-8") as file:
-                    file.write(f"hung: not done after {limit:g} s\n")
+                    file.write(f"hung: not done after {LIMIT:g} s\n")
                 os.waitpid(self.pid, 0)
                 self.code = -signal.SIGKILL
         while not self._closed and select.select([self.reading], [], [], 0)[0]:
@@ -167,10 +167,8 @@ def start(
     workflow  of a forked run's command line; that of `workflows.asset` by default
     """
     reading, writing = os.pipe()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    pid = os.fork()
-    if pid == 0:
+
+    def child() -> int:
         try:
             os.setsid()
             _redirect(writing, errors_file)
@@ -183,18 +181,13 @@ def start(
             if fresh:
                 program = FRESH_WATCHED if armed is not None and python_alone() else FRESH
                 os.execv(sys.executable, [sys.executable, *program, *arguments])
-            code = _run(arguments, armed, workflow)
+            return _run(arguments, armed, workflow)
         except KeyboardInterrupt:  # as Python itself ends
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGINT)
-            code = 1
-        except BaseException:
-            traceback.print_exc()
-            code = 1
-        with contextlib.suppress(OSError):
-            sys.stdout.flush()
-            sys.stderr.flush()
-        os._exit(code)
+            return 1
+
+    pid = forked(child)
     os.close(writing)
     return Child(pid, reading, errors_file, armed, fresh)
 
@@ -268,22 +261,23 @@ def load_kernels() -> None:
     gc.freeze()
 
 
-def forked(work: Any) -> int:
-    """Call a function in a child process, whose children may use OpenMP; its pid."""
+def forked(work: Callable[[], int | None]) -> int:
+    """Call a function in a child process, whose children may use OpenMP; its pid. The exit code is what the function returns, or SystemExit has."""
     sys.stdout.flush()
+    sys.stderr.flush()
     pid = os.fork()
-    if pid == 0:
-        try:
-            work()
-            code = 0
-        except SystemExit as error:
-            code = error.code if isinstance(error.code, int) else 1
-            if not isinstance(error.code, int):
-                print(error.code, file=sys.stderr)
-        except BaseException:
-            traceback.print_exc()
-            code = 1
+    if pid:
+        return pid
+    try:
+        code = work() or 0
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 1
+        if not isinstance(error.code, int):
+            print(error.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    with contextlib.suppress(OSError):
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code)
-    return pid
+    os._exit(code)
