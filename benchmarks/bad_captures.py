@@ -15,14 +15,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from benchmarks.machine import hardware
-from benchmarks.poses import STILL_LIFE, TRUTH, percent_off, true_centres
-from benchmarks.project import ENERF, RESULTS, ROOT
+from benchmarks.poses import STILL_LIFE, TRUTH, found_centres, percent_off, true_centres
+from benchmarks.project import ENERF, RESULTS, ROOT, last_object
 from benchmarks.scenes import room
 from pipeline.files import write_json
 from stages.io.pictures import opened, rgb_and_alpha
@@ -225,7 +224,7 @@ def measured(capture: Capture, count: int, work: Path) -> Row:
     shutil.rmtree(run, ignore_errors=True)
     row = Row(capture.name, len(names))
     checked = subprocess.run([*ENERF, "check", str(folder), "--json"], capture_output=True, text=True, check=False, cwd=ROOT)
-    forecast = _last_json(checked.stdout)
+    forecast = last_object(checked.stdout)
     row.forecast = str(forecast.get("grade") or forecast.get("message") or checked.returncode)
     row.forecast_problems = [problem["what"] for problem in forecast.get("problems", [])]
     row.forecast_seconds = forecast.get("forecast", {}).get("poses_seconds")
@@ -238,28 +237,12 @@ def measured(capture: Capture, count: int, work: Path) -> Row:
         found = json.loads(verdict.read_text())
         row.grade, row.registered, row.problems = found["grade"], found["registered"] or 0, [problem["what"] for problem in found["problems"]]
         diagnosis = " ".join(f"{problem['what']} {problem['sentence']}" for problem in found["problems"]).lower()
-        row.centre_rms_percent = _error(run, capture) if done.returncode == 0 else None
+        if done.returncode == 0:
+            row.centre_rms_percent = percent_off({capture.names(name): at for name, at in found_centres(run).items()}, true_centres(TRUTH))
     placeable = len(capture.placeable(names))
     placed = row.centre_rms_percent is not None and row.centre_rms_percent <= MOST_ERROR and row.registered >= ENOUGH * placeable
     row.right = "Traceback" not in done.stdout + done.stderr and (placed or any(word in diagnosis for word in capture.diagnoses))
     return row
-
-
-def _last_json(text: str) -> dict[str, Any]:
-    for line in reversed(text.splitlines()):
-        try:
-            found = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(found, dict):
-            return found
-    return {}
-
-
-def _error(run: Path, capture: Capture) -> float | None:
-    """Root mean square of the centres' distances from the truth, %; None where there are too few."""
-    cameras = [view["source_camera"] for view in json.loads((run / "poses" / "scene.json").read_text())["views"]]
-    return percent_off({capture.names(camera["name"]): np.array(camera["world_from_camera"])[:3, 3] for camera in cameras}, true_centres(TRUTH))
 
 
 def in_markdown(rows: list[Row]) -> str:

@@ -12,7 +12,6 @@ again. Results: captures.json, captures.md and captures/NAME.webp (photograph, a
 
 import argparse
 import datetime
-import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -22,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import hardware
-from benchmarks.poses import percent_off, true_centres
-from benchmarks.project import DATA, ENERF, RESULTS, code_version
+from benchmarks.poses import found_centres, percent_off, true_centres
+from benchmarks.project import DATA, ENERF, RESULTS, code_version, last_object
 from pipeline.files import read_json, write_atomically, write_json
 from pipeline.run import NAME as RUN_FILE
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs, SplatsOutputs, TrainOutputs
@@ -59,10 +58,7 @@ def run_capture(source: Path, run: Path, options: Sequence[str]) -> str | None:
     sources = [str(source)] if source.exists() else []
     command = [*ENERF, "run", *sources, "--out", str(run), "--json", *options]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode == 0:
-        return None
-    lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
-    return f"exit code {done.returncode}: {json.loads(lines[-1]).get('error') if lines else 'no summary'}"
+    return None if done.returncode == 0 else f"exit code {done.returncode}: {last_object(done.stdout).get('error', 'no summary')}"
 
 
 def row_of(run: Path, reference: Path | None = None) -> dict[str, Any]:
@@ -118,9 +114,7 @@ def off_reference(run: Path, reference: Path) -> float | None:
         centres = {Path(camera["img_name"]).stem: np.array(camera["position"]) for camera in stated}
     else:
         centres = {Path(name).stem: centre for name, centre in true_centres(reference).items()}
-    views = [view["source_camera"] for view in read_json(PosesOutputs.of_run(run).scene)["views"]]
-    found = {Path(view["name"]).stem: np.array(view["world_from_camera"])[:3, 3] for view in views}
-    return percent_off(found, centres)
+    return percent_off({Path(name).stem: centre for name, centre in found_centres(run).items()}, centres)
 
 
 def write_picture(run: Path, path: Path) -> bool:

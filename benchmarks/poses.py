@@ -21,6 +21,8 @@ import numpy as np
 
 from benchmarks.project import ROOT
 from efficientnerf.geometry.cameras import closest_similarity, pose_from_opengl
+from pipeline.files import read_json
+from stages.artifacts import PosesOutputs
 from stages.sfm.cameras import find_cameras
 from stages.sfm.reconstruction import Request
 
@@ -45,6 +47,12 @@ def percent_off(found: Mapping[str, np.ndarray], true: Mapping[str, np.ndarray])
 def true_centres(path: Path) -> dict[str, np.ndarray]:
     frames = json.loads(path.read_text())["frames"]
     return {frame["file_path"]: pose_from_opengl(np.array(frame["transform_matrix"]))[:3, 3] for frame in frames}
+
+
+def found_centres(run: Path) -> dict[str, np.ndarray]:
+    """The centres of a run's cameras in the capture's frame, by the names of their photographs."""
+    cameras = [view["source_camera"] for view in read_json(PosesOutputs.of_run(run).scene)["views"]]
+    return {camera["name"]: np.array(camera["world_from_camera"])[:3, 3] for camera in cameras}
 
 
 def processor_seconds() -> float:

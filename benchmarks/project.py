@@ -1,14 +1,22 @@
 """What is measured: folders, the command, and the version of the code."""
 
 import hashlib
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DATA = ROOT.parent / "shared" / "data"
 PACKAGES = ("pipeline", "efficientnerf", "stages", "workflows")
 ENERF = (sys.executable, "-m", "workflows.cli.main")
+
+
+def last_object(output: str) -> dict[str, Any]:
+    """The last of the objects that `enerf --json` prints, a line each; empty where there is none."""
+    lines = [line for line in output.splitlines() if line.startswith("{")]
+    return dict(json.loads(lines[-1])) if lines else {}
 
 
 def code_version() -> str:
