@@ -30,7 +30,7 @@ from workflows.asset import NAMES as STAGES
 from workflows.cli.device import has_cuda
 
 FILE = "captures"
-SETS = {  # photographs alone, whatever cameras lie beside them
+SETS = {  # photographs alone, whatever cameras lie next to them
     "still_life": "sample_photos", "banana_photos": "banana_photos", "fern": "fern_4/images_4", "lund_door": "lund_door_colmap/images",
     "lund_photos": "lund_photos", "monstree": "monstree", "snowmiku": "snowmiku/photos", "controller": "controller/photos", "toy_stills": "toy_stills",
     "toy_video": "toy_video/my_video.mp4", "office_room": "office_room/images", "mary_rose": "mary_rose/images", "bonsai": "bonsai/photos",
@@ -243,7 +243,7 @@ def worse_than(before: Mapping[str, Mapping[str, Any]], rows: Mapping[str, Mappi
 
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("sources", nargs="*", type=Path, help="photographs or videos beside, or in place of, the sets")
+    made.add_argument("sources", nargs="*", type=Path, help="more photographs or videos; alone without --sets")
     where = made.add_mutually_exclusive_group(required=True)
     where.add_argument("--runs", type=Path, help="folder of the runs")
     where.add_argument("--from", dest="from_runs", type=Path, help="folder of runs that are only read")

@@ -5,7 +5,7 @@
 
 Each row is a run of its own, from the source, with `enerf run --budget`. Cameras found from photographs are found once and copied: they are no part of the
 minutes. A row is written as soon as it is measured; with the same code and options it is not measured again, and one that was broken off begins anew.
-Writes quality_over_minutes.json, and a table and a plot of it with the rows of peers (`benchmarks.peers`) beside it; --readme replaces what stands between
+Writes quality_over_minutes.json, and a table and a plot of it with the rows of peers (`benchmarks.peers`); --readme replaces what stands between
 the marks in a document. Made scenes are written to FOLDER/scenes where they are not there: `python -m benchmarks.scenes`.
 """
 
@@ -115,9 +115,9 @@ def measure(sets: Sequence[str], minutes: Sequence[float], given: argparse.Names
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, required=True, help="folder of the runs")
-    parser.add_argument("--sets", default=",".join(SETS), help=f"names, with commas between; of {DATA} beside these")
+    parser.add_argument("--sets", default=",".join(SETS), help=f"names, with commas between; also those of {DATA}")
     parser.add_argument("--minutes", default="1,5,10,30")
-    parser.add_argument("--options", default="", help="more options of `enerf run`, in one text; rows of other options stand beside each other")
+    parser.add_argument("--options", default="", help="more options of `enerf run`, in one text; rows of other options stay")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the sets that are neither made nor examples")
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--readme", type=Path, help="a document with marks, between which the table is put")

@@ -23,7 +23,7 @@ def number(rng: Random) -> bytes:
 def changed_bytes(rng: Random, data: bytes, alphabet: bytes | None = None, begin: int = 0, end: int | None = None) -> bytes:
     """One to four changes between two places.
 
-    alphabet  bytes that are put in beside random ones: the punctuation of a text format
+    alphabet  bytes that are put in, as random ones are: the punctuation of a text format
     """
     out = bytearray(data)
     for _ in range(1 + rng.randrange(4)):

@@ -1,4 +1,4 @@
-"""Readers of what a user hands to a command beside the source: a configuration, settings on the command line, a camera path."""
+"""Readers of what a user hands to a command with the source: a configuration, settings on the command line, a camera path."""
 
 import copy
 import json

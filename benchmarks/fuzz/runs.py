@@ -61,7 +61,7 @@ def seed_of(name: str) -> Callable[[], list[bytes]]:
 
 
 def opened(name: str, call: Callable[[Path], object], *commands: tuple[str, ...]) -> Callable[[Path], Opened]:
-    """A reader of the file `name` of a run, and the commands that read it; RUN and OUT in them stand for the run and a file beside it."""
+    """A reader of the file `name` of a run, and the commands that read it; RUN and OUT in them stand for the run and a file next to it."""
 
     def open_it(folder: Path) -> Opened:
         run, out = run_in(folder), folder / "out"

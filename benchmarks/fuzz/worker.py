@@ -28,7 +28,7 @@ from benchmarks.fuzz.reader import Opened, Outcome, Reader, address_space, comma
 EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
 NOTE = "input"  # a file: the number of the input that is being tried, a line's end, the input
 CORPUS = "corpus"  # a folder: the inputs that libFuzzer kept
-KEPT = 200  # inputs that are changed again, beside the seeds
+KEPT = 200  # inputs that are changed again, as the seeds are
 INSTRUMENTED = ["pipeline", "stages.io", "stages.formats", "stages.train", "workflows.cli", "workflows.report", "workflows.inspection"]
 
 

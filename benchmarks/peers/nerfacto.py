@@ -34,7 +34,7 @@ LIBRARIES = ("nerfstudio", "torch", "numpy")
 
 
 def declare_operators() -> None:
-    """PyPI's torchvision is built for CUDA and cannot load its operators beside a torch without; it declares two of them all the same. None is used."""
+    """PyPI's torchvision is built for CUDA and cannot load its operators into a torch without; it declares two of them all the same. None is used."""
     try:
         torch.ops.load_library(next(Path(p, "torchvision", "_C.so") for p in sys.path if Path(p, "torchvision", "_C.so").exists()))
     except (OSError, StopIteration):

@@ -27,7 +27,7 @@ class Hits:
 
 
 def _near_balls(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(M, R) whether a ray comes near the ball of each shape: in single precision, with room for its rounding."""
+    """(M, R) whether a ray comes near the ball of each shape: in single precision, with a margin for its rounding."""
     centres, radii = (np.array(part, np.float32) for part in zip(*(shape.ball for shape in shapes), strict=True))
     o, d = origins.astype(np.float32), directions.astype(np.float32)
     middle = centres @ d.T  # (M, R) where on the ray the ball is nearest

@@ -66,10 +66,10 @@ class Cases:
         armed = Armed(_trap(case), run, prepared.source.folder, self.folder / "state")
         child = self._start(prepared.source.arguments(run), armed)
         child.end()
-        said = child.errors.strip()
+        errors = child.errors.strip()
         wrong, names = [], ""
         if armed.fired:
-            names, wrong = _judged(case, child, armed, said, prepared.stages)
+            names, wrong = _judged(case, child, armed, errors, prepared.stages)
             found, wanted = digests(run, prepared.stages), prepared.expected.digests
             if child.code == 0:
                 wrong += [f"{stage}: other bytes at once" for stage, digest in found.items() if digest != wanted[stage]]
@@ -77,14 +77,14 @@ class Cases:
                 wrong.append(f"lost: {', '.join(lost)}")
             wrong += self._after(prepared, run)
         elif child.code != 0:
-            wrong.append(f"it ended with {child.code} without a fault: {said[:300]}")
+            wrong.append(f"it ended with {child.code} without a fault: {errors[:300]}")
         if wrong:
-            print(f"WRONG: {case} in {run}: {'; '.join(wrong)}\n       {armed.place} {said[:300]}", flush=True)
+            print(f"WRONG: {case} in {run}: {'; '.join(wrong)}\n       {armed.place} {errors[:300]}", flush=True)
         else:
             shutil.rmtree(run, ignore_errors=True)
         about = {"error": errno.errorcode[case.errno], "reached": armed.fired, "failed": armed.failed, "code": child.code, "names": names}
         place = " ".join(armed.place[1:]).replace(str(run), "RUN")
-        about |= {"place": place, "said": said.replace(str(run), "RUN")[:500]} if wrong else {}
+        about |= {"place": place, "errors": errors.replace(str(run), "RUN")[:500]} if wrong else {}
         report.record(self.book, {"event": "case", **asdict(case), **about, "wrong": wrong})
         return wrong
 
@@ -146,7 +146,7 @@ def _trap(case: Case) -> Trap:
     return Trap(case.number, case.where, (case.kind,), "", case.errno, case.lasting, fault_kinds, case.deadly)
 
 
-def _judged(case: Case, child: Child, armed: Armed, said: str, stages: Sequence[str]) -> tuple[str, list[str]]:
+def _judged(case: Case, child: Child, armed: Armed, errors: str, stages: Sequence[str]) -> tuple[str, list[str]]:
     """(what the message names: "file", "folder", "stage" or nothing; what is wrong with how the run ended)."""
     wrong = []
     if case.deadly:
@@ -159,20 +159,20 @@ def _judged(case: Case, child: Child, armed: Armed, said: str, stages: Sequence[
         allowed.add(4)
     if child.code not in allowed:
         wrong.append(f"exit code {child.code}")
-    if "Traceback" in said:
+    if "Traceback" in errors:
         wrong.append("a traceback")
     if child.code == 0:
         return "", wrong
-    lines = said.splitlines()
+    lines = errors.splitlines()
     message = [line for line in lines if line.startswith("enerf: ")]
     if len(message) != 1 or len(lines) > 2:
         wrong.append(f"{len(lines)} lines, {len(message)} of them a message")
     path = Path(armed.place[2])
     parts = path.name.strip(".").split(".")
-    if path.name in said or ".".join(parts[:2]) in said:
+    if path.name in errors or ".".join(parts[:2]) in errors:
         return "file", wrong
-    if str(path.parent) in said or str(armed.run) in said or str(armed.source) in said:
+    if str(path.parent) in errors or str(armed.run) in errors or str(armed.source) in errors:
         return "folder", wrong
-    if said.removeprefix("enerf: ").partition(":")[0] in stages:
+    if errors.removeprefix("enerf: ").partition(":")[0] in stages:
         return "stage", wrong
     return "nothing", [*wrong, "the message names neither file nor stage"]

@@ -5,7 +5,7 @@ time followed by the same command, until it is done; then its artifacts are comp
 
     moment   at a random time of a stage, or before a random one of its file operations (trap.py)
     signal   SIGKILL to the process alone or to its children too; SIGTERM; SIGINT once or twice; SIGSTOP, then SIGCONT
-    code     SIGTERM gives 143, SIGINT 130; a second run beside a stopped one gives 5
+    code     SIGTERM gives 143, SIGINT 130; a second run of the folder of a stopped one gives 5
 
 Only SIGKILL counts as a kill; every fourth hit is another signal, of a stage that was killed before.
 """
@@ -26,7 +26,7 @@ from benchmarks.torture.processes import Child
 from benchmarks.torture.sources import Source
 from benchmarks.torture.trap import Armed, Operation, Trap
 
-ENGINE = "engine"  # an aim beside the stages: the run's own files, between and around stages
+ENGINE = "engine"  # an aim that is no stage: the run's own files, between and around stages
 METHODS = ("KILL",) * 6 + ("TERM", "INT", "INT INT", "STOP")
 SHARE_FRESH = 10  # one round in so many is made with the real command
 SHARE_VERIFIED = 5
@@ -201,7 +201,7 @@ class Rounds:
         if not child.stage:
             return []  # it may have no lock yet, or none any more
         second = processes.start(prepared.source.arguments(run), self.folder / "second.txt", workflow=self.workflow)
-        return [] if second.end() == 5 else [f"a second run beside a stopped one ended with {second.code}: {second.errors.strip()[:300]}"]
+        return [] if second.end() == 5 else [f"a second run next to a stopped one ended with {second.code}: {second.errors.strip()[:300]}"]
 
     def _note(self, hit: Hit, child: Child, wrong: list[str]) -> None:
         hit.resumed, hit.wrong = child.resumed, hit.wrong + wrong
@@ -235,9 +235,9 @@ def _judged(hit: Hit, child: Child, began: bool, last: str) -> list[str]:
     done = child.code == 0 and summary.get("ok") is True
     all_done = last in child.seconds or any(event.get("event") == "stage_skipped" and event["stage"] == last for event in child.events)
     default = not began or all_done  # signals have their usual effect before the engine listens, and after
-    alone = child.code == 3 and "its process was ended by SIGKILL" in child.errors  # that of a stage which ran beside others
+    alone = child.code == 3 and "its process was ended by SIGKILL" in child.errors  # that of a stage which ran next to others
     good = {
-        "KILL": child.code == -signal.SIGKILL or alone or (done and hit.moment == "time"),  # it may end between the look at it and the signal
+        "KILL": child.code == -signal.SIGKILL or alone or (done and hit.moment == "time"),  # it may end just before the signal
         "TERM": child.code == 143 or done or (default and child.code == -signal.SIGTERM),
         "INT": child.code == 130 or done or (default and child.code == -signal.SIGINT),
         "INT INT": child.code in (130, -signal.SIGINT) or done,

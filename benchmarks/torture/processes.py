@@ -64,7 +64,7 @@ class Child:
     _closed: bool = False
 
     def listen(self, timeout: float = 0.0) -> None:
-        """Take what it has said, waiting so many seconds for more."""
+        """Read the events that it has printed, waiting so many seconds for more."""
         if self._closed:
             if timeout:
                 time.sleep(min(timeout, 0.002))

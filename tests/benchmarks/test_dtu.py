@@ -79,9 +79,3 @@ def test_faces_outside_of_a_mask_go_with_a_margin() -> None:
     left = np.array([[0.5, 1, 0], [9, 1, 0], [9, 9, 0.0]])
     kept = in_masks(np.concatenate([left + np.array([right, 0, 0]) for right in (0.0, 1.2, 1.4)]), np.arange(9).reshape(3, 3), [camera], [mask])
     assert kept.tolist() == [[0, 1, 2], [3, 4, 5]]  # 16 and 32 pixels beyond: 24 are allowed
-
-
-def test_missing_files_are_named(dtu: Path) -> None:
-    with pytest.raises(FileNotFoundError) as error:
-        observed(dtu, 25)
-    assert "ObsMask25_10.mat" in str(error.value)
