@@ -219,7 +219,7 @@ def measure(name: str, source: Path, run: Path, given: argparse.Namespace) -> di
     if error is None and row["missing"]:
         error = f"not made: {', '.join(row['missing'])}"
     picture = given.out / FILE / f"{name}.webp"
-    about = {"error": error, "date": datetime.date.today().isoformat(), "code": None, "options": " ".join(options), "machine": None}
+    about: dict[str, Any] = {"error": error, "date": datetime.date.today().isoformat(), "code": None, "options": " ".join(options), "machine": None}
     if not given.from_runs:
         about |= {"code": code_version(), "machine": hardware(given.hardware)}
     return {**about, **row, "picture": f"{FILE}/{picture.name}" if write_picture(run, picture) else None}

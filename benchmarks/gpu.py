@@ -2,7 +2,7 @@
 benchmarks/results/gpu.json after each part.
 
     python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,renders,trees,training,asset,pipeline] [--seconds 570] [--preset standard]
-                             [--asset FILE] [--json FILE]
+                             [--json FILE]
 
 Prints a line and ends where torch has no CUDA device. Each part runs in a process of its own, because an error on a device can break what follows it;
 a part that has not ended after its share of --seconds is stopped and recorded as such. All but the pipeline need METHOD alone
@@ -105,10 +105,7 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
         splats = {"splats_ms": gpu_kernels.splat_rates("cuda", 200_000, 512, 10)}
         return {"copy_gb_per_second": round(gpu_kernels.copy_rate("cuda", 2048, 10)), **gpu_kernels.kernel_rates("cuda", 2**16, 19, 20), **splats}
     if part == "renders":
-        from efficientnerf.asset import format
-
-        tree = format.load(given.asset) if given.asset else gpu_kernels.shell(384)
-        return gpu_kernels.frame_rates("cuda", tree, 800, 10)
+        return gpu_kernels.frame_rates("cuda", gpu_kernels.shell(384), 800, 10)
     if part == "trees":
         import gpu_tree
 
@@ -143,7 +140,6 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=570.0)
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="STAGE.NAME=VALUE")
-    parser.add_argument("--asset", type=Path, help="render this asset instead of a synthetic one")
     parser.add_argument("--json", type=Path, default=HERE / "results" / "gpu.json")
     parser.add_argument("--only", help=argparse.SUPPRESS)
     given = parser.parse_args()

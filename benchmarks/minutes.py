@@ -4,11 +4,15 @@ A row is a mapping: `method`, `set`, `minutes` and `options` name it; `code` is 
 there are none. Rows of several files (ours, peers') are shown in one table.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.machine import hardware
+from efficientnerf.evaluation.metrics import psnr, ssim
 from pipeline.files import read_json, write_json
 from stages.figures.plots import with_palette
 
@@ -17,6 +21,15 @@ OTHERS = 0.1  # cores that other programs may take of a row that counts as undis
 NAMED_BY = ("method", "set", "minutes", "options")
 COLUMNS = ("scene", "method", "minutes", "PSNR / dB", "SSIM", "MB", "peak MiB", "seconds", "pixels")
 BEGIN, END = "<!-- begin quality over minutes -->", "<!-- end quality over minutes -->"
+
+
+def mean_quality(pairs: Sequence[tuple[np.ndarray, np.ndarray]], whole: bool = True) -> dict[str, Any]:
+    """Means over renders and their photographs, (H, W, 3) from 0 to 1; SSIM of whole images alone."""
+    return {
+        "psnr": math.fsum(psnr(*pair) for pair in pairs) / len(pairs),
+        "ssim": math.fsum(ssim(*pair) for pair in pairs) / len(pairs) if whole else None,
+        "views": len(pairs),
+    }
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:

@@ -1,13 +1,11 @@
 """The command line of the fuzzer; see the package."""
 
 import argparse
-import functools
 import importlib.metadata
 import importlib.util
 import platform
 import sys
 import tempfile
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -33,27 +31,19 @@ def main() -> int:
         return 2
     if given.file is not None:
         return _again(given.readers[0], given.file)
-    wrong = False
-    local, all_nurseries = threading.local(), []
-
-    def begin() -> None:
-        local.nurseries = campaign.Nurseries()
-        all_nurseries.append(local.nurseries)
+    wrong, nurseries = False, campaign.Nurseries()
 
     def fuzz(name: str) -> tuple[str, dict[str, Any]]:
         count = round(given.inputs * READERS[name].share)
-        say = functools.partial(print, flush=True)
-        return name, campaign.fuzz(name, count, given.seed, local.nurseries, coverage=coverage, shrink=given.shrink, say=say)
+        return name, campaign.fuzz(name, count, given.seed, nurseries, coverage=coverage, shrink=given.shrink)
 
-    with ThreadPoolExecutor(given.jobs, initializer=begin) as threads:
+    with ThreadPoolExecutor(given.jobs) as threads:
         for done in as_completed([threads.submit(fuzz, name) for name in given.readers or READERS]):
             name, result = done.result()
             wrong = wrong or bool(result["findings"])
             _tell(name, result, given.findings)
             if given.json is not None:
                 write(given.json, name, result, given.seed, coverage)
-    for each in all_nurseries:
-        each.close()
     return int(wrong)
 
 

@@ -1,8 +1,9 @@
 """Many inputs on many readers, in batches, and on after the input of which a worker died; what the workers report is added up."""
 
 import json
+import threading
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ GUIDED = 0.25  # of the inputs are guided by coverage, which takes twice the tim
 BATCH = 75_000  # inputs of one process
 
 
-class Nurseries:
-    """Those of one thread, made when they are needed."""
+class Nurseries(threading.local):
+    """Those of each thread, made when they are needed. They end with this process, which closes their standard input."""
 
     def __init__(self) -> None:
         self.made: dict[bool, Nursery] = {}
@@ -24,12 +25,8 @@ class Nurseries:
             self.made[coverage] = Nursery(coverage)
         return self.made[coverage]
 
-    def close(self) -> None:
-        for each in self.made.values():
-            each.close()
 
-
-def fuzz(name: str, inputs: int, seed: int, nurseries: Nurseries, *, coverage: bool, shrink: float, say: Callable[[str], None]) -> dict[str, Any]:
+def fuzz(name: str, inputs: int, seed: int, nurseries: Nurseries, *, coverage: bool, shrink: float) -> dict[str, Any]:
     """All inputs of one reader; the sum of what its processes reported."""
     parts: list[dict[str, Any]] = []
     deaths: list[dict[str, Any]] = []
@@ -47,7 +44,7 @@ def fuzz(name: str, inputs: int, seed: int, nurseries: Nurseries, *, coverage: b
             else:
                 parts.append(found)
                 first += found["inputs"]
-            say(f"{name}: {first} inputs, {sum(len(part['findings']) for part in parts)} findings")
+            print(f"{name}: {first} inputs, {sum(len(part['findings']) for part in parts)} findings", flush=True)
     return summed(name, parts)
 
 

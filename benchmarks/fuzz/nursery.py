@@ -105,8 +105,3 @@ class Nursery:
         """The next line that it prints; None where there is none within so many seconds."""
         assert self.process.stdout is not None
         return self.process.stdout.readline().decode().strip() if select.select([self.process.stdout], [], [], seconds)[0] else None
-
-    def close(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()

@@ -12,7 +12,6 @@ A peer has the settings that were the best of those tried: docs/experiments/peer
 
 import argparse
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.minutes import read_rows, same_row, with_row, write_rows
+from benchmarks.minutes import mean_quality, read_rows, same_row, with_row, write_rows
 from benchmarks.project import DATA, RESULTS
 from benchmarks.quality_over_minutes import PEERS, source_of
 from benchmarks.scenes.__main__ import as_blender
@@ -46,19 +45,6 @@ def truth_of(folder: Path, stride: int) -> list[np.ndarray]:
     return [subsample(pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:]), stride) for pixels in images]
 
 
-def quality(renders: np.ndarray, truth: Sequence[np.ndarray], whole: bool) -> dict[str, Any]:
-    """Means over the views; SSIM of whole images alone."""
-    from efficientnerf.evaluation.metrics import psnr, ssim
-
-    if len(renders) != len(truth):
-        raise SystemExit(f"{len(renders)} views were rendered, {len(truth)} are there")
-    pairs = [(np.clip(np.asarray(image, np.float64), 0, 1), np.asarray(true, np.float64)) for image, true in zip(renders, truth, strict=True)]
-    found = {"psnr": math.fsum(psnr(*pair) for pair in pairs) / len(pairs), "views": len(pairs), "ssim": None}
-    if whole:
-        found["ssim"] = math.fsum(ssim(*pair) for pair in pairs) / len(pairs)
-    return found
-
-
 def row_of(named: Mapping[str, Any], data: Path, out: Path, given: argparse.Namespace) -> dict[str, Any]:
     """Train and render in the peer's environment, and compare here."""
     shutil.rmtree(out, ignore_errors=True)
@@ -73,8 +59,9 @@ def row_of(named: Mapping[str, Any], data: Path, out: Path, given: argparse.Name
     if done.returncode != 0:
         raise SystemExit(f"{given.peer}: exit code {done.returncode}; see {out / 'log.txt'}")
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    pairs = [(np.clip(image, 0, 1), true) for image, true in zip(np.load(out / "renders.npy"), truth_of(data, given.stride), strict=True)]
     return {
-        **named, **quality(np.load(out / "renders.npy"), truth_of(data, given.stride), given.stride == 1), "stride": given.stride,
+        **named, **mean_quality(pairs, given.stride == 1), "stride": given.stride,
         "megabytes": report["model_bytes"] / 1e6, "peak_mib": report["peak_mib"], "seconds": report["seconds"], "load": load,
         "code": f"{given.peer} {report['versions'].get('nerfstudio', '')}".strip(),
         **{key: report[key] for key in ("steps", "rays_per_second", "rendering_seconds", "threads", "settings", "versions")},

@@ -9,7 +9,6 @@ other. OpenSplat has its own options for 30,000 steps: with schedules made as sh
 """
 
 import argparse
-import math
 import os
 import shutil
 import signal
@@ -21,9 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.minutes import OURS, read_rows, with_row, write_rows
+from benchmarks.minutes import OURS, mean_quality, read_rows, with_row, write_rows
 from benchmarks.project import ENERF, RESULTS, code_version
-from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.rendering import render
 from efficientnerf.surface.mesh import PointCloud
@@ -86,16 +84,13 @@ def gaussians_of(out: Path) -> Gaussians:
     raise SystemExit(f"{out}: no Gaussians were written")
 
 
-def quality(poses: Path, gaussians: Gaussians) -> dict[str, float]:
+def quality(poses: Path, gaussians: Gaussians) -> dict[str, Any]:
     """Mean PSNR and SSIM over the test views, by our renderer, of 8-bit images."""
     pairs = [
         (np.clip(render(gaussians, view.camera, BEHIND).colour, 0, 1), scene.read_image(poses, view)[..., :3].astype(np.float32) / 255)
         for view in scene.views_of(scene.load(poses), "test")
     ]
-    return {
-        "psnr": math.fsum(psnr(*pair) for pair in pairs) / len(pairs), "ssim": math.fsum(ssim(*pair) for pair in pairs) / len(pairs), "views": len(pairs),
-        "gaussians": len(gaussians),
-    }  # fmt: skip
+    return mean_quality(pairs) | {"gaussians": len(gaussians)}
 
 
 def ours(run: Path, source: Path, out: Path, minutes: float) -> dict[str, Any]:

@@ -127,7 +127,7 @@ class Rounds:
         if not child.alive() and not (armed and armed.fired):
             child.end()
             if child.code != 0:
-                self._note(hit, child, [f"it ended with {child.code} before it was hit: {child.errors.strip()[:300]}"])
+                self._record(hit, child, [f"it ended with {child.code} before it was hit: {child.errors.strip()[:300]}"])
             return  # it was done before the moment came
         if armed and armed.fired:
             stage, kind, path = armed.place
@@ -173,40 +173,39 @@ class Rounds:
             time.sleep(self.random.uniform(0.0, 0.05))
             child.signal(signal.SIGINT, group=True)
         if hit.signal == "STOP":
-            wrong += self._beside(child, prepared, run)
+            wrong += self._second_run(child, prepared, run)
             child.signal(signal.SIGCONT, group=True)
             if self.random.random() < 0.8:
                 child.listen(self.random.uniform(0.0, 0.2))
                 child.signal(signal.SIGKILL, group=True)
         child.end()
-        hit.code = child.code or 0
         if hit.signal == "INT" and not sent and child.armed is not None and child.armed.fired:
             hit.signal = "INT INT"  # the trap was quicker than its end
         wrong += _judged(hit, child, began, prepared.stages[-1])
-        self._note(hit, child, wrong)
         self.kills += child.code == -signal.SIGKILL
         if child.code == -signal.SIGKILL:
             self.killed.add(hit.stage)
         if hit.signal != "KILL" and child.leftover():
-            hit.wrong.append("a child process lives on")
+            wrong.append("a child process lives on")
         self.hits[hit.stage] += 1
         if self.random.randrange(SHARE_VERIFIED) == 0 and (run / "run.json").exists():
             verified = processes.start(["verify", str(run)], self.folder / "verify.txt", workflow=self.workflow)
             if verified.end() != 0:
-                hit.wrong.append(f"verify ended with {verified.code}: {verified.errors.strip()[:300]}")
-        report.record(self.book, {"event": "hit", **asdict(hit)})
+                wrong.append(f"verify ended with {verified.code}: {verified.errors.strip()[:300]}")
+        self._record(hit, child, wrong)
 
-    def _beside(self, child: Child, prepared: Prepared, run: Path) -> list[str]:
-        """What a second run says while the first is stopped."""
+    def _second_run(self, child: Child, prepared: Prepared, run: Path) -> list[str]:
+        """What is wrong with a second run while the first is stopped."""
         if not child.stage:
             return []  # it may have no lock yet, or none any more
         second = processes.start(prepared.source.arguments(run), self.folder / "second.txt", workflow=self.workflow)
         return [] if second.end() == 5 else [f"a second run next to a stopped one ended with {second.code}: {second.errors.strip()[:300]}"]
 
-    def _note(self, hit: Hit, child: Child, wrong: list[str]) -> None:
-        hit.resumed, hit.wrong = child.resumed, hit.wrong + wrong
+    def _record(self, hit: Hit, child: Child, wrong: list[str]) -> None:
+        hit.code, hit.resumed, hit.wrong = child.code or 0, child.resumed, wrong
         if wrong:
             print(f"WRONG: {hit}", flush=True)
+        report.record(self.book, {"event": "hit", **asdict(hit)})
 
     def _start(self, source: Source, run: Path, armed: Armed | None, *, fresh: bool) -> Child:
         child = processes.start(source.arguments(run), self.folder / "errors.txt", armed, fresh=fresh, workflow=self.workflow)
