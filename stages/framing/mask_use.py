@@ -48,14 +48,14 @@ class MaskUse:
     @property
     def sentences(self) -> list[str]:
         names = {"alpha": "alpha channels", "masks": "masks"}
-        use = {"alpha": self.silhouettes.alpha, "masks": self.silhouettes.masks}
-        return [f"{names[kind]} {'are silhouettes' if use[kind] else 'leave pixels out'}: {why}" for kind, why in self.reasons.items()]
+        use = {True: "are silhouettes", False: "leave pixels out"}
+        return [f"{names[kind]} {use[getattr(self.silhouettes, kind)]}: {why}" for kind, why in self.reasons.items()]
 
     @property
     def facts(self) -> dict[str, object]:
         """For the report."""
-        use = {"alpha": self.silhouettes.alpha, "masks": self.silhouettes.masks}
-        return {kind: {"use": "silhouette" if use[kind] else "ignore", "because": why} for kind, why in self.reasons.items()}
+        use = {True: "silhouette", False: "ignore"}
+        return {kind: {"use": use[getattr(self.silhouettes, kind)], "because": why} for kind, why in self.reasons.items()}
 
 
 def find_mask_use(capture: Capture, choice: str, renders: bool, reader: PhotoReader, safe_point: Callable[[], None] = lambda: None) -> MaskUse:
@@ -76,8 +76,7 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, reader: PhotoRea
         pictures = _pictures(photos, reader.alpha, safe_point)
         if any(picture is not None and (picture < 255).any() for _, picture in pictures):
             rendered = renders and there["alpha"] == len(photos)
-            use["alpha"], reasons["alpha"], names = _of_renders(pictures) if rendered else _of_photographs(capture, pictures)
-            doubtful += names
+            use["alpha"], reasons["alpha"], doubtful = (*_of_renders(pictures), []) if rendered else _of_photographs(capture, pictures)
     if there["masks"]:
         if all(photo.mask_ignore == "white" for photo in photos if photo.mask is not None):
             reasons["masks"] = "they mark what moves"
@@ -104,14 +103,18 @@ def compactness(kept: np.ndarray) -> str | None:
         return f"keep more than {MOST_KEPT:.0%} of the picture"
     if share < LEAST_KEPT:
         return "keep next to nothing"
-    border = np.concatenate([kept[0], kept[-1], kept[1:-1, 0], kept[1:-1, -1]])
-    if border.mean() > MOST_OF_BORDER:
+    if along_border(kept).mean() > MOST_OF_BORDER:
         return f"keep more than {MOST_OF_BORDER:.0%} of the picture's border"
     _, labels = cv2.connectedComponents(kept.astype(np.uint8), connectivity=8)
     sizes = np.sort(np.bincount(labels[kept]))[::-1]
     if sizes[:PARTS].sum() < LEAST_OF_PARTS * kept.sum():
         return f"keep more than {PARTS} parts"
     return None
+
+
+def along_border(kept: np.ndarray) -> np.ndarray:
+    """(N,) the pixels along the border of a picture (h, w)."""
+    return np.concatenate([kept[0], kept[-1], kept[1:-1, 0], kept[1:-1, -1]])
 
 
 def finer_hull(pictures: Sequence[np.ndarray], cameras: Sequence[Camera], hull: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +145,7 @@ def projection(xyz: np.ndarray, step: np.ndarray, camera: Camera, shape: tuple[i
 
 def _pixels(xyz: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Index of each point (N, 3) that a camera has in view, and the column and row of its pixel."""
-    shown = np.flatnonzero(scene_bounds.in_view(xyz, [camera])[0])
+    shown = np.flatnonzero(scene_bounds.shows(xyz, camera))
     column, row = np.minimum(np.floor(project(camera, xyz[shown])[0]).astype(int), (camera.width - 1, camera.height - 1)).T
     return shown, column, row
 
@@ -163,16 +166,16 @@ def _pictures(photos: Sequence[Photo], read: Callable[[Photo], np.ndarray | None
     return found
 
 
-def _of_renders(pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[bool, str, list[str]]:
+def _of_renders(pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[bool, str]:
     """For images that all have an alpha channel, in a format that renders come in: where most are transparent somewhere, they show an object."""
     alphas = [picture for _, picture in pictures if picture is not None]  # images that cannot be read have no say
     transparent = [alpha for alpha in alphas if (alpha < 255).any()]
     if 2 * len(transparent) <= len(alphas):
-        return False, f"{len(alphas) - len(transparent)} of {len(alphas)} images are opaque", []
+        return False, f"{len(alphas) - len(transparent)} of {len(alphas)} images are opaque"
     cut_out = [alpha for alpha in transparent if compactness(alpha >= 128) != f"keep more than {MOST_KEPT:.0%} of the picture"]
     if 2 * len(cut_out) <= len(transparent):
-        return False, f"{len(transparent) - len(cut_out)} of {len(alphas)} images keep more than {MOST_KEPT:.0%} of the picture", []
-    return True, "every image has an alpha channel, and most are transparent somewhere, as renders of an object are", []
+        return False, f"{len(transparent) - len(cut_out)} of {len(alphas)} images keep more than {MOST_KEPT:.0%} of the picture"
+    return True, "every image has an alpha channel, and most are transparent somewhere, as renders of an object are"
 
 
 def alike(pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[str, list[tuple[Photo, np.ndarray]]]:

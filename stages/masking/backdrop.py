@@ -26,7 +26,7 @@ from stages.io.capture import Capture, Silhouettes
 from stages.io.pictures import UnreadableImage
 from stages.io.png import read_png, write_png
 from stages.io.reader import SMALL, PhotoReader
-from stages.masking.made import made_masks
+from stages.masking.made import made_masks, with_masks
 
 WHITE = "white"
 MARGIN = 3  # px at `SMALL`, that a silhouette may reach beyond the hull, whose voxels are as wide
@@ -44,9 +44,8 @@ def without_white_backdrop(job: Job, capture: Capture, paths: Mapping[str, Path]
         masks = made_masks({name: paths[name] for name in names}, WHITE, job.work / "masks", safe_point=job.safe_point, progress=job.progress, warn=warn)
     except BadInput:
         return capture
-    photos = tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in capture.photos)
     kind = Silhouettes(masks=True)
-    masked = replace(capture, photos=photos, silhouettes=kind, points=points.only(reliable))
+    masked = replace(with_masks(capture, masks), silhouettes=kind, points=points.only(reliable))
     if 1 - points_of_object(masked, reader).mean() > MAX_CONTRADICTED or share_that_fits(masked, kind, reader) < MIN_AGREEING:
         return capture
     _keep_hull(job, masked, reader)
@@ -54,7 +53,7 @@ def without_white_backdrop(job: Job, capture: Capture, paths: Mapping[str, Path]
     if in_white > MAX_CONTRADICTED:
         return capture
     job.say("the subject stands before a white backdrop without a feature, which is left out; --mask off uses the full images", points_in_backdrop=in_white)
-    return replace(capture, photos=photos, provenance=structs.replace(capture.provenance, background="white"))
+    return replace(capture, photos=masked.photos, provenance=structs.replace(capture.provenance, background="white"))
 
 
 def _keep_hull(job: Job, capture: Capture, reader: PhotoReader) -> None:

@@ -23,12 +23,12 @@ from stages.compiling import compiling_kernels
 from stages.cores import count_cores, in_order
 from stages.figures.plots import grid_sheet
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
-from stages.framing.mask_use import LEAST_OVERLAP, MIN_AGREEING, alike, has_alpha, hull_overlaps
+from stages.framing.mask_use import LEAST_OVERLAP, MIN_AGREEING, alike, along_border, has_alpha, hull_overlaps
 from stages.io.capture import FOREGROUND, Capture, Photo, without
 from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, grey_of, opened
 from stages.masking.first_training import RAYS, SIDE, FirstField, first_field, first_training_needed
-from stages.masking.made import write_mask
+from stages.masking.made import with_masks, write_mask
 from stages.masking.subject import Subject, coverage, subject_of
 from stages.memory.need import refuse_what_does_not_fit
 from stages.poses.memory import reading_threads
@@ -68,9 +68,9 @@ def with_foreground_masks(job: Job, capture: Capture, warn: Any) -> Capture:
         note(folder / "made.json", msgspec.to_builtins(made), [folder / file for file in made.masks.values()])
     masks = {name: folder / file for name, file in made.masks.items()}
     job.say(f"foreground silhouettes: {len(masks)} of {len(capture.photos)} photographs, overlap with their visual hull {made.facts['overlap']:.0%}")
-    photos = tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in capture.photos)
-    _draw(photos, images, PosesOutputs(job.out).silhouettes)
-    return replace(capture, photos=photos, facts={**capture.facts, FOREGROUND: made.facts})
+    capture = with_masks(capture, masks)
+    _draw(capture.photos, images, PosesOutputs(job.out).silhouettes)
+    return replace(capture, facts={**capture.facts, FOREGROUND: made.facts})
 
 
 def _made_anew(job: Job, capture: Capture, images: list[np.ndarray], folder: Path) -> _Made:
@@ -133,8 +133,7 @@ def _made(job: Job, capture: Capture, field: FirstField, subject: Subject, folde
     why_not, compact = alike(small)
     if why_not:
         raise _refused(why_not)
-    borders = [np.concatenate([kept[0], kept[-1], kept[1:-1, 0], kept[1:-1, -1]]) for _, kept in compact]
-    cut = [photo.camera.name for (photo, _), border in zip(compact, borders, strict=True) if border.mean() > AT_BORDER]
+    cut = [photo.camera.name for photo, kept in compact if along_border(kept).mean() > AT_BORDER]
     if len(cut) > MOST_CUT * len(small):
         raise _refused(f"the border of the picture cuts off the silhouettes of {len(cut)} of {len(small)} photographs: {abbreviated(cut)}")
     overlap = hull_overlaps(capture, compact)

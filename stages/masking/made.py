@@ -2,62 +2,51 @@
 
 import contextlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import cv2
 import numpy as np
 
 from efficientnerf.capture.keying import key_of, keyed
 from pipeline.errors import BadInput
+from pipeline.files import SafePoint
+from stages.io.capture import Capture
 from stages.io.photo import DecodedPhoto, read_photo
 from stages.io.pictures import UnreadableImage
 from stages.io.png import write_png
 from stages.masking.network import MaskNetwork
 from stages.masking.static import SIDE, StillBackground, sharpened
+from stages.sfm.images import Callables
 
 STATIC = "static"
 MASK_SIDE = 2048  # px, longest side of the photographs that masks are made from
-Warn = Callable[..., Any]
 Make = Callable[[DecodedPhoto, Path], np.ndarray | None]  # the mask of a photograph, by its pixels and its file; None where it has none
 
 
-def made_masks(
-    paths: Mapping[str, Path], how: str, folder: Path, *, safe_point: Callable[[], None], progress: Callable[[int, int, str], None], warn: Warn
-) -> dict[str, Path]:
+def made_masks(paths: Mapping[str, Path], how: str, folder: Path, **callables: Unpack[Callables]) -> dict[str, Path]:
     """Name -> mask, written to a folder, of the photographs whose background is found.
 
     how    static, green, white or #rrggbb
     Raises BadInput where no photograph has one.
     """
-    make = _by_stillness(paths, sorted(paths), safe_point) if how == STATIC else _by_key(how)
-    return _all_made(paths, make, folder, f"--mask {how}", "such background", safe_point=safe_point, progress=progress, warn=warn)
+    make = _by_stillness(paths, callables["safe_point"]) if how == STATIC else _by_key(how)
+    return _all_made(paths, make, folder, f"--mask {how}", "such background", **callables)
 
 
-def masks_by_network(
-    paths: Mapping[str, Path], model: Path, folder: Path, *, safe_point: Callable[[], None], progress: Callable[[int, int, str], None], warn: Warn
-) -> dict[str, Path]:
+def masks_by_network(paths: Mapping[str, Path], model: Path, folder: Path, **callables: Unpack[Callables]) -> dict[str, Path]:
     """The same of photographs in which a network finds a subject. Raises UsageError and BadInput."""
-    return _all_made(paths, _by_network(model), folder, f"--mask-model {model.name}", "subject", safe_point=safe_point, progress=progress, warn=warn)
+    return _all_made(paths, _by_network(model), folder, f"--mask-model {model.name}", "subject", **callables)
 
 
-def _all_made(
-    paths: Mapping[str, Path],
-    make: Make,
-    folder: Path,
-    option: str,
-    what: str,
-    *,
-    safe_point: Callable[[], None],
-    progress: Callable[[int, int, str], None],
-    warn: Warn,
-) -> dict[str, Path]:
+def _all_made(paths: Mapping[str, Path], make: Make, folder: Path, option: str, what: str, **callables: Unpack[Callables]) -> dict[str, Path]:
     names = sorted(paths)
     folder.mkdir(parents=True, exist_ok=True)
     found, without = {}, []
     for number, name in enumerate(names):
-        safe_point()
-        progress(number, len(names), "masks")
+        callables["safe_point"]()
+        callables["progress"](number, len(names), "masks")
         try:
             photo = read_photo(paths[name], MASK_SIDE)
         except UnreadableImage:
@@ -68,10 +57,9 @@ def _all_made(
             found[name] = folder / f"{number:05d}.png"
             write_mask(mask, (photo.width, photo.height), found[name])
     if not found:
-        article = "such a background" if what == "such background" else f"a {what}"
-        raise BadInput(f"{option}: no photograph shows {article}. Choose another, or omit {option.split()[0]}.")
+        raise BadInput(f"{option}: no {what} in any photograph. Choose another, or omit {option.split()[0]}.")
     if without:
-        warn(f"{option}: no {what} in {len(without)} of {len(names)} photographs, such as {without[0]}; they get no mask", images=without)
+        callables["warn"](f"{option}: no {what} in {len(without)} of {len(names)} photographs, such as {without[0]}; they get no mask", images=without)
     return found
 
 
@@ -90,9 +78,9 @@ def _by_key(how: str) -> Make:
     return lambda photo, path: keyed(photo.rgb, key)
 
 
-def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Callable[[], None]) -> Make:
+def _by_stillness(paths: Mapping[str, Path], safe_point: SafePoint) -> Make:
     small: dict[Path, np.ndarray] = {}
-    for name in names:
+    for name in sorted(paths):
         safe_point()
         with contextlib.suppress(UnreadableImage):
             small[paths[name]] = read_photo(paths[name], SIDE).rgb
@@ -105,6 +93,11 @@ def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Calla
         return sharpened(mask, photo.rgb) if mask.any() else None
 
     return make
+
+
+def with_masks(capture: Capture, masks: Mapping[str, Path | None]) -> Capture:
+    """The capture with these masks, by name; other photographs keep theirs."""
+    return replace(capture, photos=tuple(replace(photo, mask=masks.get(photo.camera.name, photo.mask)) for photo in capture.photos))
 
 
 def write_mask(mask: np.ndarray, size: tuple[int, int], target: Path) -> None:

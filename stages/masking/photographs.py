@@ -22,13 +22,14 @@ from stages.io.pictures import UnreadableImage, read_header
 from stages.io.reader import PhotoReader
 from stages.masking.backdrop import without_white_backdrop
 from stages.masking.background import silhouettes_with_surroundings
-from stages.masking.made import made_masks, masks_by_network
+from stages.masking.made import made_masks, masks_by_network, with_masks
 from stages.masking.polarity import INVERTED_NOTICE, kept_white
 from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
 from stages.sfm.added.networks import given_networks
 from stages.sfm.attempts import MIN_REGISTERED
 from stages.sfm.cameras import find_cameras
+from stages.sfm.images import Callables
 from stages.sfm.pairs import features_for
 from stages.sfm.reconstruction import Request
 
@@ -99,7 +100,7 @@ def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[st
         if other is None or not fit(other):
             raise
     else:
-        other = replace(capture, photos=tuple(replace(photo, mask=inverted.get(photo.camera.name)) for photo in capture.photos))
+        other = with_masks(capture, {**dict.fromkeys(masks), **inverted})
         if not fit(other):
             return capture
     job.say(INVERTED_NOTICE)
@@ -108,16 +109,15 @@ def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[st
 
 def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, Path]:
     """Masks made for these photographs, by name, as `poses.mask_from` and `poses.mask_model` say."""
-    common: dict[str, Any] = {"safe_point": job.safe_point, "progress": job.progress, "warn": warn}
+    how, network, folder = job.settings.mask_from, job.settings.mask_model, job.work / "masks"
+    callables = Callables(safe_point=job.safe_point, progress=job.progress, warn=warn)
     if not paths:
         return {}
-    if job.settings.mask_model != "off" and job.settings.mask_from not in ("auto", "off"):
-        raise UsageError(f"--mask {job.settings.mask_from} and --mask-model: masks are made in one way. Give one of them.")
-    if job.settings.mask_model != "off":
-        return masks_by_network(paths, Path(job.settings.mask_model), job.work / "masks", **common)
-    if job.settings.mask_from in ("auto", "off", FOREGROUND):  # the last needs cameras
-        return {}
-    return made_masks(paths, job.settings.mask_from, job.work / "masks", **common)
+    if network != "off":
+        if how not in ("auto", "off"):
+            raise UsageError(f"--mask {how} and --mask-model: masks are made in one way. Give one of them.")
+        return masks_by_network(paths, Path(network), folder, **callables)
+    return {} if how in ("auto", "off", FOREGROUND) else made_masks(paths, how, folder, **callables)  # the foreground needs cameras
 
 
 def mask_choice(settings: Any, provenance: Provenance) -> str:
@@ -212,8 +212,7 @@ def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mappi
     job.say(f"{what} are used as silhouettes; features outside them are used too, because the background moves with the object")
     whole: Capture | None = None
     with contextlib.suppress(BadInput):
-        found = find("cameras", everywhere)
-        whole = replace(found, photos=tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in found.photos))
+        whole = with_masks(find("cameras", everywhere), masks)
         if fit(whole) >= MIN_AGREEING * len(whole.photos):
             return whole
     job.say("the silhouettes do not fit these cameras; cameras are estimated again from the object alone")

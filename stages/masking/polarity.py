@@ -19,6 +19,7 @@ from stages.io.png import FAST, write_png
 from stages.io.reader import PhotoReader
 from stages.io.working_images import mask_levels
 from stages.masking.background import photo_without_camera
+from stages.masking.made import with_masks
 
 INVERTED = "masks keep what is black; what is white is left out"
 INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white reverses this"
@@ -58,8 +59,7 @@ def capture_kept_white(job: Job, capture: Capture, reader: PhotoReader) -> Captu
         if share_that_fits(flipped, Silhouettes(masks=True), reader) < MIN_AGREEING:
             return capture
     job.say(INVERTED_NOTICE if polarity == "auto" else INVERTED)
-    masks = _turned_round(job, photos)
-    return replace(capture, photos=tuple(replace(photo, mask=masks.get(photo.camera.name, photo.mask)) for photo in capture.photos))
+    return with_masks(capture, _turned_round(job, photos))
 
 
 def _look_inverted(photos: Sequence[Photo], reader: PhotoReader) -> bool:

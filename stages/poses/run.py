@@ -33,6 +33,7 @@ from stages.io.capture import FOREGROUND, Capture, Photo, without
 from stages.io.pictures import UnreadableImage
 from stages.io.reader import PhotoReader
 from stages.io.scene import SPLITS, Scene, View, save, save_points
+from stages.masking.made import with_masks
 from stages.masking.photographs import cameras_of_photographs, mask_choice, masks_made_for
 from stages.masking.polarity import capture_kept_white
 from stages.memory.need import refuse_what_does_not_fit
@@ -125,7 +126,7 @@ def read(job: Job, settings: PosesSettings, reader: PhotoReader, warn: Any) -> C
             warn(sentence)
         capture = capture_kept_white(job, capture, reader)
         made = masks_made_for(job, {photo.camera.name: photo.image for photo in capture.photos if photo.mask is None}, warn)
-        capture = replace(capture, photos=tuple(replace(photo, mask=made.get(photo.camera.name, photo.mask)) for photo in capture.photos))
+        capture = with_masks(capture, made)
     else:
         capture = cameras_of_photographs(job, reader, warn)
     if settings.mask_from == FOREGROUND:
