@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, Similarity, project
-from stages.framing.scene_bounds import in_view
+from stages.framing.scene_bounds import shows
 from stages.io.capture import Capture, SparsePoints
 
 MIN_TRACK = 3  # photographs that observe a reliable point
@@ -73,7 +73,7 @@ def content_depths(capture: Capture, placed: Sequence[Camera], world: Similarity
         if photo.near and photo.far:
             row[:] = photo.near * world.scale, photo.far * world.scale
             continue
-        depths = np.sort((xyz[in_view(xyz, [camera])[0]] - camera.centre) @ camera.forward)
+        depths = np.sort((xyz[shows(xyz, camera)] - camera.centre) @ camera.forward)
         if len(depths) >= MIN_POINTS:
             outside = min(int(OUTSIDE * len(depths)), MOST_OUTSIDE)
             row[:] = depths[outside], depths[-1 - outside]
@@ -108,6 +108,6 @@ def depths_in_picture(point: np.ndarray, placed: Sequence[Camera]) -> np.ndarray
     """(C,) depth of a point for the cameras that have it in their picture; nan for the others."""
     found = np.full(len(placed), np.nan)
     for n, camera in enumerate(placed):
-        if in_view(point[None], [camera])[0, 0]:
+        if shows(point[None], camera)[0]:
             found[n] = project(camera, point[None])[1][0]
     return found

@@ -109,7 +109,7 @@ def bounds_of_points(points: SparsePoints, cameras: Sequence[Camera], focus: np.
 
 def _cameras_pass_through(xyz: np.ndarray, cameras: Sequence[Camera], centres: np.ndarray) -> bool:
     """Whether the cameras' path is longer than the usual depth of their content."""
-    depths = [depth[inside] for inside, depth in ((in_view(xyz, [camera])[0], project(camera, xyz)[1]) for camera in cameras) if inside.any()]
+    depths = [depth[inside] for inside, depth in ((shows(xyz, camera), project(camera, xyz)[1]) for camera in cameras) if inside.any()]
     extent = np.linalg.norm(np.quantile(centres, 0.9, axis=0) - np.quantile(centres, 0.1, axis=0))
     return bool(depths) and float(np.median([np.quantile(depth, 0.25) for depth in depths])) < float(extent)
 
@@ -133,13 +133,23 @@ def outliers(xyz: np.ndarray) -> np.ndarray:
 
 def in_view(xyz: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """(C, N) bool: which points project into the images of which cameras."""
-    rows = []
-    for camera in cameras:
-        pixels, depth = project(camera, xyz)
-        with np.errstate(invalid="ignore"):
-            inside = (pixels >= 0).all(1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
-        rows.append(inside & (depth > 0))
-    return np.array(rows).reshape(len(cameras), len(xyz))
+    return np.array([shows(xyz, camera) for camera in cameras]).reshape(len(cameras), len(xyz))
+
+
+def shows(xyz: np.ndarray, camera: Camera, mask: np.ndarray | None = None, margin: float = 0.0) -> np.ndarray:
+    """(N,) bool: which points (N, 3) a camera shows by a pixel that its mask (h, w), of any size, keeps.
+
+    margin  how far outside of the picture counts as its border, as a share of its longest side
+    """
+    pixels, depth = project(camera, xyz)
+    size, beyond = np.array([camera.width, camera.height]), margin * max(camera.width, camera.height)
+    with np.errstate(invalid="ignore"):
+        found = (depth > 0) & (pixels >= -beyond).all(1) & (pixels <= size + beyond).all(1)
+    if mask is not None:
+        at = np.flatnonzero(found)
+        cells = np.clip((pixels[at] * (np.array(mask.shape[::-1]) / size)).astype(int), 0, np.array(mask.shape[::-1]) - 1)
+        found[at] = mask[cells[:, 1], cells[:, 0]]
+    return np.asarray(found)
 
 
 def bounds_of_frusta(

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from efficientnerf.capture.coverage import meeting_point
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.geometry.spaces import Space
-from stages.framing.scene_bounds import in_view
+from stages.framing.scene_bounds import shows
 from stages.io.scene import View, read_mask
 
 Masks = Sequence[np.ndarray | None]  # (h, w) bool of each view at any size, True where pixels are kept; None: everywhere
@@ -110,7 +110,7 @@ def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int,
     undecided = np.arange(len(points) if needed > 1 else 0)
     for n in bit_reversed_order(len(cameras)):
         ahead = undecided[(points[undecided] - cameras[n].centre) @ cameras[n].forward > 0]  # cheaper than to project all
-        count[ahead] += in_view(points[ahead], [cameras[n]])[0] if masks is None else shows(points[ahead], cameras[n], masks[n])
+        count[ahead] += shows(points[ahead], cameras[n], None if masks is None else masks[n])
         undecided = undecided[count[undecided] < needed]
     return (count >= needed) | (needed < 2)
 
@@ -236,22 +236,6 @@ def before_near(points: np.ndarray, camera: Camera, near: float) -> np.ndarray:
     pixels, depth = project(camera, points)
     with np.errstate(invalid="ignore"):
         return np.asarray((depth > 0) & (depth < near) & (pixels >= 0).all(1) & (pixels <= (camera.width, camera.height)).all(1))
-
-
-def shows(points: np.ndarray, camera: Camera, mask: np.ndarray | None, margin: float = 0.0) -> np.ndarray:
-    """(N,) bool: which points (N, 3) a camera shows by a pixel that its mask keeps.
-
-    margin  how far outside of the picture counts as its border, as a share of its longest side
-    """
-    pixels, depth = project(camera, points)
-    size, beyond = np.array([camera.width, camera.height]), margin * max(camera.width, camera.height)
-    with np.errstate(invalid="ignore"):
-        found = (depth > 0) & (pixels >= -beyond).all(1) & (pixels <= size + beyond).all(1)
-    if mask is not None:
-        at = np.flatnonzero(found)
-        cells = np.clip((pixels[at] * (np.array(mask.shape[::-1]) / size)).astype(int), 0, np.array(mask.shape[::-1]) - 1)
-        found[at] = mask[cells[:, 1], cells[:, 0]]
-    return np.asarray(found)
 
 
 def shrunk(mask: np.ndarray, longest: int) -> np.ndarray:

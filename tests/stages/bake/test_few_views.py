@@ -18,8 +18,8 @@ from stages.bake import pruning
 from stages.bake.plan import bake_plan
 from stages.bake.settings import BakeSettings
 from stages.bake.voxels import FEW_VIEWS_RATIO, WELL_SEEN_VIEWS, by_views, seen_by_few
-from stages.framing.scene_bounds import in_view
-from stages.framing.view_coverage import count_views, shows
+from stages.framing.scene_bounds import in_view, shows
+from stages.framing.view_coverage import count_views
 from stages.io.field_file import space_of
 from stages.io.scene import Scene
 from tests.efficientnerf.balls import settings

@@ -14,6 +14,7 @@ from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
 from stages.bake.settings import BakeSettings
+from stages.framing.scene_bounds import shows
 from stages.framing.view_coverage import (
     before_near,
     cells_before_near,
@@ -21,7 +22,6 @@ from stages.framing.view_coverage import (
     cells_without_view,
     close_to_path,
     poorly_seen,
-    shows,
 )
 from stages.io.field_file import space_of
 from stages.io.scene import Scene, views_of
