@@ -28,7 +28,6 @@ from stages.masking.first_training import first_training_needed
 from stages.masking.turning import masks_of_turning_subject
 from stages.poses.memory import decoding_needed, features_needed
 from stages.sfm import pairs
-from stages.sfm.attempts import MORE_FEATURES
 from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
 from stages.verdict import looks, run_forecast
 from stages.verdict.grades import GRADES
@@ -57,7 +56,6 @@ FIRST_TRAINING, A_SILHOUETTE = 92.0, 0.8  # of --mask foreground, docs/experimen
 A_PAIR, COMPARING, MANY = 0.006, 0.030, 4096  # of verifying a pair, and of comparing so many features of each with each
 CONTRAST = 0.02  # from which SIFT detects about as many features as COLMAP's does
 PAIRS_AN_IMAGE = 20  # of retrieval
-MAPPED_AGAIN, LEAST_WEAK = 6, 0.1  # of the later steps: times that all is mapped again, and share of the photographs that are matched again, at least
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
         problems += of_sizes(seen)
         problems += _with_turning(_of_overlap(list(small), overlaps), {name: files[name] for name in small})
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
-    about = forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed, joined=_share_in_largest(len(small), overlaps))
+    about = forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed)
     if later is not None:
         whole = kind != "llff" and settings.mask_from != FOREGROUND and not _rendered(kind, files[next(iter(small))])
         about |= _forecast_of_run(about, small, len(names), later, threads, whole=whole)
@@ -123,7 +121,6 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
         "left_aside": [] if posed else source.warnings(),
         "sizes": sorted({f"{a}x{b}" for a, b in (each.size for each in small.values())}),
         "overlapping": round(_share_in_largest(len(small), overlaps), 3),
-        "closed": _is_closed(len(small), overlaps),
         "forecast": about,
     }
     return Verdict(ordered[0].grade if ordered else "good", ordered, figures, {name: each.figures() for name, each in seen.items()})
@@ -204,11 +201,6 @@ def _share_in_largest(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> flo
     return len(_groups(count, overlaps)[0]) / count
 
 
-def _is_closed(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> bool | None:
-    """Whether the photographs lead round something, one after the other; None where that is not known."""
-    return any(j - i > count // 2 for i, j in overlaps) if count >= 4 and overlaps else None
-
-
 def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) -> list[Problem]:
     groups = _groups(len(names), overlaps)
     share = len(groups[0]) / len(names)
@@ -276,14 +268,8 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
     return found
 
 
-def forecast(
-    first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool, joined: float
-) -> dict[str, Any]:
-    """Seconds of the stage poses on a machine that does nothing else, where the mapper's first run suffices and where all is tried, and bytes
-    at its peak; roughly.
-
-    joined  share of the photographs that overlap, in the largest component
-    """
+def forecast(first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool) -> dict[str, Any]:
+    """Seconds of the stage poses on a machine that does nothing else, where the mapper's first run suffices, and bytes at its peak; roughly."""
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
     features = resolved(settings.max_features) or pairs.features_for(count)
     before, rgb = time.thread_time(), np.zeros((1, 1, 3), np.uint8)
@@ -296,8 +282,7 @@ def forecast(
         reading += slower * (FIRST_TRAINING + A_SILHOUETTE * count) / threads
         memory = first_training_needed(count).total
     if posed:
-        seconds = {"poses_seconds": round(reading, 1), "poses_seconds_at_most": round(reading, 1)}
-        return {**seconds, "poses_bytes": max(memory, int(decoding_needed(sizes).total)), "pairs": 0}
+        return {"poses_seconds": round(reading, 1), "poses_bytes": max(memory, int(decoding_needed(sizes).total)), "pairs": 0}
     memory = max(memory, features_needed(sizes * -(-count // len(sizes)), side, features, threads, networks=settings.features_model != "off").total)
     reduced = [working_size(*size, side) for size in sizes]
     pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
@@ -305,17 +290,9 @@ def forecast(
     compared = min(count * (count - 1) // 2, 10**9 if how == "exhaustive" else PAIRS_AN_IMAGE * count)
     finding = count * float(np.mean(pixels)) / 1e6 * FEATURES_A_MEGAPIXEL / threads
     detected, workers = min(features, count_features(rgb)), max(1, min(threads, MAX_WORKERS, compared // PAIRS_A_WORKER))
+    matching = compared * (A_PAIR + COMPARING * (detected / MANY) ** 2) / workers  # each feature is compared with each
     mapping = AN_IMAGE * count * max(1.0, count / 50) ** 0.4
-    seconds = finding + compared * pair_seconds(detected) / workers + mapping
-    weak = max(LEAST_WEAK, 1 - joined)  # matched once more with what they have, and once with more features
-    again = min(compared, weak * count * min(pairs.WIDER, count - 1)) * (pair_seconds(detected) + pair_seconds(MORE_FEATURES * detected))
-    most = seconds + MORE_FEATURES * weak * finding + again / workers + MAPPED_AGAIN * mapping
-    return {
-        "poses_seconds": round(reading + slower * seconds, 1),
-        "poses_seconds_at_most": round(reading + slower * most, 1),
-        "poses_bytes": int(memory),
-        "pairs": compared,
-    }
+    return {"poses_seconds": round(reading + slower * (finding + matching + mapping), 1), "poses_bytes": int(memory), "pairs": compared}
 
 
 def _slower(small: Mapping[str, Small]) -> float:
@@ -348,8 +325,3 @@ def count_features(rgb: np.ndarray) -> int:
     if max(grey.shape) >= UPSAMPLE_BELOW:  # OpenCV's SIFT doubles any picture
         grey = cv2.resize(grey, (max(1, grey.shape[1] // 2), max(1, grey.shape[0] // 2)), interpolation=cv2.INTER_AREA)
     return len(cv2.SIFT_create(0, contrastThreshold=CONTRAST).detect(grey, None))  # type: ignore[attr-defined]
-
-
-def pair_seconds(features: float) -> float:
-    """Of a processor, to match two photographs of so many features: each is compared with each."""
-    return A_PAIR + COMPARING * (features / MANY) ** 2

@@ -112,9 +112,8 @@ def in_words(found: dict[str, Any]) -> list[str]:
     if found["grade"] == "failed":
         return [*lines, "  A run would end without cameras."]
     compared = f", {about['pairs']} pairs compared" if about["pairs"] else ""
-    longer = f", up to {duration(about['poses_seconds_at_most'])} where photographs match badly" if about["pairs"] else ""
     seconds, memory = duration(about["poses_seconds"]), size(about["poses_bytes"])
-    lines.append(f"  Cameras: about {seconds} on this machine if nothing else runs{compared}{longer}, and {memory} of memory.")
+    lines.append(f"  Cameras: about {seconds} on this machine if nothing else runs{compared}, and {memory} of memory.")
     lines.append(f"  {_of_the_run(about)}")
     return lines
 
