@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from efficientnerf.capture.supports import level_plane
-from stages.framing.training_frame import UP_CHOICES, estimated_up, up_vector
+from stages.framing.training_frame import estimated_up, up_vector
 from stages.io.capture import Capture
 from stages.io.photo import read_gravity
 from stages.io.pictures import UnreadableImage
@@ -27,7 +27,7 @@ def with_up(capture: Capture, choice: str, say: Callable[[str], None], warn: Cal
     by = next(iter(found), THE_CAMERAS)
     cameras = estimated_up([photo.camera for photo in capture.photos])
     up = found.get(by, cameras)
-    if choice in UP_CHOICES and choice != "auto":
+    if choice != "auto":
         by, up = "poses.up", up_vector(capture, choice)[0]
     near = None if capture.points is None else level_plane(capture.points.xyz, np.array([photo.camera.centre for photo in capture.photos]), up)
     found |= {THE_CAMERAS: cameras} | ({} if near is None else {PLANE: near[0]})
