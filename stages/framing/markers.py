@@ -35,6 +35,12 @@ TILT = 30.0  # degrees from the upward axis that the cameras suggest, up to whic
 TIED = 1.5  # times as sure as their four corners are the nine tie points of a marker taken to be
 LEAST_MISS = 0.2  # px, of tie points: those of one marker agree by what they are made of
 MIN_CONTRAST = 0.02  # of linear light between inside and outside of an edge
+_LINEAR = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
+_INSTEAD = (
+    f"Dictionaries tried: {', '.join(DICTIONARIES)}; circular targets are not read. Print markers (enerf board), or give the distance of two places:"
+    " enerf measure RUN --known-length PLACE PLACE LENGTH."
+)
+_REMEDY = "the cameras are wrong. Without --marker-size (poses.marker_size=off) they are not looked for."
 Seen = dict[tuple[str, int], np.ndarray]  # dictionary and number of a marker -> (4, 2) its corners
 Size = tuple[int, int]
 
@@ -55,8 +61,9 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     fits = {number: fit_square([photo.camera for photo, _ in found], np.stack([corners for _, corners in found])) for number, found in views.items()}
     still = {number: fit for number, fit in fits.items() if fit.still}
     moved = sorted(fits.keys() - still.keys())
+    their_numbers = ", ".join(map(str, moved))
     if len(still) <= len(moved):
-        raise BadInput(f"{job.source}: markers {_listed(moved)} are not where other photographs see them: they moved, a number was printed twice, or {_REMEDY}")
+        raise BadInput(f"{job.source}: markers {their_numbers} are not where other photographs see them: they moved, a number was printed twice, or {_REMEDY}")
     length, error, excess = common_length([*still.values()])
     if excess > 3 and max(abs(fit.square.scale / length - 1) for fit in still.values()) > LARGEST_ERROR:
         lengths = ", ".join(f"{number}: {fit.square.scale / length * size:.4g} m" for number, fit in sorted(still.items()))
@@ -67,7 +74,7 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
         warn(f"markers give lengths within {min(error, 1):.0%} only, and are not used. {remedy}")
         return capture
     if moved:
-        warn(f"markers {_listed(moved)} moved, or their number was printed twice; they are not used.")
+        warn(f"markers {their_numbers} moved, or their number was printed twice; they are not used.")
     normal, tilt = _normal(capture, [*still.values()]) or (None, None)
     words, frame = f"{len(still)} markers give the scale, within {error:.2g} of each length (99 %)", Similarity(size / length, np.eye(3), np.zeros(3))
     if normal is not None:
@@ -80,18 +87,6 @@ def with_markers(job: Job, capture: Capture, size: float, warn: Callable[[str], 
     facts = {"used": sorted(still), "moved": moved, "size": size, "error": error, "normal": None if normal is None else normal.tolist(), "normal_error": tilt}
     scaled = in_metres(capture, frame)
     return replace(scaled, facts=scaled.facts | {"markers": facts}, markers_up=normal)
-
-
-_LINEAR = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
-_INSTEAD = (
-    f"Dictionaries tried: {', '.join(DICTIONARIES)}; circular targets are not read. Print markers (enerf board), or give the distance of two places:"
-    " enerf measure RUN --known-length PLACE PLACE LENGTH."
-)
-_REMEDY = "the cameras are wrong. Without --marker-size (poses.marker_size=off) they are not looked for."
-
-
-def _listed(numbers: list[int]) -> str:
-    return ", ".join(map(str, numbers))
 
 
 def find_markers(job: Job, files: Mapping[str, tuple[Path, Size]]) -> Markers:

@@ -98,13 +98,12 @@ def likeness(work: Path, seed: int, safe_point: SafePoint) -> np.ndarray:
 
 
 def match_photographs(work: Path, images: Sequence[WorkImage], how: str, *, seed: int, workers: int, progress: Progress, safe_point: SafePoint) -> None:
-    """Verified matches of the pairs that `how` stands for; of retrieval also of more pairs of the photographs that overlap with few others."""
+    """Verified matches of the pairs that `how` stands for: "exhaustive", "sequential" or "retrieval". Of retrieval also of more pairs of the photographs
+    that overlap with few others."""
     common: dict[str, Any] = {"seed": seed, "workers": workers, "progress": progress, "safe_point": safe_point}
     if how in ("exhaustive", "sequential"):
         match_pairs(work, images, pairs.all_pairs(len(images)) if how == "exhaustive" else pairs.sequential_pairs(len(images)), **common)
         return
-    if how != "retrieval":
-        raise ValueError(f"matching {how!r}: expected 'exhaustive', 'retrieval' or 'sequential'")
     alike = likeness(work, seed, safe_point)
     match_pairs(work, images, pairs.retrieved_pairs(alike), **common)
     near = neighbours(work, len(images))

@@ -27,7 +27,7 @@ from pipeline.text import printable
 
 _HANDLED = (signal.SIGINT, signal.SIGTERM)
 _SHOWN_LINES, _SHOWN_CHARACTERS = 3, 240
-POLL_SECONDS = 0.2  # seconds between two looks whether to stop, while the child says nothing
+POLL_SECONDS = 0.2  # seconds between two checks whether to stop, while the child says nothing
 GRACE = 1.2  # seconds that the child has to come to a safe point, once it was asked to stop
 _FRAMES = (" ", "\t", "*** ", "PC: @", "Current thread", "Thread 0x", "Stack (most", "Extension modules")  # beginnings of lines of a stack trace
 
@@ -63,12 +63,12 @@ def run(
                     safe_point()
                     child.write("go")
                 case "error":
-                    child.wait()
+                    child.process.wait()
                     _raise(message)
                 case "result":
-                    child.wait()
+                    child.process.wait()
                     return message["value"]
-        code = child.wait()
+        code = child.process.wait()  # negative: the number of the signal that ended it
     except BaseException:
         child.stop()
         raise
@@ -131,10 +131,6 @@ class _Child(Child):
         except BaseException:
             self.process.kill()
             raise
-
-    def wait(self) -> int:
-        """Its return code; negative, the number of the signal that ended it."""
-        return self.process.wait()
 
     def close(self) -> None:
         if self.process.poll() is None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Unpack
 
-from msgspec import structs
+from msgspec import UNSET, UnsetType, structs
 
 from pipeline.files import remove
 from stages.cores import count_cores
@@ -91,14 +91,12 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
     progress, safe_point, threads = callables["progress"], callables["safe_point"], r.threads or count_cores()
     features = r.features or features_for(len(r.paths))
 
-    # Copies of the photographs at working size, with their masks.
     images, unreadable = prepare_images(
         r.paths, max_side=r.max_side, features=features, seed=r.seed, masks=r.masks, lens=r.lens, threads=threads, work=r.work, copies=r.copies,
         **callables,
     )  # fmt: skip
     if len(images) < mapping.MIN_MODEL_SIZE:
         raise result.too_few(r.folder, images, unreadable)
-
     keep_markers(r.work, images, r.markers)
 
     # Features, matches of pairs, and COLMAP's mapper, with further attempts where photographs have no camera.
@@ -111,17 +109,17 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
     rejected = [*unreadable, *result.unregistered(search)]
     if mapping.num_registered(search.models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
         raise result.not_found(r.folder, r.paths, search, rejected, matching)
-    provenance = result.provenance_of(search, matching)
 
     # Bundle adjustment with a robust loss; then intrinsics for each photograph, where they explain what they were not fitted to.
     model = search.models[0]
+    own: str | UnsetType | None = UNSET
     if search.best != CROPPED:
         model = mapping.bundle_adjusted(search.work, images, model, safe_point)
     if search.best not in (EACH, CROPPED):
         model, own = with_own_intrinsics(images, model, safe_point)
-        provenance = structs.replace(provenance, own_intrinsics=own)
 
-    provenance = structs.replace(provenance, moving_parts=mapping.moving_shares(search.work, images, model, safe_point))
+    moving = mapping.moving_shares(search.work, images, model, safe_point)
+    provenance = structs.replace(result.provenance_of(search, matching), own_intrinsics=own, moving_parts=moving)
     capture = result.capture_of(search, model, r.paths, r.masks, rejected, provenance)
     for sentence in capture.warnings:
         callables["warn"](sentence)

@@ -19,8 +19,7 @@ from stages.io.network_file import in_words, open_network, run_network
 OPTION = "--features-model"
 LONGEST = 1024  # px of a picture that a detector is given, where it takes any size: as LightGlue's authors have it
 DIVISOR = 32  # of the sides of that picture: ALIKED halves it five times
-MIN_SCORE = 0.2  # of a feature, COLMAP's default
-MIN_SCORE = 0.1  # score of a match, at least: LightGlue's own and COLMAP's default
+MIN_SCORE = 0.1  # of a feature, where the network takes a limit; and of a match: LightGlue's own and COLMAP's default
 FEWEST = 15  # features of a picture and matches of a pair: fewer verify nothing, as the mapper has it
 _IN_BOUNDS = 1.001  # of key points from -1 to 1
 
