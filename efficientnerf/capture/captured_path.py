@@ -84,19 +84,21 @@ def capture_order(rows: np.ndarray) -> np.ndarray:
 
 def _rows(poses: np.ndarray) -> np.ndarray:
     """(C, 7): centres, in units of half of their mean distance from their middle, and unit quaternions; a right angle counts as about 0.77 such units."""
-    centres = poses[:, :3, 3]
-    size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() / 2
-    return np.concatenate([centres / (size if size > 0 else 1.0), Rotation.from_matrix(poses[:, :3, :3]).as_quat()], axis=1)
+    return np.concatenate([poses[:, :3, 3] / _unit(poses), Rotation.from_matrix(poses[:, :3, :3]).as_quat()], axis=1)
 
 
 def _poses(rows: np.ndarray, given: np.ndarray) -> list[np.ndarray]:
     """The inverse of `_rows` of the given poses (C, 4, 4)."""
-    centres = given[:, :3, 3]
-    size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() / 2
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     out[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
-    out[:, :3, 3] = rows[:, :3] * (size if size > 0 else 1.0)
+    out[:, :3, 3] = rows[:, :3] * _unit(given)
     return list(out)
+
+
+def _unit(poses: np.ndarray) -> float:
+    """Half of the mean distance of the centres of poses (C, 4, 4) from their middle; 1 where they are in one place."""
+    centres = poses[:, :3, 3]
+    return float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean() / 2) or 1.0
 
 
 def _sign(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -48,14 +48,6 @@ class Foreground:
 NO_POINTS = np.zeros((0, 3))
 
 
-def find_foreground(
-    points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], *, weights: np.ndarray | None = None
-) -> Region | None:
-    """The foreground region of a capture, in the training frame; None where the rays say too little. See `find_subject`."""
-    found = find_subject(points, views, pixels, cameras, weights=weights)
-    return None if found is None else found.region
-
-
 def find_subject(
     points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], *, weights: np.ndarray | None = None
 ) -> Foreground | None:

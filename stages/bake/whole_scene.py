@@ -26,7 +26,7 @@ from efficientnerf.asset.field_samples import (
     weight_by_box,
 )
 from efficientnerf.asset.tree import Region
-from efficientnerf.capture.foreground import find_foreground
+from efficientnerf.capture.foreground import find_subject
 from efficientnerf.model import Model
 from efficientnerf.training.pixels import Pixels
 from pipeline.stage import Job
@@ -179,8 +179,8 @@ def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> R
     every = slice(None, None, max(1, len(samples.pixel) // FOREGROUND_RAYS))
     cameras = [one.camera for one in scene.views_of(s, "train")]
     place = picture_places(samples, pixels, every)
-    found = find_foreground(surface_points(samples)[every], samples.view[every], place, cameras, weights=samples.opacity[every])
-    return Region(np.asarray(s.bounds, np.float64)) if found is None else found
+    found = find_subject(surface_points(samples)[every], samples.view[every], place, cameras, weights=samples.opacity[every])
+    return Region(np.asarray(s.bounds, np.float64)) if found is None else found.region
 
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from efficientnerf.asset.region import inside_distance
 from efficientnerf.asset.tree import Region
-from efficientnerf.capture.foreground import find_foreground
+from efficientnerf.capture.foreground import find_subject
 from efficientnerf.geometry.cameras import Camera, rays
 from tests.poses import looking_at
 
@@ -68,9 +68,13 @@ def cast(cameras: Sequence[Camera], shapes: Sequence[Shape], noise: float = 0.0,
 
 
 def region(cameras: Sequence[Camera], shapes: Sequence[Shape], **more: float) -> Region:
-    found = find_foreground(*cast(cameras, shapes, **more), cameras)  # type: ignore[arg-type]
+    return found_in(*cast(cameras, shapes, **more), cameras)  # type: ignore[arg-type]
+
+
+def found_in(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> Region:
+    found = find_subject(points, views, pixels, cameras)
     assert found is not None
-    return found
+    return found.region
 
 
 def on_ball(centre: Sequence[float], radius: float) -> np.ndarray:
@@ -131,7 +135,7 @@ def test_a_head_is_whole_in_close_ups_and_before_a_wall_of_uncertain_depth(away:
     wall = ~np.isfinite(cast(cameras, subject)[0]).all(axis=1)
     centres = np.array([one.centre for one in cameras])[views]
     points[wall] = centres[wall] + (points - centres)[wall] * (1 + uncertain * generator.normal(size=(int(wall.sum()), 1)))
-    found = find_foreground(points, views, pixels, cameras)
+    found = found_in(points, views, pixels, cameras)
     for low, high in (*ears, nose):
         assert (inside_distance(found, in_box(low, high)) > found.fade).all()
     assert (inside_distance(found, on_ball(centre, 0.4)) > 0).all()
@@ -202,7 +206,7 @@ def test_floaters_before_the_cameras_and_scattered_ends_change_little() -> None:
     cameras = ring(30, 2.5, 1.2)
     shapes = [ball([0, 0, 0], 0.5), ROOM]
     points, views, pixels = cast(cameras, shapes)
-    clean = find_foreground(points, views, pixels, cameras)
+    clean = found_in(points, views, pixels, cameras)
     generator = np.random.default_rng(1)
     struck = generator.random(len(points)) < 0.05
     centres = np.array([one.centre for one in cameras])[views]
@@ -210,7 +214,7 @@ def test_floaters_before_the_cameras_and_scattered_ends_change_little() -> None:
     blob = generator.choice(len(cameras), 3)
     near = np.isin(views, blob) & (np.linalg.norm(pixels - 0.3, axis=1) < 0.2)
     points[near] = centres[near] + 0.1 * (points - centres)[near]  # a patch before three of the cameras
-    noisy = find_foreground(points, views, pixels, cameras)
+    noisy = found_in(points, views, pixels, cameras)
     assert np.abs(noisy.bounds - clean.bounds).max() < 0.25
 
 
@@ -225,11 +229,11 @@ def test_a_subject_seen_from_one_side_is_whole() -> None:
 def test_the_scale_of_the_scene_does_not_matter() -> None:
     cameras = ring(20, 2.5, 1.0)
     points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5), ROOM])
-    found = find_foreground(points, views, pixels, cameras)
+    found = found_in(points, views, pixels, cameras)
     larger = []
     for one in cameras:
         pose = one.world_from_camera.copy()
         pose[:3, 3] *= 8
         larger.append(Camera(one.name, one.width, one.height, one.model, one.params, pose))
-    scaled = find_foreground(8 * points, views, pixels, larger)
+    scaled = found_in(8 * points, views, pixels, larger)
     assert scaled.bounds == pytest.approx(8 * found.bounds)
