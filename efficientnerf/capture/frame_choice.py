@@ -33,10 +33,10 @@ def choose(motion: np.ndarray, sharpness: np.ndarray, count: int) -> list[str]:
     for frame in range(len(motion)):
         if frame in blurred:
             verdicts.append(BLUR)
-        elif len(kept) and frame not in kept:
-            verdicts.append(SAME if np.abs(motion[kept] - motion[frame]).min() < ALIKE else LESS_SHARP)
+        elif frame in kept:
+            verdicts.append(CHOSEN)
         else:
-            verdicts.append(CHOSEN if len(kept) else LESS_SHARP)
+            verdicts.append(SAME if np.abs(motion[kept] - motion[frame]).min() < ALIKE else LESS_SHARP)
     return verdicts
 
 

@@ -127,6 +127,13 @@ def without_specks(mask: np.ndarray) -> np.ndarray:
     return np.where(_small_parts(mask <= 127, HOLE * mask.size), np.uint8(255), mask)
 
 
+def large_parts(region: np.ndarray, share: float) -> np.ndarray:
+    """(h, w) bool: the connected parts of a region that have at least this share of the pixels of the largest one."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    return np.asarray(np.concatenate([[False], areas >= share * areas.max(initial=0)])[labels])
+
+
 def _small_parts(region: np.ndarray, area: float) -> np.ndarray:
     """(h, w) bool: the connected parts of a region of fewer pixels than `area`, but the largest one."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=8)

@@ -16,6 +16,7 @@ import numpy as np
 
 from efficientnerf.asset.field_samples import field_samples, picture_places, surface_points
 from efficientnerf.capture.foreground import find_subject
+from efficientnerf.capture.keying import large_parts
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
@@ -154,10 +155,7 @@ def _made(job: Job, capture: Capture, field: FirstField, subject: Subject, folde
 def cleaned(covered: np.ndarray) -> np.ndarray:
     """(H, W) uint8 of how much of each pixel is covered: without small parts and small gaps."""
     mask = np.round(np.clip(covered, 0, 1) * 255).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((mask >= 128).astype(np.uint8), connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA]
-    large = [part for part in range(1, count) if area[part] >= PART * area[1:].max()]
-    near = cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    near = cv2.dilate(large_parts(mask >= 128, PART).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     mask[~near] = 0
     count, labels, stats, _ = cv2.connectedComponentsWithStats((mask < 128).astype(np.uint8), connectivity=4)
     gaps = [part for part in range(1, count) if stats[part, cv2.CC_STAT_AREA] <= GAP * mask.size]

@@ -6,8 +6,9 @@ photographs. N photographs of (h, w).
 
 import cv2
 import numpy as np
+from scipy.ndimage import binary_fill_holes
 
-from efficientnerf.capture.keying import without_specks
+from efficientnerf.capture.keying import large_parts, without_specks
 from pipeline.errors import BadInput
 
 SIDE = 480  # px, longest side of what is compared
@@ -48,11 +49,7 @@ class StillBackground:
         wide = max(1, round(CLOSING * max(found.shape)))
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * wide + 1, 2 * wide + 1))
         found = cv2.morphologyEx(cv2.medianBlur(found, 3), cv2.MORPH_CLOSE, disc)
-        found = _filled(found)
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
-        areas = stats[1:, cv2.CC_STAT_AREA]
-        kept = [part + 1 for part in range(count - 1) if areas[part] >= SHARE * areas.max()]
-        return np.where(np.isin(labels, kept), np.uint8(255), np.uint8(0))
+        return np.where(large_parts(binary_fill_holes(found), SHARE), np.uint8(255), np.uint8(0))
 
     def _even(self, image: np.ndarray) -> np.ndarray:
         """An image in float32, its border as bright as that of the others."""
@@ -91,10 +88,3 @@ def border_of(shape: tuple[int, ...]) -> np.ndarray:
     strip = np.ones(shape, bool)
     strip[wide:-wide, wide:-wide] = False
     return strip
-
-
-def _filled(mask: np.ndarray) -> np.ndarray:
-    """A mask (h, w) of 0 and 1 without what no border reaches."""
-    around = np.pad(1 - mask, 1, constant_values=1)
-    _, labels = cv2.connectedComponents(around.astype(np.uint8), connectivity=4)
-    return np.asarray((labels != labels[0, 0])[1:-1, 1:-1], np.uint8)

@@ -7,6 +7,7 @@ import traceback
 from typing import Any
 
 from pipeline.executors.pipes import Channel, end_with
+from pipeline.failures import history
 from pipeline.library_output import warnings_for_users
 from pipeline.stage import ByName
 
@@ -44,21 +45,12 @@ def main() -> None:
         with warnings_for_users(channel.warn):
             value = TASKS[request["task"]](request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
     except BaseException as error:
-        if not _was_stopped(error):
+        if not any(isinstance(each, Stopped) for each in history(error)):  # COLMAP wraps it where it passes through a callback
             _send_error(channel, error)
     else:
         channel.send({"event": "result", "value": value})
     sys.stderr.flush()
     os._exit(0)  # libraries that take the process down while they are unloaded have no say
-
-
-def _was_stopped(error: BaseException | None) -> bool:
-    """Whether it is Stopped, which COLMAP may have wrapped into an error of its own on the way through a callback."""
-    while error is not None:
-        if isinstance(error, Stopped):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
 
 
 def _send_error(channel: _Channel, error: BaseException) -> None:

@@ -120,7 +120,7 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
         "looked_at": len(chosen),
         "left_aside": [] if posed else source.warnings(),
         "sizes": sorted({f"{a}x{b}" for a, b in (each.size for each in small.values())}),
-        "overlapping": round(_share_in_largest(len(small), overlaps), 3),
+        "overlapping": round(len(_groups(len(small), overlaps)[0]) / len(small), 3),
         "forecast": about,
     }
     return Verdict(ordered[0].grade if ordered else "good", ordered, figures, {name: each.figures() for name, each in seen.items()})
@@ -195,10 +195,6 @@ def _groups(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> list[list[int
         near[i].add(j)
         near[j].add(i)
     return pairs.components(near)
-
-
-def _share_in_largest(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> float:
-    return len(_groups(count, overlaps)[0]) / count
 
 
 def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) -> list[Problem]:

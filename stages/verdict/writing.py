@@ -87,8 +87,7 @@ def _coverage(scene: Scene) -> dict[str, float]:
 
 
 def _photographs_in_folder(job: Job) -> int | None:
-    if job.source is None:
-        return None
+    assert job.source is not None
     with contextlib.suppress(BadInput):
         return len(photographs(Source(job.source, job.settings.allow_outside)))
     return None
