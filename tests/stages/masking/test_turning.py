@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.poses import aligned_errors
 from efficientnerf.geometry.cameras import Camera
 from pipeline.stage import Job
 from stages.io.png import write_png
@@ -17,6 +16,7 @@ from stages.poses.run import read
 from stages.poses.settings import PosesSettings
 from stages.verdict.verdict import verdict_on
 from tests.stages import turntables
+from tests.stages.sfm.still_life import errors_of
 
 COUNT = 11
 
@@ -50,8 +50,7 @@ def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Pa
     assert mask_choice(job.settings, capture.provenance) == "silhouette"
     assert len(capture.photos) >= 0.9 * COUNT
     assert all(photo.mask is not None for photo in capture.photos)
-    true = np.array([cameras[int(Path(photo.camera.name).stem)].centre for photo in capture.photos])
-    errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), true)
+    errors = errors_of(capture, {f"{number:02d}.png": camera.centre for number, camera in enumerate(cameras)})
     assert np.sqrt((errors**2).mean()) < 0.02
     problems = {problem.what: problem for problem in verdict_on(capture, {}).problems}
     assert problems["background"].grade == "good"

@@ -15,7 +15,6 @@ from tests.poses import looking_at
 
 SIZE = 480, 360
 COUNT, POINTS = 9, 250
-QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
 
 
 def cameras(focal: tuple[float, ...] = (400.0,) * COUNT, cut: Sequence[tuple[int, int]] = ((0, 0),) * COUNT) -> list[Camera]:

@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
+from pipeline.files import read_json
 from stages.sfm import attempts, mapping, matches, merging, pairs
 from stages.sfm.attempts import Search
 from stages.sfm.cameras import find_cameras
 from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics import zoom
 from stages.sfm.reconstruction import Request, find_models
+from tests.stages.sfm.still_life import QUIET, SILENT, STILL_LIFE, errors_of, neighbours
 
-ROOT = Path(__file__).resolve().parents[3]
-STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
-QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
 ANEW = ["another beginning", "small angles"]
 IMAGES = [WorkImage(f"{k}.jpg", f"{k:05d}.png", 64, 48, 64, 48, None, "a") for k in range(20)]
 
@@ -137,21 +135,16 @@ def test_networks_come_last_and_for_photographs_without_a_camera_alone(
 
 def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> None:
     """Of a sixth of the contrast, and blurred."""
-    truth = true_centres(TRUTH)
-    names = sorted(sorted((path.name for path in STILL_LIFE.glob("*.jpg")), key=lambda name: -truth[name][0])[:6])
-    if len(names) < 6:
-        pytest.skip("examples/still_life is not there")
+    names = neighbours(6)
     for name in names:
         with Image.open(STILL_LIFE / name) as image:
             faint = np.asarray(image.filter(ImageFilter.GaussianBlur(1.0)), np.float32) * 0.15 + 85
             (Image.fromarray(faint.astype(np.uint8)) if name == names[2] else image).save(tmp_path / name, quality=95)
-    capture = find_cameras(Request(tmp_path, {name: tmp_path / name for name in names}, tmp_path / "work", 360), warn=lambda *a, **k: None, **QUIET)
+    capture = find_cameras(Request(tmp_path, {name: tmp_path / name for name in names}, tmp_path / "work", 360), **SILENT)
     rungs = {rung["rung"]: rung["registered"] for rung in capture.provenance.rungs}
     assert rungs["exhaustive"] == rungs["wider matching"] == 5
     assert rungs["more features"] == 6
-    errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))
-    assert len(errors) == 6
-    assert errors.max() < 0.02
+    assert errors_of(capture).max() < 0.02
 
 
 def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:
@@ -160,9 +153,7 @@ def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:
         coarse = Image.fromarray(rng.integers(0, 255, (24, 32, 3), np.uint8))
         coarse.resize((160, 120), Image.Resampling.BICUBIC).save(tmp_path / f"{k}.png")
     with pytest.raises(BadInput, match=r"verdict\.json"):
-        find_cameras(Request(tmp_path, {f"{k}.png": tmp_path / f"{k}.png" for k in range(3)}, tmp_path / "work"), warn=lambda *a, **k: None, **QUIET)
-    from pipeline.files import read_json
-
+        find_cameras(Request(tmp_path, {f"{k}.png": tmp_path / f"{k}.png" for k in range(3)}, tmp_path / "work"), **SILENT)
     said = read_json(tmp_path / "work/verdict.json")
     assert said["grade"] == "failed"
     assert [rung["rung"] for rung in said["rungs"]] == ["exhaustive", *ANEW, "wider matching", "more features", *ANEW]

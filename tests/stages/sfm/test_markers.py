@@ -16,7 +16,8 @@ from stages.sfm.cameras import find_cameras
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, mapper_database
 from stages.sfm.reconstruction import Request
-from tests.stages.sfm.made_matches import POINTS, QUIET, cameras, matched
+from tests.stages.sfm.made_matches import POINTS, cameras, matched
+from tests.stages.sfm.still_life import SILENT
 
 EDGE = 0.12
 
@@ -28,7 +29,7 @@ def test_markers_reach_the_process_that_ties_them(tmp_path: Path) -> None:
         write_png(np.full((90, 120, 3), 128, np.uint8), path)
     request = Request(tmp_path, paths, tmp_path / "work", markers={"0.png": {7: np.array([[10.0, 10], [30, 10], [30, 30], [10, 30]])}})
     with pytest.raises(BadInput, match="cameras found for 0 of 3"):
-        find_cameras(request, **QUIET, warn=lambda *a, **k: None)
+        find_cameras(request, **SILENT)
     noted = json.loads((tmp_path / "work/markers.json").read_bytes())
     np.testing.assert_allclose(noted["00000.png"]["7"][4], [20, 20])
 

@@ -15,7 +15,8 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import PAIRS, WorkImage, forget, pair_id_of
 from stages.sfm.merging import Sights
 from stages.sfm.reconstruction import find_models
-from tests.stages.sfm.made_matches import QUIET, cameras, matched, off, registered
+from tests.stages.sfm.made_matches import cameras, matched, off, registered
+from tests.stages.sfm.still_life import QUIET
 
 MOVED = Similarity(3.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, -2, 1]))
 TRUTH = cameras()

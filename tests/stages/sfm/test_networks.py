@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
 from stages.sfm import matches
 from stages.sfm.added.matches import NEIGHBOURS, pairs_of
 from stages.sfm.database import FEATURES, forget
 from stages.sfm.reconstruction import Request, reconstruct
+from tests.stages.sfm.still_life import SILENT, STILL_LIFE, errors_of, neighbours
 
 pytest.importorskip("onnx", reason="the package onnx, which makes the networks of these tests, is not installed")
 pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed (extra rembg)")
@@ -19,10 +19,6 @@ pytest.importorskip("onnxruntime", reason="the package onnxruntime is not instal
 from stages.sfm.added.networks import Detector, Features, Matcher
 from tests.stages.sfm.made_networks import WIDE, _Graph, detector, matcher, value
 
-ROOT = Path(__file__).resolve().parents[3]
-STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
-QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
-LAYOUTS = ("LightGlue-ONNX", "TensorRT", "COLMAP")
 WIDTH, HEIGHT = 330, 250
 
 
@@ -42,16 +38,11 @@ def strongest(path: Path, mask: np.ndarray | None = None) -> Features:
     return Detector(path).features(squares()[0], mask, 100)
 
 
-def distance(found: np.ndarray, to: np.ndarray) -> np.ndarray:
-    return np.asarray(np.linalg.norm(found[:, None] - to[None], axis=2).min(1))
-
-
-@pytest.mark.parametrize("size", [(160, 192)])
-def test_a_network_of_one_size_gets_the_picture_at_its_size(tmp_path: Path, size: tuple[int, int]) -> None:
-    for layout in LAYOUTS:
-        found = strongest(detector(tmp_path / f"{layout}.onnx", layout, size))
-        assert max(found.size[0] / size[1], found.size[1] / size[0]) == pytest.approx(1.0, abs=0.01)
-        assert np.median(distance(found.xy, squares()[1])) < 5.0
+@pytest.mark.parametrize("layout", ["LightGlue-ONNX", "TensorRT", "COLMAP"])
+def test_a_network_of_one_size_gets_the_picture_at_its_size(tmp_path: Path, layout: str) -> None:
+    found, corners = strongest(detector(tmp_path / "d.onnx", layout, (160, 192))), squares()[1]
+    assert max(found.size[0] / 192, found.size[1] / 160) == pytest.approx(1.0, abs=0.01)
+    assert np.median(np.linalg.norm(found.xy[:, None] - corners, axis=2).min(1)) < 5.0
 
 
 def refused_networks(folder: Path) -> dict[str, Path]:
@@ -96,21 +87,8 @@ def test_photographs_without_cameras_are_compared_with_others() -> None:
     assert all(sum(i in pair for pair in every) >= 1 + NEIGHBOURS for i in range(1, 8))
 
 
-def some(count: int) -> tuple[list[str], dict[str, Any]]:
-    truth = true_centres(TRUTH)
-    names = sorted(sorted((path.name for path in STILL_LIFE.glob("*.jpg")), key=lambda name: -truth[name][0])[:count])
-    if len(names) < count:
-        pytest.skip("examples/still_life is not there")
-    return names, truth
-
-
-def errors_of(capture: Any, truth: dict[str, Any]) -> np.ndarray:
-    photos = capture.photos
-    return np.asarray(aligned_errors(np.array([photo.camera.centre for photo in photos]), np.array([truth[photo.camera.name] for photo in photos])))
-
-
 def test_a_photograph_without_sift_features_gets_its_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names, truth = some(6)
+    names = neighbours(6)
     detect = matches.extract_features
 
     def without_the_third(work: Path, images: Any, **how: Any) -> None:
@@ -124,14 +102,14 @@ def test_a_photograph_without_sift_features_gets_its_camera(tmp_path: Path, monk
     monkeypatch.setattr(matches, "extract_features", without_the_third)
     networks = detector(tmp_path / "d.onnx", "COLMAP"), matcher(tmp_path / "m.onnx", "COLMAP")
     paths = {name: STILL_LIFE / name for name in names}
-    usual = reconstruct(Request(STILL_LIFE, paths, tmp_path / "without", 360, 4096, threads=1), **QUIET)
+    usual = reconstruct(Request(STILL_LIFE, paths, tmp_path / "without", 360, 4096, threads=1), **SILENT)
     asked = [Request(STILL_LIFE, paths, tmp_path / f"with {threads}", 360, 4096, threads=threads, networks=networks) for threads in (1, 2)]
-    found = [reconstruct(request, **QUIET) for request in asked]
+    found = [reconstruct(request, **SILENT) for request in asked]
     assert [name for name, _ in usual.rejected] == [names[2]]
     before, after = (list(capture.provenance.rungs) for capture in (usual, found[0]))
     assert after[: len(before)] == before, "what is tried before it is the same"
     assert found[0].rejected == ()
-    assert errors_of(found[0], truth).max() < 0.02
+    assert errors_of(found[0]).max() < 0.02
     for one, other in zip(*(capture.photos for capture in found), strict=True):
         assert (one.camera.name, one.camera.params) == (other.camera.name, other.camera.params)
         np.testing.assert_array_equal(one.camera.world_from_camera, other.camera.world_from_camera)

@@ -10,11 +10,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.poses import aligned_errors, true_centres
+from efficientnerf.geometry.cameras import Camera, project, rays
 from pipeline.errors import StageFailed
 from stages.io.capture import Capture
 from stages.sfm import mapping, matches, pair_workers
@@ -24,28 +25,14 @@ from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, open_
 from stages.sfm.images import prepare_images
 from stages.sfm.pairs import all_pairs
 from stages.sfm.reconstruction import Request, reconstruct
+from tests.stages.sfm.still_life import QUIET, ROOT, SILENT, STILL_LIFE, errors_of, neighbours
 from tests.stages.spoilers import SPOILERS
 
-ROOT = Path(__file__).resolve().parents[3]
-STILL_LIFE = ROOT / "examples" / "still_life"
-TRUTH = ROOT / "tests" / "data" / "still_life_cameras.json"
 SIDE = 360  # px: enough for exact cameras, quick enough for a test
 
 
-def chosen() -> list[str]:
-    """Ten photographs along a third of the circle."""
-    names = sorted(path.name for path in STILL_LIFE.glob("*.jpg")) if STILL_LIFE.is_dir() else []
-    if len(names) < 10:
-        pytest.skip("examples/still_life is not there")
-    centres = true_centres(TRUTH)
-    return sorted(sorted(names, key=lambda name: -centres[name][0])[:10])
-
-
-def find(folder: Path, names: list[str], work: Path, **changes: object) -> Capture:
-    callables: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
-    callables |= {name: changes.pop(name) for name in [*changes] if name in callables}
-    asked: dict[str, Any] = {"max_side": SIDE} | changes
-    return find_cameras(Request(folder, {name: folder / name for name in names}, work, **asked), **callables)
+def find(folder: Path, names: list[str], work: Path, **callables: Any) -> Capture:
+    return find_cameras(Request(folder, {name: folder / name for name in names}, work, SIDE), **SILENT | callables)
 
 
 def numbers(capture: Capture) -> tuple[bytes, ...]:
@@ -56,18 +43,16 @@ def numbers(capture: Capture) -> tuple[bytes, ...]:
 
 @pytest.fixture(scope="module")
 def ten(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path, Capture]:
-    names = chosen()
+    names = neighbours(10)
     work = tmp_path_factory.mktemp("work")
     return names, work, find(STILL_LIFE, names, work)
 
 
 def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path, Capture]) -> None:
     names, _, capture = ten
-    truth = true_centres(TRUTH)
     assert [photo.camera.name for photo in capture.photos] == names
     assert not capture.rejected
-    errors = aligned_errors(np.array([p.camera.centre for p in capture.photos]), np.array([truth[n] for n in names]))
-    assert np.sqrt((errors**2).mean()) < 0.005
+    assert np.sqrt((errors_of(capture) ** 2).mean()) < 0.005
     camera = capture.photos[0].camera
     assert (camera.width, camera.height) == (480, 360)  # of the source, not of the working copies
     assert camera.intrinsics["fx"] == pytest.approx(400, rel=0.01)
@@ -88,8 +73,7 @@ def test_again_in_another_order_gives_the_same_bits(ten: tuple[list[str], Path, 
 def test_the_process_changes_no_bit(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
     names, work, capture = ten
     shutil.copytree(work, tmp_path / "work")
-    quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
-    here = reconstruct(Request(STILL_LIFE, {name: STILL_LIFE / name for name in names}, tmp_path / "work", SIDE, 4096), **quiet)
+    here = reconstruct(Request(STILL_LIFE, {name: STILL_LIFE / name for name in names}, tmp_path / "work", SIDE, 4096), **SILENT)
     assert numbers(here) == numbers(capture)
     assert (here.provenance, here.warnings, here.rejected, here.reprojection_error) == (
         capture.provenance, capture.warnings, capture.rejected, capture.reprojection_error,
@@ -125,11 +109,10 @@ def test_killed_and_resumed_gives_the_same_bits(ten: tuple[list[str], Path, Capt
 
 def test_an_image_that_colmap_cannot_read_is_not_left_out(resumed: tuple[Path, list[WorkImage]]) -> None:
     work, images = resumed
-    quiet: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
     last = work / "images" / images[-1].file
     last.rename(work / "hidden.png")
     with pytest.raises(StageFailed, match=r"\w+.png"):
-        mapping.sub_models(work, images, 0, mapping.DEFAULTS, **quiet)
+        mapping.sub_models(work, images, 0, mapping.DEFAULTS, **QUIET)
     assert not list(work.glob("colmap_log*"))
     with pytest.raises(StageFailed, match="COLMAP"):
         open_database(work, images, lambda *a, **k: None)
@@ -140,7 +123,7 @@ def test_an_image_that_colmap_cannot_read_is_not_left_out(resumed: tuple[Path, l
         connection.commit()
     last.rename(work / "hidden.png")
     with pytest.raises(FileNotFoundError):
-        matches.extract_features(work, images[-2:], features=256, **quiet)
+        matches.extract_features(work, images[-2:], features=256, **QUIET)
 
 
 @pytest.fixture
@@ -149,9 +132,8 @@ def resumed(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> tuple[Path,
     names, work, _ = ten
     shutil.copytree(work, tmp_path / "work")
     images, _ = prepare_images(
-        {name: STILL_LIFE / name for name in names}, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
-        progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
-    )  # fmt: skip
+        {name: STILL_LIFE / name for name in names}, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work", **SILENT
+    )
     return tmp_path / "work", images
 
 
@@ -230,19 +212,12 @@ def test_mixed_sizes_rotation_and_a_truncated_file(ten: tuple[list[str], Path, C
     assert {(c.width, c.height) for c in by_name.values()} == {(480, 360), (400, 300)}
     for camera in by_name.values():
         assert camera.intrinsics["fx"] == pytest.approx(400 * camera.width / 480, rel=0.02)
-    truth = true_centres(TRUTH)
-    errors = aligned_errors(np.array([c.centre for c in by_name.values()]), np.array([truth[Path(n).name] for n in by_name]))
-    assert errors.max() < 0.02
+    assert errors_of(capture).max() < 0.02
 
 
 def test_lens_with_more_than_one_term_of_distortion(tmp_path: Path) -> None:
     """Fourteen photographs drawn again as a lens with two radial and two tangential terms would have taken them."""
-    import cv2
-
-    from efficientnerf.geometry.cameras import Camera, project, rays
-
-    chosen()
-    names = sorted(path.name for path in STILL_LIFE.glob("*.jpg"))[:14]
+    names = neighbours(14)
     old = Camera("old", 480, 360, "SIMPLE_RADIAL", (400.0, 240.0, 180.0, -0.04), np.eye(4))
     new = Camera("new", 480, 360, "OPENCV", (440.0, 440.0, 240.0, 180.0, -0.28, 0.22, 0.002, -0.001), np.eye(4))
     from_pixel = project(old, rays(new)[1])[0].reshape(360, 480, 2).astype(np.float32) - 0.5  # cv2's pixel centres are integers
@@ -251,13 +226,11 @@ def test_lens_with_more_than_one_term_of_distortion(tmp_path: Path) -> None:
             drawn = cv2.remap(np.asarray(image), from_pixel[..., 0], from_pixel[..., 1], cv2.INTER_CUBIC)
         Image.fromarray(drawn).save(tmp_path / name, quality=96)
     capture = find(tmp_path, names, tmp_path / "work")
-    truth = true_centres(TRUTH)
-    errors = aligned_errors(np.array([p.camera.centre for p in capture.photos]), np.array([truth[p.camera.name] for p in capture.photos]))
     camera = capture.photos[0].camera
     assert camera.model == "OPENCV"
     assert camera.intrinsics["fx"] == pytest.approx(440, rel=0.01)
     assert camera.intrinsics["k1"] == pytest.approx(-0.28, abs=0.04)
-    assert np.sqrt((errors**2).mean()) < 0.002
+    assert np.sqrt((errors_of(capture) ** 2).mean()) < 0.002
 
 
 def without_pairs(work: Path) -> dict[str, list[Any]]:

@@ -17,9 +17,7 @@ from PIL import Image
 from pipeline.errors import BadInput, Interrupted, StageFailed
 from pipeline.executors import pipes
 from stages.sfm import process
-
-ROOT = Path(__file__).resolve().parents[3]
-QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
+from tests.stages.sfm.still_life import ROOT, SILENT
 
 ORDER = """
 import sys
@@ -81,7 +79,7 @@ def test_an_abort_is_an_error_of_the_stage_with_its_last_words(monkeypatch: pyte
         monkeypatch, f"os.write(2, b'free(): invalid pointer\\x1b\\n    @ 0x1 frame\\n*** SIGABRT\\n')\nos.kill(os.getpid(), {int(number)})\ntime.sleep(9)"
     )
     with pytest.raises(StageFailed, match=words) as caught:
-        process.run({}, **QUIET)
+        process.run({}, **SILENT)
     assert caught.value.exit_code == 3
     assert "frame" not in str(caught.value)
 
@@ -99,7 +97,7 @@ def test_an_abort_is_an_error_of_the_stage_with_its_last_words(monkeypatch: pyte
 def test_errors_keep_their_class(monkeypatch: pytest.MonkeyPatch, raised: str, expected: type[Exception]) -> None:
     child_does(monkeypatch, raised)
     with pytest.raises(expected) as caught:
-        process.run({}, **QUIET)
+        process.run({}, **SILENT)
     assert "capture_for" in str(caught.value.__cause__)  # the child's own traceback
     if expected is OSError:
         assert (caught.value.errno, caught.value.filename) == (28, "/somewhere")  # type: ignore[attr-defined]
@@ -117,14 +115,14 @@ def test_what_a_safe_point_raises_stops_the_child_at_a_safe_point(monkeypatch: p
             raise Interrupted(signal.SIGTERM)
 
     with pytest.raises(Interrupted) as caught:
-        process.run({"note": str(tmp_path / "note")}, **{**QUIET, "safe_point": safe_point, "progress": lambda *values: begun.append(values)})
+        process.run({"note": str(tmp_path / "note")}, **{**SILENT, "safe_point": safe_point, "progress": lambda *values: begun.append(values)})
     assert caught.value.exit_code == 143
     assert (tmp_path / "note").read_text() == "tidy"
 
 
 def test_the_signals_of_a_terminal_are_the_parents_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     child_does(monkeypatch, "for number in (2, 15):\n    os.kill(os.getpid(), number)\nsafe_point()\nreturn 'alive'")
-    assert process.run({}, **QUIET) == "alive"
+    assert process.run({}, **SILENT) == "alive"
 
 
 # -------------------------------------------------------------------------------------------------------- whole runs

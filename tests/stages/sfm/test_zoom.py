@@ -11,7 +11,8 @@ from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics import zoom
 from stages.sfm.reconstruction import find_models
 from stages.verdict.verdict import DOUBTFUL
-from tests.stages.sfm.made_matches import COUNT, POINTS, QUIET, cameras, matched, off, registered
+from tests.stages.sfm.made_matches import COUNT, POINTS, cameras, matched, off, registered
+from tests.stages.sfm.still_life import QUIET
 
 ZOOMED = tuple(400.0 / (1.0, 0.8, 0.65)[k % 3] for k in range(COUNT))
 
