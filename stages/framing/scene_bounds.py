@@ -249,7 +249,7 @@ def shares_outside(pictures: Sequence[np.ndarray | None], outside: Sequence[np.n
 
 
 def visual_hull(
-    pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray, quorum: float = QUORUMS[0]
+    pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray, quorum: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Centres (N, 3) of the voxels of the visual hull in a box, and the (3,) sides of a voxel; None unless half of the photos have a silhouette, or where
     the hull is empty.

@@ -67,15 +67,15 @@ def retrieved_pairs(likeness: np.ndarray) -> set[Pair]:
     return wanted | {(i, i + offset) for i in range(count) for offset in FOLLOWING if i + offset < count}
 
 
-def wider_pairs(likeness: np.ndarray, weak: Iterable[int], neighbours: Mapping[int, set[int]], most: int = WIDER) -> set[Pair]:
-    """More pairs for the images that too few others were found to overlap with: the `most` that are most like each, and the neighbours of its neighbours.
+def wider_pairs(likeness: np.ndarray, weak: Iterable[int], neighbours: Mapping[int, set[int]]) -> set[Pair]:
+    """More pairs for the images that too few others were found to overlap with: the WIDER that are most like each, and the neighbours of its neighbours.
 
     neighbours  images that each overlaps with
     """
     ranked, count = ranks(likeness), len(likeness)
     wanted: set[Pair] = set()
     for i in sorted(set(weak)):
-        wanted |= {ordered(i, int(j)) for j in ranked[i, : min(most, count - 1)]}
+        wanted |= {ordered(i, int(j)) for j in ranked[i, : min(WIDER, count - 1)]}
         wanted |= {ordered(i, k) for j in neighbours.get(i, set()) for k in neighbours.get(j, set()) if k != i}
     return wanted
 

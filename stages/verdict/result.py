@@ -9,7 +9,6 @@ The figures are those of metrics.json (`stages.evaluate.summary`) and the verdic
 give a better grade. Each threshold and its reason: docs/experiments/verdict.md.
 """
 
-import math
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -128,7 +127,7 @@ def _figures(metrics: Mapping[str, Any], cameras: CameraVerdict | None) -> dict[
     blur ..._blur  `equivalent_blur`: medians over the views; of mesh and Gaussians with as many decibels more as fitting its colours gives the asset
     gain           PSNR with fitted colours over that of pictures of one colour, means over the views
     """
-    views = [view for view in metrics["views"] if view["trivial"] is not None and view["asset"]["psnr_colour_fitted"] is not None]
+    views = _measured(metrics)
     train, split = metrics.get("train"), metrics["split"]
     fitted = [view["asset"]["psnr_colour_fitted"] for view in views]
     flat = [view["trivial"]["mean_colour"] for view in views]
@@ -137,9 +136,9 @@ def _figures(metrics: Mapping[str, Any], cameras: CameraVerdict | None) -> dict[
         "views": f"{len(views)} {'view' if len(views) == 1 else 'views'} that training {'saw' if split == 'train' else 'did not see'}",
         "psnr": metrics["asset"]["psnr"],
         "ssim": metrics["asset"]["ssim"],
-        "psnr_colour_fitted": math.fsum(fitted) / len(fitted) if fitted else None,
-        "mean_colour": math.fsum(flat) / len(flat) if flat else None,
-        "gain": math.fsum(fitted) / len(fitted) - math.fsum(flat) / len(flat) if fitted else None,
+        "psnr_colour_fitted": statistics.fmean(fitted) if views else None,
+        "mean_colour": statistics.fmean(flat) if views else None,
+        "gain": statistics.fmean(fitted) - statistics.fmean(flat) if views else None,
         "blur": _median(view_blur(view) for view in views),
         "network_blur": _median(equivalent_blur(view["network"]["psnr_colour_fitted"], view["trivial"]["blurred"]) for view in drawn),
         "mesh_blur": _median(_other_blur(view, "mesh") for view in views),
@@ -148,6 +147,11 @@ def _figures(metrics: Mapping[str, Any], cameras: CameraVerdict | None) -> dict[
         "train_blur": None if train is None else train["blur"],
         "cameras": None if cameras is None else cameras.grade,
     }
+
+
+def _measured(metrics: Mapping[str, Any]) -> list[Any]:
+    """The views whose masks leave pixels to compare."""
+    return [view for view in metrics["views"] if view["trivial"] is not None and view["asset"]["psnr_colour_fitted"] is not None]
 
 
 def view_blur(view: Mapping[str, Any]) -> float:
@@ -251,7 +255,7 @@ def _short(metrics: Mapping[str, Any]) -> tuple[str, str] | None:
 
 def _of_single_views(metrics: Mapping[str, Any], figures: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     """Of views that are much worse than the others."""
-    views = [view for view in metrics["views"] if view["trivial"] is not None and view["asset"]["psnr_colour_fitted"] is not None]
+    views = _measured(metrics)
     bad = tuple(view["name"] for view in views if view_blur(view) > POOR_BLUR)
     if not bad or figures["blur"] > POOR_BLUR:
         return []
@@ -285,7 +289,7 @@ def _mostly_holes(metrics: Mapping[str, Any]) -> bool:
     """Whether more than half of the asset's squared error is in its holes: then these come before its pictures."""
     errors = [10 ** (-view["asset"]["psnr"] / 10) for view in metrics["views"] if view["asset"]["psnr"] is not None]
     excess = metrics["holes_excess_error"]
-    return bool(errors) and excess is not None and excess > 0.5 * math.fsum(errors) / len(errors)
+    return bool(errors) and excess is not None and excess > 0.5 * statistics.fmean(errors)
 
 
 def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
@@ -328,7 +332,7 @@ def _of_mesh(metrics: Mapping[str, Any], figures: Mapping[str, Any]) -> list[Res
         return [ResultProblem("mesh", "usable", "The mesh is empty.", "The asset has no clear surface.", remedy, picture)]
     found = []
     rough = [view["mesh"]["roughness"] for view in metrics["views"] if view["mesh"]["roughness"] is not None]
-    if len(rough) > 1 and (share := math.fsum(rough) / len(rough)) > ROUGH:
+    if len(rough) > 1 and (share := statistics.fmean(rough)) > ROUGH:
         sentence = f"The mesh is rough: {100 * share:.0f} % of what photographs show as plain is bent by more than {BENT:.0f} degrees."
         cause = "Photographs say little about walls and tables of one colour, which come out in rags; the asset shows them right from near the photographs."
         remedy = "Photograph such surfaces with something on them that has texture (posters, newspapers, chalk); use the asset or the splats."

@@ -45,7 +45,6 @@ def test_retrieval_finds_what_shows_the_same_in_any_order_of_files() -> None:
 
 def test_weak_images_are_compared_with_neighbours_of_neighbours() -> None:
     likeness = -np.abs(np.subtract.outer(np.arange(100.0), np.arange(100.0)))
-    near = {i: {i - 1, i + 1} & set(range(100)) for i in range(100)} | {0: {50}, 50: {0, 90}}
-    found = pairs.wider_pairs(likeness, [0], near, 12)
-    assert found == {(0, j) for j in [*range(1, 13), 90]}
-    assert pairs.wider_pairs(likeness, [], near, 12) == set()
+    near = {i: {i - 1, i + 1} & set(range(100)) for i in range(100)} | {0: {30}, 30: {0, 90}}
+    assert pairs.wider_pairs(likeness, [0], near) == {(0, j) for j in [*range(1, pairs.WIDER + 1), 90]}
+    assert pairs.wider_pairs(likeness, [], near) == set()
