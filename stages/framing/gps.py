@@ -17,10 +17,11 @@ from stages.io.capture import Alignment, Capture
 from stages.io.photo import read_gps_position
 from stages.io.pictures import UnreadableImage
 
-FEWEST = 6  # photographs with a position
+MIN_PHOTOGRAPHS = 6  # photographs with a position
 ROUNDS = 20
-SCALE, UP = 0.1, 0.03  # median distance to the positions over their extent, up to which the scale (or a stated frame) and the upward axis are taken from them
-FLAT = 0.1  # extent across the longest line through the cameras, over that along it: below, they turn about it freely
+# Median distance to the positions over their extent, up to which the scale (or a stated frame) and the upward axis are taken from them.
+MAX_DISTANCE_FOR_SCALE, MAX_DISTANCE_FOR_UP = 0.1, 0.03
+MIN_BREADTH = 0.1  # extent across the longest line through the cameras, over that along it: below, they turn about it freely
 _A, _F = 6378137.0, 1 / 298.257223563  # WGS 84: semi-major axis in metres, flattening
 
 
@@ -62,15 +63,15 @@ def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]
             positions[photo.camera.name] = position
     if not positions:
         return capture, ""
-    if len(positions) < max(FEWEST, len(capture.photos) / 2):
+    if len(positions) < max(MIN_PHOTOGRAPHS, len(capture.photos) / 2):
         return _with(capture, gps=Alignment(photographs=len(positions), used="nothing")), ""
     places = enu_from_gps(np.array([positions[photo.camera.name] for photo in capture.photos if photo.camera.name in positions]))
     aligned, distance, extent, straight = _aligned(capture, [*positions], places)
     found = Alignment(photographs=len(positions), extent=round(extent, 3), distance=round(distance, 3), used="nothing")
-    if not distance <= SCALE * extent or aligned.scale <= 0:
+    if not distance <= MAX_DISTANCE_FOR_SCALE * extent or aligned.scale <= 0:
         return _with(capture, gps=found), ""
     words = f"{len(positions)} of {len(capture.photos)} photographs have a GPS position, {distance:.2g} m from the cameras found in the median"
-    if distance > UP * extent or straight:
+    if distance > MAX_DISTANCE_FOR_UP * extent or straight:
         scaled = Similarity(aligned.scale, np.eye(3), np.zeros(3))
         return in_metres(_with(capture, gps=structs.replace(found, used="scale")), scaled), f"{words}: the scale is taken from them."
     moved = replace(in_metres(capture, aligned), up=np.array([0.0, 0.0, 1.0]))
@@ -82,11 +83,11 @@ def with_stated_cameras(capture: Capture, stated: Capture) -> tuple[Capture, str
     places = {photo.camera.name: photo.camera.centre for photo in stated.photos}
     names = [photo.camera.name for photo in capture.photos if photo.camera.name in places]
     words = f"the source states cameras of {len(names)} of the {len(capture.photos)} photographs ({stated.kind})"
-    if len(names) < max(FEWEST, len(capture.photos) / 2):
+    if len(names) < max(MIN_PHOTOGRAPHS, len(capture.photos) / 2):
         return _with(capture, stated_cameras=Alignment(photographs=len(names), used="nothing")), f"{words}: too few to be used."
     aligned, distance, extent, straight = _aligned(capture, names, np.array([places[name] for name in names]))
     found = Alignment(photographs=len(names), extent=round(extent, 6), distance=round(distance, 6), used="nothing")
-    if not distance <= SCALE * extent or aligned.scale <= 0:
+    if not distance <= MAX_DISTANCE_FOR_SCALE * extent or aligned.scale <= 0:
         share = f"{distance / extent:.0%} of their extent" if extent > 0 else "they lie in one place"
         return _with(capture, stated_cameras=found), f"{words}, but not where they were found ({share} apart in the median): they are not used."
     if straight:
@@ -104,7 +105,7 @@ def _aligned(capture: Capture, names: Sequence[str], places: np.ndarray) -> tupl
     aligned = robust_similarity(centres, places)
     distance = float(np.median(np.linalg.norm(aligned.points(centres) - places, axis=1)))
     spread = np.linalg.svd(aligned.scale * (centres - centres.mean(0)), compute_uv=False) / np.sqrt(len(centres))  # along three axes
-    return aligned, distance, float(np.linalg.norm(spread)), bool(spread[1] < FLAT * spread[0])
+    return aligned, distance, float(np.linalg.norm(spread)), bool(spread[1] < MIN_BREADTH * spread[0])
 
 
 def in_metres(capture: Capture, similarity: Similarity) -> Capture:

@@ -22,11 +22,11 @@ from stages.io.capture import Capture, SparsePoints
 MIN_TRACK = 3  # photographs that observe a reliable point
 MAX_ERROR = 2.0  # its reprojection error over the median
 MIN_POINTS = 10  # in a picture, of which its content is judged
-OUTSIDE, MOST_OUTSIDE = 0.01, 10  # share, and number, of the reliable points in a picture that may lie before its content, and behind it: outliers
-RATIO = 0.5  # near plane over the depth of the nearest content; over that of the point that all cameras look at, at most
+OUTLIER_SHARE, MAX_OUTLIERS = 0.01, 10  # share, and number, of the reliable points in a picture that may lie before its content, and behind it: outliers
+NEAR_RATIO = 0.5  # near plane over the depth of the nearest content; over that of the point that all cameras look at, at most
 NEIGHBOURS = 8  # cameras, nearest in place, among those whose axes are within 60 degrees
-BEYOND = 1.5  # far plane over the depth of the farthest content
-END = 100.0  # far plane at most, over half of the box's longest side: contracted space ends at 64
+FAR_RATIO = 1.5  # far plane over the depth of the farthest content
+MAX_FAR = 100.0  # far plane at most, over half of the box's longest side: contracted space ends at 64
 MAX_OVER_NEIGHBOURS = 1.5  # near plane over the median of theirs
 
 
@@ -45,11 +45,11 @@ def near_far_planes(capture: Capture, placed: Sequence[Camera], world: Similarit
         return boxes
     content = content_depths(capture, placed, world)
     stated = np.array([bool(photo.near and photo.far) for photo in capture.photos])
-    farthest = min(BEYOND * float(np.fmax.reduce(content[~stated, 1], initial=0.0)), END)
-    near, far = np.where(stated, 0.9, RATIO) * content[:, 0], np.fmax(boxes[:, 1], np.where(stated, 1.1 * content[:, 1], farthest))
+    farthest = min(FAR_RATIO * float(np.fmax.reduce(content[~stated, 1], initial=0.0)), MAX_FAR)
+    near, far = np.where(stated, 0.9, NEAR_RATIO) * content[:, 0], np.fmax(boxes[:, 1], np.where(stated, 1.1 * content[:, 1], farthest))
     caps = [MAX_OVER_NEIGHBOURS * of_neighbours(near, placed)]
     if focus is not None:
-        caps.append(RATIO * depths_in_picture(focus, placed))
+        caps.append(NEAR_RATIO * depths_in_picture(focus, placed))
     near = np.where(stated, near, np.fmin.reduce([near, *caps]))
     near = np.where(np.isnan(near), 0.05 * np.maximum(boxes[:, 0], 0.2 * boxes[:, 1]), near)
     return np.stack([np.minimum(near, 0.5 * far), far], axis=1)
@@ -75,7 +75,7 @@ def content_depths(capture: Capture, placed: Sequence[Camera], world: Similarity
             continue
         depths = np.sort((xyz[shows(xyz, camera)] - camera.centre) @ camera.forward)
         if len(depths) >= MIN_POINTS:
-            outside = min(int(OUTSIDE * len(depths)), MOST_OUTSIDE)
+            outside = min(int(OUTLIER_SHARE * len(depths)), MAX_OUTLIERS)
             row[:] = depths[outside], depths[-1 - outside]
     return found
 

@@ -12,9 +12,9 @@ from stages.io.capture import Capture
 from stages.io.photo import read_gravity
 from stages.io.pictures import UnreadableImage
 
-FEWEST = 6  # photographs with a gravity vector, and half of all
+MIN_PHOTOGRAPHS = 6  # photographs with a gravity vector, and half of all
 MAX_SPREAD = 5.0  # degrees, of the median photograph's gravity from that of all, up to which they give up
-AGREED = 5.0  # degrees between two that say which way is up, beyond which a warning names them
+MAX_DISAGREEMENT = 5.0  # degrees between two that say which way is up, beyond which a warning names them
 THE_CAMERAS, PLANE = "level cameras", "the floor or table"
 
 
@@ -32,10 +32,10 @@ def with_up(capture: Capture, choice: str, say: Callable[[str], None], warn: Cal
     near = None if capture.points is None else level_plane(capture.points.xyz, np.array([photo.camera.centre for photo in capture.photos]), up)
     found |= {THE_CAMERAS: cameras} | ({} if near is None else {PLANE: near[0]})
     degrees = {name: round(float(np.degrees(np.arccos(np.clip(up @ other, -1, 1)))), 2) for name, other in found.items() if name != by}
-    apart = [f"{name} ({angle:.0f} degrees)" for name, angle in degrees.items() if angle > AGREED and name not in (THE_CAMERAS, PLANE)]
+    apart = [f"{name} ({angle:.0f} degrees)" for name, angle in degrees.items() if angle > MAX_DISAGREEMENT and name not in (THE_CAMERAS, PLANE)]
     if apart:
         warn(f"up is taken from {by}, and contradicted by {', '.join(apart)}. Set it by poses.up, or afterwards by enerf orient.")
-    if degrees.get(PLANE, 0.0) > AGREED:  # it may be a slope
+    if degrees.get(PLANE, 0.0) > MAX_DISAGREEMENT:  # it may be a slope
         say(f"{PLANE} is {degrees[PLANE]:.0f} degrees off level by {by}. If it is level: enerf orient RUN --plane, afterwards.")
     facts = capture.facts | {"up": {"by": by, "degrees": degrees}}
     return replace(capture, facts=facts, up=capture.up if by in (THE_CAMERAS, "poses.up") else up)
@@ -62,7 +62,7 @@ def up_by_gravity(capture: Capture) -> np.ndarray | None:
             continue
         if gravity is not None:
             ups.append(-photo.camera.world_from_camera[:3, :3] @ gravity)
-    if len(ups) < max(FEWEST, len(capture.photos) / 2):
+    if len(ups) < max(MIN_PHOTOGRAPHS, len(capture.photos) / 2):
         return None
     all_of, weight = np.array(ups), np.ones(len(ups))
     for _ in range(20):

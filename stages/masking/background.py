@@ -17,10 +17,10 @@ from stages.io.capture import Photo, Silhouettes
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.reader import SMALL, PhotoReader
 
-MOST_PAIRS = 24  # of photographs that follow each other
+MAX_PAIRS = 24  # of photographs that follow each other
 FINE = 4.0  # px at `SMALL`, standard deviation of the blur that separates texture from shading
-STANDING = 0.5  # correlation of the texture of two photographs, from which the background is the same
-LEAST_TEXTURE = 1.0  # of 255, standard deviation
+MIN_CORRELATION = 0.5  # correlation of the texture of two photographs, from which the background is the same
+MIN_TEXTURE = 1.0  # of 255, standard deviation
 
 
 def silhouettes_with_surroundings(
@@ -42,7 +42,7 @@ def silhouettes_with_surroundings(
 def stands_still(photos: Sequence[Photo], kind: Silhouettes, reader: PhotoReader, safe_point: Callable[[], None]) -> bool:
     """Whether what lies outside of the silhouettes is the same in photographs that follow each other, or has no texture at all."""
     found: list[float] = []
-    for index in range(0, len(photos) - 1, -(-len(photos) // MOST_PAIRS)):
+    for index in range(0, len(photos) - 1, -(-len(photos) // MAX_PAIRS)):
         safe_point()
         pair = []
         for photo in photos[index : index + 2]:
@@ -60,9 +60,9 @@ def stands_still(photos: Sequence[Photo], kind: Silhouettes, reader: PhotoReader
         if len(pair) == 2 and pair[0][0].shape == pair[1][0].shape:
             outside = pair[0][1] & pair[1][1]
             one, other = (texture[outside] for texture, _ in pair)
-            if outside.any() and min(one.std(), other.std()) >= LEAST_TEXTURE:
+            if outside.any() and min(one.std(), other.std()) >= MIN_TEXTURE:
                 found.append(float(np.corrcoef(one, other)[0, 1]))
-    return not found or float(np.median(found)) >= STANDING
+    return not found or float(np.median(found)) >= MIN_CORRELATION
 
 
 def photo_without_camera(name: str, image: Path, mask: Path | None) -> Photo | None:

@@ -24,7 +24,7 @@ from stages.masking.backdrop import without_white_backdrop
 from stages.masking.background import silhouettes_with_surroundings
 from stages.masking.made import made_masks, masks_by_network, with_masks
 from stages.masking.polarity import INVERTED_NOTICE, kept_white
-from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
+from stages.masking.turning import MIN_TURN, masks_of_turning_subject, turn
 from stages.poses.memory import feature_threads
 from stages.sfm.added.networks import given_networks
 from stages.sfm.attempts import MIN_REGISTERED
@@ -181,14 +181,14 @@ def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path], reader:
     except BadInput:
         job.say("the subject alone has too few features; cameras are estimated from the full images")
         return None, True
-    if turn([photo for photo in alone.photos if photo.mask is not None]) < LEAST_TURN:
+    if turn([photo for photo in alone.photos if photo.mask is not None]) < MIN_TURN:
         job.say("all cameras look the same way, so the background may be far away; the full images are used")
         return None, False
     if len(alone.photos) < MIN_REGISTERED * len(paths):
         job.say("the subject alone has too few features in some photographs; cameras are also estimated from the full images")
         with contextlib.suppress(BadInput):
             whole = find("cameras", {})
-            if turn(whole.photos) >= LEAST_TURN and _explained(whole) > _explained(alone):
+            if turn(whole.photos) >= MIN_TURN and _explained(whole) > _explained(alone):
                 job.say("the full images explain more than the subject alone and are used")
                 return whole, False
     return replace(alone, provenance=structs.replace(alone.provenance, background="left out")), False

@@ -18,15 +18,15 @@ from stages.framing.mask_use import alike
 from stages.io.capture import Photo
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.reader import PhotoReader
-from stages.masking.background import FINE, LEAST_TEXTURE, photo_without_camera
+from stages.masking.background import FINE, MIN_TEXTURE, photo_without_camera
 from stages.masking.made import STATIC, made_masks
 from stages.masking.static import border_of
 
 SIDE = 320  # px, longest side of the photographs whose borders are compared
-FEWEST, COMPARED = 8, 6  # photographs; those that are compared, far apart
-STANDING, STILL_PAIRS = 0.7, 0.8  # correlation of the texture of two borders, from which they stand still; share of the pairs that do
-ONE_SIZE = 0.9  # of the photographs
-LEAST_TURN = 15.0  # degrees between two view directions
+MIN_PHOTOGRAPHS, COMPARED = 8, 6  # photographs; those that are compared, far apart
+MIN_CORRELATION, MIN_STILL_PAIRS = 0.7, 0.8  # correlation of the texture of two borders, from which they stand still; share of the pairs that do
+MIN_OF_ONE_SIZE = 0.9  # of the photographs
+MIN_TURN = 15.0  # degrees between two view directions
 
 
 def masks_of_turning_subject(
@@ -40,7 +40,7 @@ def masks_of_turning_subject(
     except BadInput:  # no background that recurs
         return {}
     photos = [photo for name in sorted(masks) if (photo := photo_without_camera(name, paths[name], masks[name])) is not None]
-    return {} if len(masks) < ONE_SIZE * len(paths) or alike([(photo, reader.mask(photo)) for photo in photos])[0] else masks
+    return {} if len(masks) < MIN_OF_ONE_SIZE * len(paths) or alike([(photo, reader.mask(photo)) for photo in photos])[0] else masks
 
 
 def border_stands_still(paths: Mapping[str, Path], reader: PhotoReader, safe_point: Callable[[], None]) -> bool:
@@ -58,7 +58,7 @@ def border_stands_still(paths: Mapping[str, Path], reader: PhotoReader, safe_poi
         sizes.append((header.size, name))
     usual = max({size for size, _ in sizes}, key=[size for size, _ in sizes].count, default=None)
     chosen = [name for size, name in sizes if size == usual]
-    if len(chosen) < max(FEWEST, ONE_SIZE * len(names)):
+    if len(chosen) < max(MIN_PHOTOGRAPHS, MIN_OF_ONE_SIZE * len(names)):
         return False
     borders: list[np.ndarray] = []
     for index in np.linspace(0, len(chosen) - 1, COMPARED).astype(int):
@@ -68,13 +68,13 @@ def border_stands_still(paths: Mapping[str, Path], reader: PhotoReader, safe_poi
         except UnreadableImage:
             return False
         texture = (grey - cv2.GaussianBlur(grey, (0, 0), FINE))[border_of(grey.shape)]
-        if texture.std() < LEAST_TEXTURE:
+        if texture.std() < MIN_TEXTURE:
             return False
         borders.append(texture)
-        if len(borders) == 2 and _correlation(*borders) < STANDING:
+        if len(borders) == 2 and _correlation(*borders) < MIN_CORRELATION:
             return False  # of nearly all captures: what follows costs time
-    pairs = [_correlation(one, other) >= STANDING for k, one in enumerate(borders) for other in borders[k + 1 :]]
-    return float(np.mean(pairs)) >= STILL_PAIRS
+    pairs = [_correlation(one, other) >= MIN_CORRELATION for k, one in enumerate(borders) for other in borders[k + 1 :]]
+    return float(np.mean(pairs)) >= MIN_STILL_PAIRS
 
 
 def _correlation(one: np.ndarray, other: np.ndarray) -> float:

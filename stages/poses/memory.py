@@ -17,8 +17,8 @@ from stages.io.photo import working_size
 from stages.io.pictures import UnreadableImage, read_header
 from stages.memory.forecast import Known, files_below, sizes_below
 from stages.memory.need import IMAGING, MIB, Need, most_threads, refuse_what_does_not_fit
-from stages.sfm.added.matches import AT_ONCE
-from stages.sfm.added.networks import LONGEST
+from stages.sfm.added.matches import MAX_AT_ONCE
+from stages.sfm.added.networks import LONGEST_SIDE
 from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
 from stages.sfm.pairs import BLOCK_SIZE, features_for
 from stages.video.panorama import VIEWS
@@ -59,7 +59,7 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     decoded = decoding_needed(sizes).terms
     workers = min(threads, MAX_WORKERS)
     matching = workers * (COLMAP + 4 * BLOCK_SIZE * DESCRIPTOR * features) if workers > 1 and len(sizes) > 2 * BLOCK_SIZE else 0
-    in_networks = min(threads, AT_ONCE) * NETWORK * LONGEST**2 if networks else 0
+    in_networks = min(threads, MAX_AT_ONCE) * NETWORK * LONGEST_SIDE**2 if networks else 0
     return Need({
         "a photograph, or features, on each thread": max(decoded["a photograph"] * threads, SIFT * most * threads, matching, in_networks),
         "descriptors": DESCRIPTOR * features * len(sizes),

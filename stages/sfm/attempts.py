@@ -19,17 +19,18 @@ from stages.sfm.intrinsics import zoom
 from stages.verdict.verdict import DOUBTFUL
 
 MIN_REGISTERED = 0.9  # of the photographs with a camera, from which the costlier attempts are not made; and
-AGREEING = 0.8  # of the verified matches, that agree with the cameras
+MIN_AGREEING = 0.8  # of the verified matches, that agree with the cameras
 MIN_GAIN = 1.005  # times the score, from which a later attempt is better than an earlier one
 MORE_FEATURES, LESS_CONTRAST = 2, 0.35
-EACH, CROPPED, MERGED = "a focal length each", "a principal point each", "merged sub-models"
+OWN_FOCAL_LENGTHS, OWN_PRINCIPAL_POINTS, MERGED = "a focal length each", "a principal point each", "merged sub-models"
 BEGIN_ANEW, SMALL_ANGLES = "another beginning", "small angles"
 NETWORK, NETWORK_ANEW = "matches by a network", "another beginning with matches by a network"
 MATCHED_AGAIN, NETWORKS, OWN_CAMERAS = "rungs", "networks", "own_cameras"  # scratch folders
-MAX_LOSS = 0.02  # of the matches, that fewer may agree when sub-models are merged: a false place contradicts the matches between them
-SPREAD = 1.08  # between the focal lengths of single photographs, from which they may have been zoomed
-APART = 0.009  # of the longest side, between the principal points of single photographs, from which they may have been cropped
-CLOSER, SAME = 0.85, 0.995  # times the reprojection error, to which principal points of their own must lower it; and the score, which is hardly lower then
+MAX_AGREEMENT_LOSS = 0.02  # of the matches, that fewer may agree when sub-models are merged: a false place contradicts the matches between them
+MIN_FOCAL_SPREAD = 1.08  # between the focal lengths of single photographs, from which they may have been zoomed
+MIN_MIDDLE_SPREAD = 0.009  # of the longest side, between the principal points of single photographs, from which they may have been cropped
+# Principal points of their own must lower the reprojection error to so many times; and keep so much of the score.
+MAX_ERROR_RATIO, MIN_SCORE_RATIO = 0.85, 0.995
 MAX_STILL_DISAGREEING = 0.5  # of the matches that disagreed, that may disagree with a focal length each: more parameters fit anything a little better
 
 Models = list[Any]  # sub-models, largest first
@@ -103,7 +104,7 @@ class Search:
 
     @property
     def enough(self) -> bool:
-        return mapping.num_registered(self.models) >= MIN_REGISTERED * len(self.images) and self.agreement >= AGREEING
+        return mapping.num_registered(self.models) >= MIN_REGISTERED * len(self.images) and self.agreement >= MIN_AGREEING
 
     def was_last(self, name: str) -> bool:
         return self.tried[-1]["rung"] == name
@@ -202,14 +203,14 @@ def match_by_networks(search: Search) -> Models | None:
 
 def zoomed(search: Search) -> bool:
     """Whether single photographs would have another focal length, or matches disagree with the cameras."""
-    return bool(search.models) and (search.agreement < DOUBTFUL or zoom.focal_length_spread(search.models[0]) > SPREAD)
+    return bool(search.models) and (search.agreement < DOUBTFUL or zoom.focal_length_spread(search.models[0]) > MIN_FOCAL_SPREAD)
 
 
 def cropped(search: Search) -> bool:
     """Whether single photographs of one lens would have another principal point; of fisheye lenses none are looked for."""
     lenses = {(image.focal, round(image.work_width / image.width, 2)) for image in search.images}  # or reduced by different factors
     of_one = len(lenses) == 1 and not any(image.fisheye for image in search.images)
-    return bool(search.models) and search.best != EACH and of_one and zoom.principal_point_spread(search.models[0]) > APART
+    return bool(search.models) and search.best != OWN_FOCAL_LENGTHS and of_one and zoom.principal_point_spread(search.models[0]) > MIN_MIDDLE_SPREAD
 
 
 def with_own_cameras(search: Search) -> Models:
@@ -227,5 +228,5 @@ def with_own_principal_points(search: Search) -> Models | None:
 
 
 def better_where_closer(search: Search, models: Models) -> float:
-    closer = models[0].compute_mean_reprojection_error() < CLOSER * search.models[0].compute_mean_reprojection_error()
-    return SAME if closer else MIN_GAIN
+    closer = models[0].compute_mean_reprojection_error() < MAX_ERROR_RATIO * search.models[0].compute_mean_reprojection_error()
+    return MIN_SCORE_RATIO if closer else MIN_GAIN

@@ -20,10 +20,10 @@ from stages.sfm.images import Progress
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
-TOLERANCE = 4.0  # px at working size, of the epipolar error of a match that agrees with the cameras
+MAX_EPIPOLAR_ERROR = 4.0  # px at working size, of the epipolar error of a match that agrees with the cameras
 MANY_OBSERVATIONS = 150_000  # of points in images; of more, an even choice holds the cameras as well
-NEARLY = 0.95  # of the photographs: later steps may bring back the others
-ALL_OF = 300  # points: a photograph with no more keeps all of them
+MIN_REGISTERED_RATIO = 0.95  # of the photographs: later steps may bring back the others
+FEW_POINTS = 300  # points: a photograph with no more keeps all of them
 # Global bundle adjustments: one each time photographs or points have grown by these ratios, over the points that hold the cameras, and loosely converged,
 # for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
 ADJUSTMENTS: Mapping[str, object] = {
@@ -55,7 +55,7 @@ def sub_models(work: Path, images: Sequence[WorkImage], seed: int, options: Opti
     if not models or not any(contradicts_exif(camera.mean_focal_length(), prior) for camera, prior in _cameras_with_exif_focal(images, models[0])):
         return models
     fixed = _incremental_mapping(work, len(images), seed, options, progress, safe_point, refine_camera=False)
-    enough = fixed and num_registered(fixed) >= NEARLY * num_registered(models)
+    enough = fixed and num_registered(fixed) >= MIN_REGISTERED_RATIO * num_registered(models)
     if enough and fixed[0].compute_mean_reprojection_error() < 1.15 * models[0].compute_mean_reprojection_error():
         return fixed
     return models
@@ -173,7 +173,7 @@ def thinned(model: Any, most: int) -> Any:
     every = -(-int(model.compute_num_observations()) // most)
     if every < 2:
         return None
-    poor = [image for image in model.images.values() if image.num_points3D <= ALL_OF]
+    poor = [image for image in model.images.values() if image.num_points3D <= FEW_POINTS]
     needed = {point.point3D_id for image in poor for point in image.points2D if point.has_point3D()}
     some = model.__deepcopy__({})
     for number, point_id in enumerate(sorted(model.point3D_ids())):
@@ -268,7 +268,7 @@ def camera_of(model: Any, image: Any) -> Camera:
 
 
 def match_agreement(work: Path, model: Any) -> float:
-    """The share of the verified matches of all pairs whose epipolar error is below TOLERANCE.
+    """The share of the verified matches of all pairs whose epipolar error is below MAX_EPIPOLAR_ERROR.
 
     COLMAP drops observations that do not fit, so that its reprojection error is small even where repeated structure was folded onto itself.
     """
@@ -282,6 +282,6 @@ def match_agreement(work: Path, model: Any) -> float:
                 continue
             inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
             a, b = directions[first][inliers[:, 0]], directions[second][inliers[:, 1]]
-            agreeing += int((epipolar_error(cameras[first], cameras[second], a, b) < TOLERANCE).sum())
+            agreeing += int((epipolar_error(cameras[first], cameras[second], a, b) < MAX_EPIPOLAR_ERROR).sum())
             total += len(inliers)
     return agreeing / total if total else 1.0

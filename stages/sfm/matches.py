@@ -17,8 +17,8 @@ from stages.sfm.pairs import Pair, aggregated, in_blocks, likeness_of, ordered
 
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md
 MAX_WORKERS = 8  # processes that match pairs
-FEW_NEIGHBOURS = 3  # photographs that one overlaps with; of fewer, more are looked for
-PAIRS_A_WORKER = 96  # a process is not worth its start for fewer
+MIN_NEIGHBOURS = 3  # photographs that one overlaps with; of fewer, more are looked for
+MIN_PAIRS_A_WORKER = 96  # a process is not worth its start for fewer
 
 
 def extract_features(
@@ -107,7 +107,7 @@ def match_photographs(work: Path, images: Sequence[WorkImage], how: str, *, seed
     alike = likeness(work, seed, safe_point)
     match_pairs(work, images, pairs.retrieved_pairs(alike), **common)
     near = neighbours(work, len(images))
-    weak = [i for i, others in near.items() if len(others) < FEW_NEIGHBOURS] + [i for part in pairs.components(near)[1:] for i in part]
+    weak = [i for i, others in near.items() if len(others) < MIN_NEIGHBOURS] + [i for part in pairs.components(near)[1:] for i in part]
     match_pairs(work, images, pairs.wider_pairs(alike, weak, near), name="wider_", **common)
 
 
@@ -152,7 +152,7 @@ def match_pairs(
         done += count
         progress(done, total, "matching pairs")
 
-    busy = min(workers, MAX_WORKERS, left // PAIRS_A_WORKER)
+    busy = min(workers, MAX_WORKERS, left // MIN_PAIRS_A_WORKER)
     if busy > 1:
         pair_workers.match(work, blocks, seed=seed, guided=guided, workers=busy, more=more, safe_point=safe_point)
         return

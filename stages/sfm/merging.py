@@ -20,11 +20,11 @@ from stages.sfm.added.markers import tie_markers
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import WorkImage, database_path, images_of, inlier_counts, mapper_database
 
-MIN_SHARED, SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
-TOLERANCE = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart
-MATCHES = 15  # of a pair, from which they are used, as in the mapper
-HYPOTHESES, MOST = 500, 5000  # similarities that are tried; shared points that they are tried on
-REFINED = 5  # times that the best is fitted to all that fit it
+MIN_SHARED, MIN_SHARE = 30, 0.4  # shared points that must fit, and of all that are shared
+MAX_MISS = 8.0  # px at working size, within which a shared point fits: sub-models have drifted apart
+MIN_MATCHES = 15  # of a pair, from which they are used, as in the mapper
+HYPOTHESES, MAX_SHARED = 500, 5000  # similarities that are tried; shared points that they are tried on
+REFINEMENTS = 5  # times that the best is fitted to all that fit it
 ROUNDS = 2  # of triangulating and adjusting: the second finds more points that go through both
 
 
@@ -45,11 +45,11 @@ class Sights:
         return Sights(similarity.points(self.xyz), similarity.points(self.centre), self.direction @ similarity.rotation.T, self.focal)
 
     def see(self, xyz: np.ndarray) -> np.ndarray:
-        """(N,) whether points (N, 3) lie within TOLERANCE of the rays."""
+        """(N,) whether points (N, 3) lie within MAX_MISS of the rays."""
         towards = xyz - self.centre
         distance = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
         off = np.linalg.norm(np.cross(towards, self.direction), axis=1) / distance
-        return np.asarray((off * self.focal < TOLERANCE) & ((towards * self.direction).sum(1) > 0))
+        return np.asarray((off * self.focal < MAX_MISS) & ((towards * self.direction).sum(1) > 0))
 
 
 def merged(work: Path, images: Sequence[WorkImage], models: Sequence[Any], seed: int, safe_point: SafePoint) -> list[Any]:
@@ -86,7 +86,7 @@ def similarity_of(ours: Sights, theirs: Sights, seed: int) -> Similarity | None:
     count = len(ours.xyz)
     if count < MIN_SHARED:
         return None
-    some = np.arange(0, count, -(-count // MOST))
+    some = np.arange(0, count, -(-count // MAX_SHARED))
     few_ours, few_theirs = ours.only(some), theirs.only(some)
     rng = np.random.Generator(np.random.PCG64(seed))
     best, most = None, 0
@@ -99,13 +99,13 @@ def similarity_of(ours: Sights, theirs: Sights, seed: int) -> Similarity | None:
     if best is None:
         return None
     fitting = _fitting(best, ours, theirs)
-    for _ in range(REFINED):
+    for _ in range(REFINEMENTS):
         if fitting.sum() < MIN_SHARED:
             return None
         near = np.linalg.norm(ours.xyz - ours.centre, axis=1)[fitting]  # what is far away is known less well
         best = closest_similarity(theirs.xyz[fitting], ours.xyz[fitting], near**-2.0)
         fitting = _fitting(best, ours, theirs)
-    return best if fitting.sum() >= max(MIN_SHARED, SHARE * count) else None
+    return best if fitting.sum() >= max(MIN_SHARED, MIN_SHARE * count) else None
 
 
 def _fitting(similarity: Similarity, ours: Sights, theirs: Sights) -> np.ndarray:
@@ -142,7 +142,7 @@ def _shared(work: Path, ours: Mapping[int, Any], theirs: Mapping[int, Any]) -> I
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
         for (first, second), count in inlier_counts(database_path(work)).items():
             for a, b in ((first, second), (second, first)):
-                if count < MATCHES or a not in ours or b not in theirs or a in theirs or b in ours:
+                if count < MIN_MATCHES or a not in ours or b not in theirs or a in theirs or b in ours:
                     continue
                 matches = np.asarray(database.read_two_view_geometry(first, second).inlier_matches, np.int64).reshape(-1, 2)
                 matches = matches if a == first else matches[:, ::-1]

@@ -23,7 +23,7 @@ from stages.cores import count_cores
 from stages.io.capture import Capture, Markers
 from stages.sfm import attempts, mapping, matches, result
 from stages.sfm.added.markers import keep_markers
-from stages.sfm.attempts import BEGIN_ANEW, CROPPED, EACH, MERGED, NETWORK, NETWORK_ANEW, SMALL_ANGLES, Attempt, Search, anew
+from stages.sfm.attempts import BEGIN_ANEW, MERGED, NETWORK, NETWORK_ANEW, OWN_FOCAL_LENGTHS, OWN_PRINCIPAL_POINTS, SMALL_ANGLES, Attempt, Search, anew
 from stages.sfm.database import open_database
 from stages.sfm.images import Callables, prepare_images
 from stages.sfm.intrinsics.own import with_own_intrinsics
@@ -37,20 +37,20 @@ from stages.sfm.pairs import features_for, matching_for
 #     they are matched by networks, where the user has given them
 #     each photograph gets a focal length or a principal point of its own, where single photographs would have another, as zoomed or cropped ones have
 ATTEMPTS = (
-    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.MAX_LOSS),
+    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.MAX_AGREEMENT_LOSS),
     Attempt("fewer matches", lambda s: s.models and s.missing, lambda s: s.go_on()),
     anew(BEGIN_ANEW, lambda s: s.most_missing, RELAXED),
     anew(SMALL_ANGLES, lambda s: s.was_last(BEGIN_ANEW) and not s.enough, FORWARD),  # as of a way straight ahead
     Attempt("wider matching", lambda s: s.missing, attempts.match_more),
-    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.MAX_LOSS),
+    Attempt(MERGED, attempts.unmerged, attempts.merge, least=lambda s: s.agreement - attempts.MAX_AGREEMENT_LOSS),
     Attempt("more features", lambda s: s.missing and not s.enough, attempts.detect_more),
     anew(BEGIN_ANEW, lambda s: not s.enough and not s.begun_anew(), RELAXED),
     anew(SMALL_ANGLES, lambda s: s.was_last(BEGIN_ANEW) and not s.enough, FORWARD),
     Attempt(NETWORK, lambda s: s.networks and s.missing, attempts.match_by_networks),
     anew(NETWORK_ANEW, lambda s: s.place.name == attempts.NETWORKS and s.most_missing, DEFAULTS),
     anew(NETWORK_ANEW, lambda s: s.was_last(NETWORK_ANEW) and not s.enough, RELAXED),
-    Attempt(EACH, attempts.zoomed, attempts.with_own_cameras, least=lambda s: 1 - attempts.MAX_STILL_DISAGREEING * (1 - s.agreement)),
-    Attempt(CROPPED, attempts.cropped, attempts.with_own_principal_points, better=attempts.better_where_closer),
+    Attempt(OWN_FOCAL_LENGTHS, attempts.zoomed, attempts.with_own_cameras, least=lambda s: 1 - attempts.MAX_STILL_DISAGREEING * (1 - s.agreement)),
+    Attempt(OWN_PRINCIPAL_POINTS, attempts.cropped, attempts.with_own_principal_points, better=attempts.better_where_closer),
 )
 
 
@@ -113,9 +113,9 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
     # Bundle adjustment with a robust loss; then intrinsics for each photograph, where they explain what they were not fitted to.
     model = search.models[0]
     own: str | UnsetType | None = UNSET
-    if search.best != CROPPED:
+    if search.best != OWN_PRINCIPAL_POINTS:
         model = mapping.bundle_adjusted(search.work, images, model, safe_point)
-    if search.best not in (EACH, CROPPED):
+    if search.best not in (OWN_FOCAL_LENGTHS, OWN_PRINCIPAL_POINTS):
         model, own = with_own_intrinsics(images, model, safe_point)
 
     moving = mapping.moving_shares(search.work, images, model, safe_point)

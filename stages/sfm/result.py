@@ -15,7 +15,7 @@ from pipeline.files import write_json
 from stages.formats.importers.source import abbreviated
 from stages.io.capture import Capture, Lens, Photo, Provenance, SparsePoints
 from stages.sfm import mapping
-from stages.sfm.attempts import CROPPED, EACH, Search
+from stages.sfm.attempts import OWN_FOCAL_LENGTHS, OWN_PRINCIPAL_POINTS, Search
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import WorkImage, database_path, inlier_counts, neighbours, planar_share
 from stages.sfm.images import Masks
@@ -25,9 +25,9 @@ from stages.verdict.parallax import parallax
 from stages.verdict.verdict import WITHOUT_TEXTURE, failed
 
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
-FEW_FEATURES = 50  # of a photograph, below which it has too little detail
-OWN_LENSES: dict[str, Lens] = {EACH: "zoomed", CROPPED: "cropped"}  # by attempt
-OTHER_FOCAL = 1.2  # times a focal length: that of another lens
+MIN_FEATURES = 50  # of a photograph, below which it has too little detail
+OWN_LENSES: dict[str, Lens] = {OWN_FOCAL_LENGTHS: "zoomed", OWN_PRINCIPAL_POINTS: "cropped"}  # by attempt
+OTHER_LENS_RATIO = 1.2  # times a focal length: that of another lens
 MAX_NAMES = 8  # photographs that an error lists by name
 Rejected = Sequence[tuple[str, str]]  # name and reason of each
 
@@ -123,7 +123,7 @@ def unregistered(search: Search) -> list[tuple[str, str]]:
         inliers = best.get(ids[image.file], 0)
         if other is not None:
             reason = f"belongs to another sub-model, of {len(other)} photographs, which shares too few points with the rest"
-        elif features[image.file] < FEW_FEATURES:
+        elif features[image.file] < MIN_FEATURES:
             reason = f"only {features[image.file]} features detected: {WITHOUT_TEXTURE}"
         elif inliers < 15:
             reason = "overlaps no other photograph well enough"
@@ -162,7 +162,7 @@ def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: fl
         )
     lenses: dict[tuple[float | None, str, int, int, int], Camera] = {}  # one of each: with intrinsics of their own they have much the same focal length
     for camera, prior in zip(cameras, priors, strict=True):
-        step = round(math.log(camera.intrinsics["fx"]) / math.log(OTHER_FOCAL))
+        step = round(math.log(camera.intrinsics["fx"]) / math.log(OTHER_LENS_RATIO))
         lenses[prior, camera.model, camera.width, camera.height, step] = camera
     for (prior, *_), camera in lenses.items():
         focal, longest = camera.intrinsics["fx"], max(camera.width, camera.height)

@@ -13,8 +13,8 @@ from efficientnerf.capture.coverage import meeting_point
 from stages.io.capture import Photo, SparsePoints
 
 SMALL_ANGLE = 4.0  # degrees of parallax
-AROUND = 0.5  # of the distance of the cameras from where their axes meet: points nearer to it are the subject, with its support
-OBSERVERS, FEWEST = 3, 10  # photographs that see a point of the subject, and such points, that wrong matches hardly make: then something is there
+SUBJECT_REACH = 0.5  # of the distance of the cameras from where their axes meet: points nearer to it are the subject, with its support
+MIN_OBSERVERS, MIN_POINTS = 3, 10  # photographs that see a point of the subject, and such points, that wrong matches hardly make: then something is there
 MAX_POINTS = 2000  # points that are looked at
 
 
@@ -40,13 +40,13 @@ def parallax(points: SparsePoints, photos: Sequence[Photo]) -> Parallax:
     chosen = np.arange(len(points.xyz))
     centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3)
     subject = False
-    if len(cameras) >= OBSERVERS:
+    if len(cameras) >= MIN_OBSERVERS:
         middle, meeting = meeting_point(cameras)
         if meeting:
-            reach = AROUND * float(np.median(np.linalg.norm(centres - middle, axis=1)))
+            reach = SUBJECT_REACH * float(np.median(np.linalg.norm(centres - middle, axis=1)))
             near = np.linalg.norm(points.xyz - middle, axis=1) < reach
-            there = np.flatnonzero(near & np.array([len(set(track)) >= OBSERVERS for track in points.tracks], bool))
-            subject = len(there) >= FEWEST
+            there = np.flatnonzero(near & np.array([len(set(track)) >= MIN_OBSERVERS for track in points.tracks], bool))
+            subject = len(there) >= MIN_POINTS
             chosen = there if subject else chosen
     chosen = chosen[:: max(1, len(chosen) // MAX_POINTS)]
     widest = [_widest(centres[list(points.tracks[n])] - points.xyz[n]) for n in chosen.tolist() if len(points.tracks[n]) > 1]

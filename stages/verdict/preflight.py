@@ -28,7 +28,7 @@ from stages.masking.first_training import first_training_needed
 from stages.masking.turning import masks_of_turning_subject
 from stages.poses.memory import decoding_needed, features_needed
 from stages.sfm import pairs
-from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
+from stages.sfm.matches import MAX_WORKERS, MIN_PAIRS_A_WORKER, UPSAMPLE_BELOW
 from stages.verdict import looks, run_forecast
 from stages.verdict.grades import GRADES
 from stages.verdict.verdict import FEW, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, plural, zooms
@@ -285,7 +285,7 @@ def forecast(first: str, files: Mapping[str, Path], small: Mapping[str, Small], 
     how = pairs.matching_for(count) if settings.matching == "auto" else settings.matching
     compared = min(count * (count - 1) // 2, 10**9 if how == "exhaustive" else PAIRS_AN_IMAGE * count)
     finding = count * float(np.mean(pixels)) / 1e6 * FEATURES_A_MEGAPIXEL / threads
-    detected, workers = min(features, count_features(rgb)), max(1, min(threads, MAX_WORKERS, compared // PAIRS_A_WORKER))
+    detected, workers = min(features, count_features(rgb)), max(1, min(threads, MAX_WORKERS, compared // MIN_PAIRS_A_WORKER))
     matching = compared * (A_PAIR + COMPARING * (detected / MANY) ** 2) / workers  # each feature is compared with each
     mapping = AN_IMAGE * count * max(1.0, count / 50) ** 0.4
     return {"poses_seconds": round(reading + slower * (finding + matching + mapping), 1), "poses_bytes": int(memory), "pairs": compared}

@@ -17,7 +17,7 @@ from pipeline.files import SafePoint, remove, write_atomically
 from stages.io.capture import Markers
 from stages.io.png import read_png
 from stages.sfm.added.matches import appended
-from stages.sfm.added.networks import FEWEST
+from stages.sfm.added.networks import MIN_MATCHES
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import PAIRS, TIED, WorkImage, copy_database, database_path, forget, images_of, inlier_counts, pair_id_of
 
@@ -74,7 +74,7 @@ def tie_markers(work: Path, seed: int, safe_point: SafePoint) -> None:
                 ties = (np.stack(first, 1)[:, None] + np.arange(GRID**2)[:, None]).reshape(-1, 2)
                 both = np.concatenate([inliers[i, j][~(on[0] | on[1])], ties]).astype(np.uint32)
                 geometry = pycolmap.TwoViewGeometry()
-                if len(both) >= FEWEST:
+                if len(both) >= MIN_MATCHES:
                     a, b = (every[k][:, :2].astype(np.float64) for k in (i, j))
                     geometry = pycolmap.estimate_two_view_geometry(lenses[i], a, lenses[j], b, both, options)
                 database.write_two_view_geometry(i, j, geometry)

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.files import SafePoint
 from stages.cores import in_order
 from stages.io.png import read_png
-from stages.sfm.added.networks import FEWEST, Detector, Features, Matcher
+from stages.sfm.added.networks import MIN_MATCHES, Detector, Features, Matcher
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, WorkImage, database_path, forget, images_of, pair_id_of
 from stages.sfm.images import Progress
@@ -16,7 +16,7 @@ from stages.sfm.pairs import Pair, ordered
 
 MAX_FEATURES = 2048  # features of a photograph: what LightGlue takes grows with their square
 NEIGHBOURS = 4  # photographs with a camera that each of them is compared with, too: its features get points by these
-AT_ONCE = 2  # pictures, or pairs, that are worked on: each takes up to 2.3 GiB (`stages.poses.memory`)
+MAX_AT_ONCE = 2  # pictures, or pairs, that are worked on: each takes up to 2.3 GiB (`stages.poses.memory`)
 
 
 def pairs_of(weak: Sequence[int], partners: Sequence[Pair], overlaps: Mapping[tuple[int, int], int]) -> list[Pair]:
@@ -53,7 +53,7 @@ def add_matches(
     threads   on which pictures are worked on; nothing depends on them
     """
     detector, matcher = Detector(networks[0]), Matcher(networks[1])
-    used, at_once = sorted({i for pair in pairs for i in pair}), max(1, min(threads, AT_ONCE))
+    used, at_once = sorted({i for pair in pairs for i in pair}), max(1, min(threads, MAX_AT_ONCE))
 
     def detect(position: int) -> Features:
         folder, file = images_of(place).parent, images[position].file
@@ -83,7 +83,7 @@ def add_matches(
             both = np.concatenate([known[i, j], new + np.array((len(before[i]), len(before[j])), np.uint32)]).astype(np.uint32)
             database.write_matches(of[i].image_id, of[j].image_id, both)
             geometry = pycolmap.TwoViewGeometry()  # without matches, where too few fit one
-            if len(both) >= FEWEST:
+            if len(both) >= MIN_MATCHES:
                 a, b = (every[k][:, :2].astype(np.float64) for k in (i, j))
                 geometry = pycolmap.estimate_two_view_geometry(lenses[i], a, lenses[j], b, both, options)
             database.write_two_view_geometry(of[i].image_id, of[j].image_id, geometry)

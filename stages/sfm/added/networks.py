@@ -17,10 +17,10 @@ from pipeline.errors import BadInput, UsageError
 from stages.io.network_file import in_words, open_network, run_network
 
 OPTION = "--features-model"
-LONGEST = 1024  # px of a picture that a detector is given, where it takes any size: as LightGlue's authors have it
+LONGEST_SIDE = 1024  # px of a picture that a detector is given, where it takes any size: as LightGlue's authors have it
 DIVISOR = 32  # of the sides of that picture: ALIKED halves it five times
 MIN_SCORE = 0.1  # of a feature, where the network takes a limit; and of a match: LightGlue's own and COLMAP's default
-FEWEST = 15  # features of a picture and matches of a pair: fewer verify nothing, as the mapper has it
+MIN_MATCHES = 15  # features of a picture and matches of a pair: fewer verify nothing, as the mapper has it
 _IN_BOUNDS = 1.001  # of key points from -1 to 1
 
 
@@ -55,7 +55,7 @@ class Detector:
     def features(self, rgb: np.ndarray, mask: np.ndarray | None, most: int) -> Features:
         """The strongest features, at most so many, of an sRGB picture (H, W, 3) uint8, where the mask (H, W) uint8 is not black."""
         height, width = rgb.shape[:2]
-        limits = [side or LONGEST for side in self._fixed]
+        limits = [side or LONGEST_SIDE for side in self._fixed]
         scale = min(1.0 if None in self._fixed else np.inf, limits[0] / height, limits[1] / width)
         small = max(1, round(height * scale)), max(1, round(width * scale))
         picture = cv2.resize(rgb, small[::-1], interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
@@ -104,7 +104,7 @@ class Matcher:
 
     def matches(self, one: Features, other: Features) -> np.ndarray:
         """(M, 2) uint32, the numbers of the features that are the same in two pictures."""
-        if min(len(one.xy), len(other.xy)) < FEWEST:
+        if min(len(one.xy), len(other.xy)) < MIN_MATCHES:
             return np.zeros((0, 2), np.uint32)
         inputs: dict[str, np.ndarray] = {}
         for k, each in enumerate((one, other)):

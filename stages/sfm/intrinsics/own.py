@@ -25,11 +25,11 @@ REFINED = {
 CHOICES = tuple(REFINED)
 # Times the error of the observations that were left out, to which a richer choice must lower it. A principal point is nearly a rotation: it fits what is no
 # matter of the lens, and costs accuracy of the centres.
-BETTER = {FOCAL_LENGTH: 0.97, PRINCIPAL_POINT: 0.9}
-LEFT_OUT, MIN_TRACK = 5, 4  # every 5th observation, of points that have so many
-SAMPLE = 40_000  # observations, of about which it is decided
-FEW = 60  # observations of a photograph, with fewer of which it has the intrinsics of all
-FAR = 4.0  # pixels, beyond which an error counts no more: a wrong match
+MAX_ERROR_RATIO = {FOCAL_LENGTH: 0.97, PRINCIPAL_POINT: 0.9}
+LEFT_OUT_EVERY, MIN_TRACK = 5, 4  # every 5th observation, of points that have so many
+SAMPLED_OBSERVATIONS = 40_000  # observations, of about which it is decided
+MIN_OBSERVATIONS = 60  # observations of a photograph, with fewer of which it has the intrinsics of all
+MAX_MISS = 4.0  # pixels, beyond which an error counts no more: a wrong match
 
 
 class Observation(NamedTuple):
@@ -46,7 +46,7 @@ def with_own_intrinsics(images: Sequence[WorkImage], model: Any, safe_point: Saf
     if cameras_with_fixed_focal(images, model):
         return model, None
     with quiet_pycolmap() as pycolmap:
-        chosen = _choice(pycolmap, thinned(model, SAMPLE) or model, safe_point)
+        chosen = _choice(pycolmap, thinned(model, SAMPLED_OBSERVATIONS) or model, safe_point)
         if chosen is None:
             return model, None
         own = _with_own_cameras(pycolmap, model)
@@ -68,7 +68,7 @@ def _choice(pycolmap: Any, model: Any, safe_point: SafePoint) -> str | None:
         safe_point()
         bundle_adjust(pycolmap, model, _poorly_observed(model), REFINED[choice])
         error = _error(model, observations)
-        if error < BETTER[choice] * least:
+        if error < MAX_ERROR_RATIO[choice] * least:
             chosen, least = choice, error
     return chosen
 
@@ -102,7 +102,7 @@ def _without_some(model: Any) -> tuple[Any, list[Observation]]:
         elements = sorted((element.image_id, element.point2D_idx) for element in model.points3D[point_id].track.elements)
         for image_id, index in elements if len(elements) >= MIN_TRACK else ():
             number += 1
-            if number % LEFT_OUT == 0:
+            if number % LEFT_OUT_EVERY == 0:
                 left_out.append(Observation(image_id, point_id, np.array(model.images[image_id].points2D[index].xy)))
                 model.delete_observation(image_id, index)
     return model, left_out
@@ -110,11 +110,11 @@ def _without_some(model: Any) -> tuple[Any, list[Observation]]:
 
 def _poorly_observed(model: Any) -> set[int]:
     """Cameras, one for each photograph, of those that observe few points."""
-    return {image.camera_id for image in model.images.values() if image.num_points3D < FEW}
+    return {image.camera_id for image in model.images.values() if image.num_points3D < MIN_OBSERVATIONS}
 
 
 def _error(model: Any, observations: Sequence[Observation]) -> float:
-    """Mean distance in pixels between observations and the projections of their points, FAR at most."""
+    """Mean distance in pixels between observations and the projections of their points, MAX_MISS at most."""
     by_image: dict[int, list[Observation]] = {}
     for one in observations:
         if one.point in model.points3D:
@@ -126,5 +126,5 @@ def _error(model: Any, observations: Sequence[Observation]) -> float:
         seen = np.array([model.points3D[one.point].xyz for one in ones]) @ pose[:, :3].T + pose[:, 3]  # (N, 3)
         for one, at in zip(ones, seen, strict=True):
             shown = camera.img_from_cam(at) if at[2] > 0 else None
-            errors.append(FAR if shown is None else min(FAR, float(np.linalg.norm(shown - one.xy))))
+            errors.append(MAX_MISS if shown is None else min(MAX_MISS, float(np.linalg.norm(shown - one.xy))))
     return float(np.mean(errors)) if errors else 0.0

@@ -50,7 +50,7 @@ class Rig:
 
     def model(self, work: Path, how: str, options: Any) -> list[Any]:
         if work.name == "own_cameras":
-            name = attempts.CROPPED if how == "adjust" else attempts.EACH
+            name = attempts.OWN_PRINCIPAL_POINTS if how == "adjust" else attempts.OWN_FOCAL_LENGTHS
         elif work.name == "rungs" and how == "begin" and self._rung == "beyond":
             name = "small angles" if options is mapping.FORWARD else "another beginning"
         elif work.name == "networks":
@@ -66,7 +66,7 @@ class Rig:
         if not count:
             return []
         images = {k: SimpleNamespace(name=IMAGES[k].file, has_pose=True) for k in range(count)}
-        error = 0.3 if name == attempts.CROPPED else 0.5
+        error = 0.3 if name == attempts.OWN_PRINCIPAL_POINTS else 0.5
         return [SimpleNamespace(images=images, num_reg_images=lambda: count, agreeing=agreeing, rung=name, compute_mean_reprojection_error=lambda: error)]
 
 
@@ -77,7 +77,7 @@ def climbed(rig: Rig, tmp_path: Path) -> Search:
 def test_attempts_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", *ANEW, "wider matching", "more features", attempts.EACH]
+    assert rig.tried == ["exhaustive", "fewer matches", *ANEW, "wider matching", "more features", attempts.OWN_FOCAL_LENGTHS]
     assert [rung["registered"] for rung in found.tried] == [8, 9, 0, 0, 11, 19, 0]
     assert rig.weak == [list(range(9, 20)), list(range(11, 20)), list(range(11, 20))]
     assert (found.models[0].rung, found.work) == ("more features", tmp_path / "rungs")
@@ -86,7 +86,7 @@ def test_attempts_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypa
 def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (12, 0.95), "more features": (20, 0.4), "another beginning": (14, 0.9)})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles", attempts.EACH]
+    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles", attempts.OWN_FOCAL_LENGTHS]
     assert found.models[0].rung == found.best == "another beginning"
 
 
@@ -94,20 +94,20 @@ def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypat
 def test_own_focal_lengths_are_kept_where_they_explain_disagreement(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, each: tuple[int, float], kept: bool
 ) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), attempts.EACH: each})
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), attempts.OWN_FOCAL_LENGTHS: each})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", attempts.EACH]
-    assert found.tried[-1] == {"rung": attempts.EACH, "registered": each[0], "agreeing": each[1]}
-    assert (found.best, found.work) == ((attempts.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
+    assert rig.tried == ["exhaustive", attempts.OWN_FOCAL_LENGTHS]
+    assert found.tried[-1] == {"rung": attempts.OWN_FOCAL_LENGTHS, "registered": each[0], "agreeing": each[1]}
+    assert (found.best, found.work) == ((attempts.OWN_FOCAL_LENGTHS, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
 
 
 @pytest.mark.parametrize(("cropped", "kept"), [((20, 0.979), True), ((20, 0.96), False), ((19, 0.98), False)])
 def test_own_principal_points_are_kept_where_points_lie_closer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cropped: tuple[int, float], kept: bool) -> None:
-    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.EACH: (20, 0.98), attempts.CROPPED: cropped})
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.OWN_FOCAL_LENGTHS: (20, 0.98), attempts.OWN_PRINCIPAL_POINTS: cropped})
     rig.apart = 0.01
     found = climbed(rig, tmp_path)
-    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.CROPPED]
-    assert found.best == (attempts.CROPPED if kept else "exhaustive")
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.OWN_PRINCIPAL_POINTS]
+    assert found.best == (attempts.OWN_PRINCIPAL_POINTS if kept else "exhaustive")
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_a_merge_that_contradicts_the_matches_is_refused(scene: tuple[Path, list
     found = climbed(scene, parts, monkeypatch)
     assert asked
     rungs = {str(rung["rung"]): rung for rung in found.tried}
-    assert rungs[attempts.MERGED]["agreeing"] < rungs["exhaustive"]["agreeing"] - attempts.MAX_LOSS  # type: ignore[operator]
+    assert rungs[attempts.MERGED]["agreeing"] < rungs["exhaustive"]["agreeing"] - attempts.MAX_AGREEMENT_LOSS  # type: ignore[operator]
     assert found.best == "exhaustive"
     assert found.models[0].num_reg_images() == 5
     errors = aligned_errors(np.array([image.projection_center() for image in registered(found.models[0])]), np.array([c.centre for c in TRUTH[:5]]))

@@ -247,7 +247,7 @@ def without_pairs(work: Path) -> dict[str, list[Any]]:
 def test_pairs_matched_by_several_processes_are_the_same(resumed: tuple[Path, list[WorkImage]], monkeypatch: pytest.MonkeyPatch) -> None:
     work, images = resumed
     before = without_pairs(work)
-    monkeypatch.setattr(matches, "PAIRS_A_WORKER", 8)
+    monkeypatch.setattr(matches, "MIN_PAIRS_A_WORKER", 8)
     seen: list[tuple[int, int]] = []
     quiet: dict[str, Any] = {"progress": lambda done, total, text: seen.append((done, total)), "safe_point": lambda: None}
     monkeypatch.setattr(pair_workers, "match_block", lambda *a: pytest.fail("matched in this process"))

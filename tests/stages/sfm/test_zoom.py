@@ -30,10 +30,10 @@ def test_a_zoom_that_changed_gives_each_photograph_its_focal_length(tmp_path: Pa
     taken = cameras(ZOOMED)
     images = matched(tmp_path, taken)
     found = found_for(tmp_path, images)
-    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.EACH]
+    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.OWN_FOCAL_LENGTHS]
     one, each = (float(rung["agreeing"]) for rung in found.tried)  # type: ignore[arg-type]
     assert one < DOUBTFUL < 0.98 < each
-    assert (found.best, found.work) == (attempts.EACH, tmp_path / "own_cameras")
+    assert (found.best, found.work) == (attempts.OWN_FOCAL_LENGTHS, tmp_path / "own_cameras")
     model = found.models[0]
     assert [image.name for image in registered(model)] == [image.file for image in images]
     assert [model.cameras[image.camera_id].focal_length for image in registered(model)] == pytest.approx(ZOOMED, rel=0.01)
@@ -50,9 +50,9 @@ def test_two_zooms_are_told_where_the_matches_agree_with_one(tmp_path: Path) -> 
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
     assert mapping.match_agreement(tmp_path, shared) > DOUBTFUL
     assert off(shared, taken) > 0.05
-    assert zoom.focal_length_spread(shared) > attempts.SPREAD
+    assert zoom.focal_length_spread(shared) > attempts.MIN_FOCAL_SPREAD
     found = found_for(tmp_path, images)
-    assert found.best == attempts.EACH
+    assert found.best == attempts.OWN_FOCAL_LENGTHS
     assert zoom.focal_length_spread(found.models[0]) < 1.01
     assert off(found.models[0], taken) < 0.01
 
@@ -62,15 +62,15 @@ def test_cropped_photographs_get_principal_points_and_one_lens(tmp_path: Path) -
     taken = cameras(cut=cut)
     images = matched(tmp_path, taken)
     shared = mapping.sub_models(tmp_path, images, 0, mapping.DEFAULTS, **QUIET)[0]
-    assert zoom.principal_point_spread(shared) > attempts.APART
+    assert zoom.principal_point_spread(shared) > attempts.MIN_MIDDLE_SPREAD
     found = found_for(tmp_path, images)
-    assert found.best == attempts.CROPPED
+    assert found.best == attempts.OWN_PRINCIPAL_POINTS
     model = found.models[0]
     lens = np.array([model.cameras[image.camera_id].params for image in registered(model)])
     assert np.ptp(lens[:, [0, 3]], axis=0).max() == 0.0
     assert lens[0, 0] == pytest.approx(400.0, rel=0.08)
     true = np.array([camera.params[1:3] for camera in taken])
     assert (lens[:, 1:3] - true).std() < 0.4 * true.std()
-    assert zoom.principal_point_spread(model) < attempts.APART / 2
+    assert zoom.principal_point_spread(model) < attempts.MIN_MIDDLE_SPREAD / 2
     assert off(model, taken) < 0.5 * off(shared, taken) < 0.005
     assert numbers(found_for(tmp_path, images)) == numbers(found)
