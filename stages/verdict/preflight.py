@@ -24,9 +24,9 @@ from stages.io.capture import FOREGROUND
 from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened, read_quality
 from stages.io.reader import PhotoReader
-from stages.masking.first_training import first_training_needed
 from stages.masking.turning import masks_of_turning_subject
-from stages.poses.memory import decoding_needed, features_needed
+from stages.memory.forecast import Known
+from stages.poses.memory import memory_needed
 from stages.sfm import pairs
 from stages.sfm.matches import MAX_WORKERS, MIN_PAIRS_A_WORKER, UPSAMPLE_BELOW
 from stages.verdict import looks, run_forecast
@@ -110,6 +110,7 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
         problems += _with_turning(_of_overlap(list(small), overlaps), {name: files[name] for name in small})
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
     about = forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed)
+    about["poses_bytes"] = memory_needed(Known(folder, [folder], {"poses": settings})).total
     if later is not None:
         whole = kind != "llff" and settings.mask_from != FOREGROUND and not _rendered(kind, files[next(iter(small))])
         about |= _forecast_of_run(about, small, len(names), later, threads, whole=whole)
@@ -265,22 +266,18 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
 
 
 def forecast(first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool) -> dict[str, Any]:
-    """Seconds of the stage poses on a machine that does nothing else, where the mapper's first run suffices, and bytes at its peak; roughly."""
-    sizes, side = [each.size for each in small.values()], settings.feature_image_size
-    features = resolved(settings.max_features) or pairs.features_for(count)
+    """Seconds of the stage poses on a machine that does nothing else, where the mapper's first run suffices, roughly; and the pairs that are compared."""
+    side, features = settings.feature_image_size, resolved(settings.max_features) or pairs.features_for(count)
     before, rgb = time.thread_time(), np.zeros((1, 1, 3), np.uint8)
     with contextlib.suppress(UnreadableImage):
         rgb = read_photo(files[first], side).rgb
     reading = 2.5 * (time.thread_time() - before) * count  # for structure from motion, as a working image, and to be looked at
     slower = _slower(small)
-    memory = 0
     if settings.mask_from == FOREGROUND:
         reading += slower * (FIRST_TRAINING + A_SILHOUETTE * count) / threads
-        memory = first_training_needed(count).total
     if posed:
-        return {"poses_seconds": round(reading, 1), "poses_bytes": max(memory, int(decoding_needed(sizes).total)), "pairs": 0}
-    memory = max(memory, features_needed(sizes * -(-count // len(sizes)), side, features, threads, networks=settings.features_model != "off").total)
-    reduced = [working_size(*size, side) for size in sizes]
+        return {"poses_seconds": round(reading, 1), "pairs": 0}
+    reduced = [working_size(*each.size, side) for each in small.values()]
     pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
     how = pairs.matching_for(count) if settings.matching == "auto" else settings.matching
     compared = min(count * (count - 1) // 2, 10**9 if how == "exhaustive" else PAIRS_AN_IMAGE * count)
@@ -288,7 +285,7 @@ def forecast(first: str, files: Mapping[str, Path], small: Mapping[str, Small], 
     detected, workers = min(features, count_features(rgb)), max(1, min(threads, MAX_WORKERS, compared // MIN_PAIRS_A_WORKER))
     matching = compared * (A_PAIR + COMPARING * (detected / MANY) ** 2) / workers  # each feature is compared with each
     mapping = AN_IMAGE * count * max(1.0, count / 50) ** 0.4
-    return {"poses_seconds": round(reading + slower * (finding + matching + mapping), 1), "poses_bytes": int(memory), "pairs": compared}
+    return {"poses_seconds": round(reading + slower * (finding + matching + mapping), 1), "pairs": compared}
 
 
 def _slower(small: Mapping[str, Small]) -> float:
