@@ -9,7 +9,7 @@ from PIL import Image
 
 from benchmarks.poses import aligned_errors
 from efficientnerf.geometry.cameras import Camera, project
-from stages.sfm.colmap import quiet_pycolmap
+from stages.sfm.colmap import import_pycolmap, quiet_pycolmap
 from stages.sfm.database import WorkImage, database_path, open_database
 from tests.poses import looking_at
 
@@ -72,6 +72,21 @@ def matched(work: Path, taken: list[Camera], elsewhere: int = 0) -> list[WorkIma
                 geometry = pycolmap.estimate_two_view_geometry(camera, seen[i], camera, seen[j], pairs, options)
                 database.write_two_view_geometry(i + 1, j + 1, geometry)
     return images
+
+
+def synthesized(count: int, points: int, params: Sequence[float]) -> tuple[Any, list[WorkImage]]:
+    """A model of so many cameras, SIMPLE_RADIAL of 1024 x 768 px, round points that all of them see."""
+    pycolmap = import_pycolmap()
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, count, points
+    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [*params]
+    model = pycolmap.synthesize_dataset(options)
+    return model, [WorkImage(image.name, image.name, 1024, 768, 1024, 768, None, "") for image in model.images.values()]
+
+
+def centres_of(model: Any) -> np.ndarray:
+    return np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
 
 
 def registered(model: Any) -> list[Any]:

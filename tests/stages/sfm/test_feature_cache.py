@@ -1,4 +1,4 @@
-"""Features that were detected before are not detected again, and nothing but those is taken for them."""
+"""Features: masked parts have none; those that were detected before are not detected again, and nothing but those is taken for them."""
 
 import hashlib
 import os
@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from stages.sfm import feature_cache, matches
+from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, WorkImage, database_path, open_database, rows_of
 from stages.sfm.images import prepare_images
 from tests.stages.sfm.still_life import QUIET
@@ -56,6 +57,18 @@ def detected(monkeypatch: pytest.MonkeyPatch, work: Path, images: list[WorkImage
 
 def features(work: Path) -> list[Any]:
     return list(rows_of(database_path(work), FEATURES, range(1, 10)))
+
+
+def test_masked_parts_give_no_features(tmp_path: Path, photographs: Path) -> None:
+    mask = np.repeat(np.array([[0, 255]], np.uint8), 128, axis=1).repeat(192, axis=0)
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    images = opened(photographs, tmp_path / "work", masks={"1.png": tmp_path / "mask.png"})
+    matches.extract_features(tmp_path / "work", images, features=200, **QUIET)
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(tmp_path / "work")) as database:
+        whole, masked = (database.read_keypoints(i)[:, 0] for i in (1, 2))
+    assert whole.min() < 100
+    assert len(masked) > 10
+    assert masked.min() >= 127
 
 
 def test_the_same_images_are_not_looked_at_again_and_have_the_same_features(monkeypatch: pytest.MonkeyPatch, cache: Path, photographs: Path) -> None:

@@ -10,17 +10,13 @@ from benchmarks.poses import aligned_errors
 from stages.sfm import mapping
 from stages.sfm.colmap import import_pycolmap
 from stages.sfm.database import WorkImage
+from tests.stages.sfm.made_matches import centres_of, synthesized
 
 
 def made_model() -> tuple[Any, list[WorkImage], np.ndarray]:
     """Twelve cameras round 800 points that all of them see, pixels off by 0.4 px and points by a hundredth of a unit; and the true centres."""
-    pycolmap = import_pycolmap()
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 12, 800
-    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [1280, 512, 384, -0.04]
-    model = pycolmap.synthesize_dataset(options)
-    centres = np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
+    model, images = synthesized(12, 800, (1280, 512, 384, -0.04))
+    centres = centres_of(model)
     rng = np.random.default_rng(0)
     for _, image in sorted(model.images.items()):
         for point in image.points2D:
@@ -28,7 +24,6 @@ def made_model() -> tuple[Any, list[WorkImage], np.ndarray]:
     for _, point in sorted(model.points3D.items()):
         point.xyz = point.xyz + rng.normal(0, 0.01, 3)
     model.update_point_3d_errors()
-    images = [WorkImage(image.name, image.name, 1024, 768, 1024, 768, None, "") for image in model.images.values()]
     return model, images, centres
 
 
@@ -39,8 +34,7 @@ def test_an_even_choice_of_points_gives_the_cameras_of_all(monkeypatch: pytest.M
     for most in (10**9, start.compute_num_observations() // 4):
         monkeypatch.setattr(mapping, "MANY_OBSERVATIONS", most)
         model = mapping.bundle_adjusted(tmp_path, images, start.__deepcopy__({}), lambda: None)
-        found = np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
-        errors[most] = float(np.sqrt((aligned_errors(found, centres) ** 2).mean()))
+        errors[most] = float(np.sqrt((aligned_errors(centres_of(model), centres) ** 2).mean()))
         points[most] = model.compute_mean_reprojection_error()
         assert model.num_points3D() == start.num_points3D()
         assert model.cameras[1].mean_focal_length() == pytest.approx(1280, rel=0.01)

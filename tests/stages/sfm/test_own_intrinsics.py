@@ -6,32 +6,22 @@ import numpy as np
 import pytest
 
 from benchmarks.poses import aligned_errors
-from stages.sfm.colmap import import_pycolmap
 from stages.sfm.database import WorkImage
 from stages.sfm.intrinsics.own import FOCAL_LENGTH, PRINCIPAL_POINT, with_own_intrinsics
+from tests.stages.sfm.made_matches import centres_of, synthesized
 
 FOCAL, MIDDLE = 1280.0, np.array([512.0, 384.0])
 
 
 def made_model(factors: np.ndarray, shifts: np.ndarray, *, noise: float = 0.3) -> tuple[Any, list[WorkImage], np.ndarray]:
     """Cameras round 500 points, of focal lengths that differ by factors (C,), and principal points by shifts (C, 2) pixels; and the true centres."""
-    pycolmap = import_pycolmap()
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, len(factors), 500
-    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [FOCAL, *MIDDLE, 0.0]
-    model = pycolmap.synthesize_dataset(options)
+    model, images = synthesized(len(factors), 500, (FOCAL, *MIDDLE, 0.0))
     rng = np.random.default_rng(0)
     for image_id, factor, shift in zip(sorted(model.reg_image_ids()), factors, shifts, strict=True):
         for point in model.images[image_id].points2D:
             point.xy = (point.xy - MIDDLE) * factor + MIDDLE + shift + rng.normal(0, noise, 2)
     model.update_point_3d_errors()
-    images = [WorkImage(image.name, image.name, 1024, 768, 1024, 768, None, "") for image in model.images.values()]
-    return model, images, np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
-
-
-def centres_of(model: Any) -> np.ndarray:
-    return np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
+    return model, images, centres_of(model)
 
 
 def test_focus_breathing_is_found() -> None:
