@@ -71,7 +71,8 @@ def find_mask_use(capture: Capture, choice: str, renders: bool, reader: PhotoRea
         wanted = choice == "silhouette"
         # Images without alpha may be renders on a constant background.
         return MaskUse(Silhouettes(wanted and (there["alpha"] > 0 or not there["masks"]), wanted and there["masks"] > 0), reasons)
-    use, reasons, doubtful = {"alpha": False, "masks": False}, {}, []
+    use, reasons = {"alpha": False, "masks": False}, {}
+    doubtful: list[str] = []
     if there["alpha"]:
         pictures = _pictures(photos, reader.alpha, safe_point)
         if any(picture is not None and (picture < 255).any() for _, picture in pictures):
