@@ -150,10 +150,6 @@ def _formats(job: Job, settings: PosesSettings) -> list[str]:
     return found
 
 
-def _format_of(capture: Capture) -> str:
-    return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
-
-
 def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) -> tuple[Capture, MaskUse]:
     """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and that meaning."""
     renders = _may_be_renders(capture)
@@ -180,7 +176,7 @@ def with_points_of_object(capture: Capture, reader: PhotoReader) -> Capture:
 
 
 def _may_be_renders(capture: Capture) -> bool:
-    return importers.IMPORTERS[_format_of(capture)].renders
+    return capture.kind in importers.IMPORTERS and importers.IMPORTERS[capture.kind].renders
 
 
 def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[Any]]:

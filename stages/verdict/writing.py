@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.capture.coverage import coverage
-from efficientnerf.geometry.cameras import project, resized
+from efficientnerf.geometry.cameras import Camera, project, resized
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job
@@ -24,7 +24,7 @@ GREY = np.array([0.299, 0.587, 0.114])
 ALREADY_REPORTED = ("not registered", "folded", "parallax", "few")  # problems that the search for cameras has warned of, or that the user knows of
 
 
-def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) -> Verdict:
+def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) -> None:
     """Write the verdict on the cameras of a scene whose working images are written, and its pictures; say it, and warn of what stands against it.
 
     renders  whether the images may be renders
@@ -32,7 +32,7 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
     outputs = PosesOutputs(job.out)
     files = {view.name: job.out / view.image for view in scene.views} | {name: capture.rejected_files[name] for name in sorted(capture.rejected_files)}
     sources = {photo.camera.name: photo.image for photo in capture.photos}
-    points = _Points(capture)
+    observed = _observed_points(capture)
     seen: dict[str, looks.Look] = {}
     for done, (name, path) in enumerate(files.items()):
         job.safe_point()
@@ -40,7 +40,7 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
         with contextlib.suppress(UnreadableImage):
             grey = looks.grey_of(path)
             own = looks.look(grey, read_quality(sources.get(name, path)))
-            seen[name] = replace(own, over_points=points.stops_over(name, grey))
+            seen[name] = replace(own, over_points=_stops_over(grey, *observed[name]) if name in observed else None)
     found = verdict_on(capture, seen, in_folder=None if capture.kind == "photographs" or renders else _photographs_in_folder(job))
     found = replace(found, figures={**found.figures, "coverage": _coverage(scene)})
     write_json(outputs.verdict, found.document())
@@ -53,31 +53,25 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
     for problem in found.problems:
         if problem.grade != "good" and problem.what not in ALREADY_REPORTED:
             warn(f"{problem.sentence} {problem.remedy}")
-    return found
 
 
-class _Points:
-    """The exposure of photographs by a capture's sparse points: where each shows those that it observes, and how light they are on average."""
+def _observed_points(capture: Capture) -> dict[str, tuple[Camera, np.ndarray, np.ndarray]]:
+    """Name of a photograph -> its camera, the sparse points (N, 3) that it observes, and how light they are on average (N,)."""
+    points = capture.points
+    if points is None or not len(points.rgb) or np.ptp(points.rgb) == 0:  # nobody knows their colours
+        return {}
+    light = ((points.rgb @ GREY) / 255.0) ** 2.2
+    observed: list[list[int]] = [[] for _ in capture.photos]
+    for point, track in enumerate(points.tracks):
+        for view in track:
+            observed[view].append(point)
+    return {photo.camera.name: (photo.camera, points.xyz[at], light[at]) for photo, at in zip(capture.photos, observed, strict=True)}
 
-    def __init__(self, capture: Capture) -> None:
-        self._numbers = {photo.camera.name: n for n, photo in enumerate(capture.photos)}
-        self._cameras = [photo.camera for photo in capture.photos]
-        self._observed: list[list[int]] = [[] for _ in capture.photos]
-        self._xyz, self._light = np.zeros((0, 3)), np.zeros(0)
-        if capture.points is not None and len(capture.points.rgb) and np.ptp(capture.points.rgb) > 0:  # else nobody knows their colours
-            self._xyz, self._light = capture.points.xyz, ((capture.points.rgb @ GREY) / 255.0) ** 2.2
-            for point, track in enumerate(capture.points.tracks):
-                for view in track:
-                    self._observed[view].append(point)
 
-    def stops_over(self, name: str, grey: np.ndarray) -> float | None:
-        """`looks.over_points` of a photograph (H, W) uint8; None where it has no camera, or no points."""
-        if name not in self._numbers or not len(self._xyz):
-            return None
-        number = self._numbers[name]
-        at = self._observed[number]
-        pixels = project(resized(self._cameras[number], grey.shape[1], grey.shape[0]), self._xyz[at])[0]
-        return looks.over_points(grey, np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0), self._light[at])
+def _stops_over(grey: np.ndarray, camera: Camera, xyz: np.ndarray, light: np.ndarray) -> float | None:
+    """`looks.over_points` of a photograph (H, W) uint8."""
+    pixels = project(resized(camera, grey.shape[1], grey.shape[0]), xyz)[0]
+    return looks.over_points(grey, np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0), light)
 
 
 def _coverage(scene: Scene) -> dict[str, float]:

@@ -16,8 +16,7 @@ import numpy as np
 from pipeline.files import SafePoint, remove, write_atomically
 from stages.io.capture import Markers
 from stages.io.png import read_png
-from stages.sfm.added.matches import appended
-from stages.sfm.added.networks import MIN_MATCHES
+from stages.sfm.added.matches import appended, two_views
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import PAIRS, TIED, WorkImage, copy_database, database_path, forget, images_of, inlier_counts, pair_id_of
 
@@ -63,8 +62,6 @@ def tie_markers(work: Path, seed: int, safe_point: SafePoint) -> None:
             for image, keypoints in every.items():
                 database.update_keypoints(image, keypoints)
         forget(place, PAIRS[1:], [pair_id_of(*pair) for pair in pairs])
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = seed
         with pycolmap.Database.open(database_path(place)) as database:
             for i, j in pairs:
                 safe_point()
@@ -73,11 +70,7 @@ def tie_markers(work: Path, seed: int, safe_point: SafePoint) -> None:
                 first = [len(before[k]) + GRID**2 * np.array([[*seen[k]].index(number) for number in common]) for k in (i, j)]
                 ties = (np.stack(first, 1)[:, None] + np.arange(GRID**2)[:, None]).reshape(-1, 2)
                 both = np.concatenate([inliers[i, j][~(on[0] | on[1])], ties]).astype(np.uint32)
-                geometry = pycolmap.TwoViewGeometry()
-                if len(both) >= MIN_MATCHES:
-                    a, b = (every[k][:, :2].astype(np.float64) for k in (i, j))
-                    geometry = pycolmap.estimate_two_view_geometry(lenses[i], a, lenses[j], b, both, options)
-                database.write_two_view_geometry(i, j, geometry)
+                database.write_two_view_geometry(i, j, two_views(pycolmap, (i, j), lenses, every, both, seed))
 
 
 def _grid(corners: np.ndarray) -> np.ndarray:

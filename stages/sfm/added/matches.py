@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -73,8 +74,6 @@ def add_matches(
     forget(place, FEATURES, [of[position].image_id for position in used])
     forget(place, PAIRS, [pair_id_of(*(of[i].image_id for i in pair)) for pair in pairs])
     every = {position: appended(before[position], found[position].xy) for position in used}
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
     matched = in_order(lambda pair: matcher.matches(found[pair[0]], found[pair[1]]), pairs, at_once, safe_point)
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(place)) as database:
         for position in used:
@@ -82,12 +81,18 @@ def add_matches(
         for done, ((i, j), new) in enumerate(zip(pairs, matched, strict=True)):
             both = np.concatenate([known[i, j], new + np.array((len(before[i]), len(before[j])), np.uint32)]).astype(np.uint32)
             database.write_matches(of[i].image_id, of[j].image_id, both)
-            geometry = pycolmap.TwoViewGeometry()  # without matches, where too few fit one
-            if len(both) >= MIN_MATCHES:
-                a, b = (every[k][:, :2].astype(np.float64) for k in (i, j))
-                geometry = pycolmap.estimate_two_view_geometry(lenses[i], a, lenses[j], b, both, options)
-            database.write_two_view_geometry(of[i].image_id, of[j].image_id, geometry)
+            database.write_two_view_geometry(of[i].image_id, of[j].image_id, two_views(pycolmap, (i, j), lenses, every, both, seed))
             progress(done + 1, len(pairs), "matching pairs by a network")
+
+
+def two_views(pycolmap: Any, pair: Pair, lenses: Mapping[int, Any], keypoints: Mapping[int, np.ndarray], matches: np.ndarray, seed: int) -> Any:
+    """COLMAP's geometry of a pair by these matches; without any where they are too few."""
+    if len(matches) < MIN_MATCHES:
+        return pycolmap.TwoViewGeometry()
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    (one, a), (other, b) = ((lenses[k], keypoints[k][:, :2].astype(np.float64)) for k in pair)
+    return pycolmap.estimate_two_view_geometry(one, a, other, b, matches, options)
 
 
 def appended(keypoints: np.ndarray, xy: np.ndarray) -> np.ndarray:
