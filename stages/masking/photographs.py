@@ -43,12 +43,12 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     sizes = _sizes(job, paths)
     markers = None if settings.marker_size == "off" else find_markers(job, {name: (paths[name], size) for name, size in sizes.items()})
     find = _search(job, paths, reader, warn, [*sizes.values()], markers)
-    given = kept_white(job, paths, found.masks, reader)
-    masks = {**given.masks, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
+    given, inverted = kept_white(job, paths, found.masks, reader)
+    masks = {**given, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     guessed = not masks and settings.mask_from == "auto" and settings.masks != "ignore"
     capture, seen = _of_turning_subject(job, find, paths, reader) if guessed else (None, False)
     if capture is None:
-        capture = _by_masks(job, find, paths, masks, given.inverted, reader)
+        capture = _by_masks(job, find, paths, masks, inverted, reader)
         if guessed and not seen:
             capture = without_white_backdrop(job, capture, paths, reader, warn)
     if seen:

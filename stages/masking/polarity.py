@@ -6,7 +6,7 @@ black shapes are views of one thing: these fit its visual hull, and shapes of mo
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import BadInput
@@ -25,25 +25,17 @@ INVERTED = "masks keep what is black; what is white is left out"
 INVERTED_NOTICE = INVERTED + "; --set poses.mask_polarity=white reverses this"
 
 
-@dataclass(frozen=True)
-class Kept:
-    """Masks by name of the photograph."""
-
-    masks: dict[str, Path]  # that keep what is white, as far as is known
-    # the same with black and white exchanged, where cameras have yet to show whether that is right; else none
-    inverted: dict[str, Path] = field(default_factory=dict)
-
-
-def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path], reader: PhotoReader) -> Kept:
-    """The masks of photographs without cameras, each turned round where `poses.mask_polarity` says so; and turned round where they look like it."""
+def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path], reader: PhotoReader) -> tuple[dict[str, Path], dict[str, Path]]:
+    """The masks of photographs without cameras, each turned round where `poses.mask_polarity` says so. And all of them turned round where they look like
+    it, and cameras have yet to show whether that is right; else none."""
     polarity = job.settings.mask_polarity
     if not masks or polarity == "white" or (polarity == "auto" and job.settings.masks == "ignore"):
-        return Kept(dict(masks))
+        return dict(masks), {}
     photos = [photo for name in sorted(masks) if (photo := photo_without_camera(name, paths[name], masks[name])) is not None]
     if polarity == "black":
         job.say(INVERTED)
-        return Kept({**masks, **_turned_round(job, photos)})
-    return Kept(dict(masks), _turned_round(job, photos) if _look_inverted(photos, reader) else {})
+        return {**masks, **_turned_round(job, photos)}, {}
+    return dict(masks), _turned_round(job, photos) if _look_inverted(photos, reader) else {}
 
 
 def capture_kept_white(job: Job, capture: Capture, reader: PhotoReader) -> Capture:

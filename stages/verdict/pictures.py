@@ -35,14 +35,10 @@ def camera_plot(centres: np.ndarray, forward: np.ndarray, points: np.ndarray, lo
     low, high = shown_box(np.concatenate([centres, lost]), points)
     middle, half = (low + high) / 2, max(float((high - low).max()) / 2, 1e-9) * BORDER
     some = points[:: max(1, len(points) // POINTS)]
-    for panel, (name, across, up) in enumerate((("from above", 0, 1), ("from the side", 0, 2))):
+    for panel, (name, axes) in enumerate((("from above", [0, 1]), ("from the side", [0, 2]))):
         left, top = MARGIN + panel * (PANEL + MARGIN), 2 * MARGIN + 20
-
-        def at(xyz: np.ndarray, left: int = left, top: int = top, across: int = across, up: int = up) -> np.ndarray:
-            flat = (xyz[:, [across, up]] - middle[[across, up]]) / half
-            return np.stack([left + PANEL * (0.5 + 0.5 * flat[:, 0]), top + PANEL * (0.5 - 0.5 * flat[:, 1])], axis=1)
-
-        _draw_panel(draw, (left, top), at(some), at(centres), at(centres + 0.09 * half * forward), at(lost))
+        shown = ((xyz - middle)[:, axes] / half * (0.5, -0.5) for xyz in (some, centres, centres + 0.09 * half * forward, lost))  # (N, 2) each, y down
+        _draw_panel(draw, (left, top), *((left, top) + PANEL * (0.5 + each) for each in shown))
         draw.text((left + 6, top + 4), name, INK, font)
     write_png(np.asarray(sheet), path)
 

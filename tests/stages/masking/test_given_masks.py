@@ -69,15 +69,15 @@ def test_masks_are_found_by_the_names_that_other_programs_give_them(tmp_path: Pa
 def test_masks_keep_white_from_here_on(tmp_path: Path, black: bool, polarity: str) -> None:
     paths, masks = sources(tmp_path, drawn, black=black)
     events: list[dict[str, Any]] = []
-    kept = kept_white(job_in(tmp_path, events, mask_polarity=polarity), paths, masks, PhotoReader())
+    kept, inverted = kept_white(job_in(tmp_path, events, mask_polarity=polarity), paths, masks, PhotoReader())
     assert any("keep what is black" in event["text"] for event in events) == (polarity == "black")
-    assert bool(kept.inverted) == (polarity == "auto" and black)
+    assert bool(inverted) == (polarity == "auto" and black)
     for index, camera in enumerate(captures.cameras()):
         photo, inside = read_photo(paths[camera.name], 100), drawn(index, camera) > 0
-        np.testing.assert_array_equal(read_mask_file(kept.masks[camera.name], photo), inside != (black != (polarity == "black")))
-        if kept.inverted:
-            np.testing.assert_array_equal(read_mask_file(kept.inverted[camera.name], photo), inside)
-    assert kept_white(job_in(tmp_path, [], masks="ignore"), paths, masks, PhotoReader()).masks == masks
+        np.testing.assert_array_equal(read_mask_file(kept[camera.name], photo), inside != (black != (polarity == "black")))
+        if inverted:
+            np.testing.assert_array_equal(read_mask_file(inverted[camera.name], photo), inside)
+    assert kept_white(job_in(tmp_path, [], masks="ignore"), paths, masks, PhotoReader()) == (masks, {})
 
 
 @pytest.mark.parametrize("surroundings", [True, False])
