@@ -12,7 +12,9 @@ import numpy as np
 from PIL import Image
 
 from efficientnerf.geometry.cameras import MODELS, Camera, opengl_from_pose, project, rays
+from pipeline.stage import Job
 from stages.io.capture import Capture
+from stages.poses.settings import PosesSettings
 from tests.poses import looking_at
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 40.0
@@ -25,6 +27,11 @@ class Settings:
     strict: bool = False
     allow_outside: bool = False
     llff_factor: int | str = "auto"
+
+
+def poses_job(source: Path, folder: Path, report: Callable[[dict[str, Any]], object] = lambda event: None, **settings: Any) -> Job:
+    """Of the poses stage for a source, which writes into a folder."""
+    return Job(settings=PosesSettings(**settings), out=folder / "poses", work=folder / "work", source=source, stage="poses", report=report)
 
 
 def cameras(count: int = 6, model: str = "SIMPLE_PINHOLE", params: tuple[float, ...] = (FOCAL, WIDTH / 2, HEIGHT / 2)) -> list[Camera]:

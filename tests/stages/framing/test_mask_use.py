@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Camera, rays
-from pipeline.stage import Job
 from stages.io import scene, working_images
 from stages.io.capture import Capture, Photo
 from stages.io.scene import Scene
 from stages.poses import run as poses
-from stages.poses.settings import PosesSettings
 from stages.sfm.reconstruction import Request
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH
@@ -83,8 +81,7 @@ def with_alpha(how: str, folder: Path, draw: Drawing) -> Path:
 def run(source: Path, out: Path, **settings: Any) -> tuple[Scene, list[str], list[str]]:
     """The scene, what was said, and the warnings."""
     events: list[dict[str, Any]] = []
-    job = Job(settings=PosesSettings(**settings), out=out / "poses", work=out / "work", source=source, stage="poses", report=events.append)
-    poses.run(job)
+    poses.run(captures.poses_job(source, out, events.append, **settings))
     said, warned = ([event["text"] for event in events if event["event"] == kind] for kind in ("message", "warning"))
     return scene.load(out / "poses"), said, warned
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import project
-from pipeline.stage import Job
 from stages.framing.scene_bounds import in_view
 from stages.io.capture import Capture, Photo, Silhouettes, SparsePoints
 from stages.io.png import read_png, write_png
@@ -16,7 +15,7 @@ from stages.io.reader import PhotoReader
 from stages.masking.backdrop import without_white_backdrop
 from stages.masking.photographs import mask_choice
 from stages.poses.settings import PosesSettings
-from tests.stages import turntables
+from tests.stages import captures, turntables
 
 COUNT = 14
 WHITE = np.full((turntables.HEIGHT, turntables.WIDTH, 3), 235.0)
@@ -56,7 +55,7 @@ def cube(camera: turntables.Camera) -> np.ndarray:
 
 
 def judged(capture: Capture, folder: Path) -> Capture:
-    job = Job(settings=PosesSettings(), out=folder / "poses", work=folder / "work", source=folder, stage="poses", report=lambda event: None)
+    job = captures.poses_job(folder, folder)
     paths = {photo.camera.name: photo.image for photo in capture.photos}
     return without_white_backdrop(job, capture, paths, PhotoReader(folder / "photographs"), job.warn)
 

@@ -11,12 +11,10 @@ from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import Foreground
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import BadInput
-from pipeline.stage import Job
 from stages.io import scene
 from stages.masking import foreground
 from stages.masking.subject import Subject, subject_of
 from stages.poses import run as poses
-from stages.poses.settings import PosesSettings
 from tests.stages import captures
 
 RADIUS = 0.6
@@ -91,12 +89,8 @@ def seen(monkeypatch: pytest.MonkeyPatch, pictures: dict[str, np.ndarray]) -> li
 FLOOR_ABOVE = ((FLOOR[0], 0.01),)
 
 
-def job_of(source: Path, out: Path, **settings: Any) -> Job:
-    return Job(settings=PosesSettings(mask_from="foreground", **settings), out=out / "poses", work=out / "work", source=source, stage="poses")
-
-
 def test_the_foreground_is_trained_alone_on_silhouettes_as_on_masks_of_users(source: Path, tmp_path: Path) -> None:
-    poses.run(job_of(source, tmp_path))
+    poses.run(captures.poses_job(source, tmp_path, mask_from="foreground"))
     made = scene.load(tmp_path / "poses")
     assert made.background == (1.0, 1.0, 1.0)
     assert not made.contracted
@@ -115,11 +109,7 @@ def test_a_photograph_whose_silhouette_does_not_fit_is_left_out(tmp_path: Path, 
     seen(monkeypatch, ball_pictures(made))
     monkeypatch.setattr("stages.masking.foreground.hull_overlaps", lambda capture, pictures: np.array([0.95] * 5 + [0.6] + [0.95] * 6))
     events: list[dict[str, Any]] = []
-    job = Job(
-        settings=PosesSettings(mask_from="foreground"), out=tmp_path / "poses", work=tmp_path / "work", source=captures.nerfstudio(tmp_path / "source", made),
-        report=events.append,
-    )  # fmt: skip
-    poses.run(job)
+    poses.run(captures.poses_job(captures.nerfstudio(tmp_path / "source", made), tmp_path, events.append, mask_from="foreground"))
     kept = {view.name for view in scene.load(tmp_path / "poses").views}
     assert len(kept) == 11
     (left,) = {f"images/{camera.name}" for camera in made} - kept
@@ -139,6 +129,6 @@ def test_silhouettes_of_no_compact_thing_are_refused(change: Any, why: str, tmp_
     made = captures.cameras(8)
     seen(monkeypatch, change(ball_pictures(made)))
     with pytest.raises(BadInput, match=rf"--mask foreground: .*{why}.* Photograph it from all sides.*masks/") as error:
-        poses.run(job_of(captures.nerfstudio(tmp_path / "source", made), tmp_path))
+        poses.run(captures.poses_job(captures.nerfstudio(tmp_path / "source", made), tmp_path, mask_from="foreground"))
     assert error.value.exit_code == 2
     assert not (tmp_path / "poses/scene.json").exists()

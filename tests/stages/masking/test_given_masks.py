@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import BadInput
-from pipeline.stage import Job
 from stages.formats.importers.masks import masks_of
 from stages.formats.importers.source import Source
 from stages.io.capture import Capture, Photo
@@ -18,7 +17,6 @@ from stages.io.photo import read_mask_file, read_photo
 from stages.io.reader import PhotoReader
 from stages.masking import photographs
 from stages.masking.polarity import kept_white
-from stages.poses.settings import PosesSettings
 from tests.stages import captures
 
 W, H = 96, 72
@@ -48,11 +46,6 @@ def sources(folder: Path, draw: Any, *, black: bool) -> tuple[dict[str, Path], d
     return paths, masks
 
 
-def job_in(folder: Path, events: list[dict[str, Any]], **settings: Any) -> Job:
-    (folder / "work").mkdir(parents=True, exist_ok=True)
-    return Job(settings=PosesSettings(**settings), out=folder / "out", work=folder / "work", source=folder, stage="poses", report=events.append)
-
-
 @pytest.mark.parametrize("name", ["IMG_1.png", "img_1.PNG", "IMG_1.jpg.png", "IMG_1.mask.png", "IMG_1.jpg.mask", "IMG_1.mask", "IMG_1_mask.png"])
 @pytest.mark.parametrize("place", ["masks", "images/masks"])
 def test_masks_are_found_by_the_names_that_other_programs_give_them(tmp_path: Path, name: str, place: str) -> None:
@@ -69,7 +62,7 @@ def test_masks_are_found_by_the_names_that_other_programs_give_them(tmp_path: Pa
 def test_masks_keep_white_from_here_on(tmp_path: Path, black: bool, polarity: str) -> None:
     paths, masks = sources(tmp_path, drawn, black=black)
     events: list[dict[str, Any]] = []
-    kept, inverted = kept_white(job_in(tmp_path, events, mask_polarity=polarity), paths, masks, PhotoReader())
+    kept, inverted = kept_white(captures.poses_job(tmp_path, tmp_path, events.append, mask_polarity=polarity), paths, masks, PhotoReader())
     assert any("keep what is black" in event["text"] for event in events) == (polarity == "black")
     assert bool(inverted) == (polarity == "auto" and black)
     for index, camera in enumerate(captures.cameras()):
@@ -77,7 +70,7 @@ def test_masks_keep_white_from_here_on(tmp_path: Path, black: bool, polarity: st
         np.testing.assert_array_equal(read_mask_file(kept[camera.name], photo), inside != (black != (polarity == "black")))
         if inverted:
             np.testing.assert_array_equal(read_mask_file(inverted[camera.name], photo), inside)
-    assert kept_white(job_in(tmp_path, [], masks="ignore"), paths, masks, PhotoReader()) == (masks, {})
+    assert kept_white(captures.poses_job(tmp_path, tmp_path, masks="ignore"), paths, masks, PhotoReader()) == (masks, {})
 
 
 @pytest.mark.parametrize("surroundings", [True, False])
@@ -94,7 +87,7 @@ def test_cameras_show_whether_black_is_one_thing(tmp_path: Path, draw: Any, surr
 
     monkeypatch.setattr(photographs, "_search", lambda *_: find)
     events: list[dict[str, Any]] = []
-    job = job_in(tmp_path, events)
+    job = captures.poses_job(tmp_path, tmp_path, events.append)
     if draw is wandering and not surroundings:
         with pytest.raises(BadInput):
             photographs.cameras_of_photographs(job, PhotoReader(tmp_path / "photographs"), lambda *_, **__: None)

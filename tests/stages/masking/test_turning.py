@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Camera
-from pipeline.stage import Job
 from stages.io.png import write_png
 from stages.io.reader import PhotoReader
 from stages.masking.photographs import mask_choice
 from stages.masking.turning import border_stands_still, masks_of_turning_subject
 from stages.poses.run import read
-from stages.poses.settings import PosesSettings
 from stages.verdict.verdict import verdict_on
-from tests.stages import turntables
+from tests.stages import captures, turntables
 from tests.stages.sfm.still_life import errors_of
 
 COUNT = 11
@@ -43,8 +41,8 @@ def found_in(paths: dict[str, Path], work: Path) -> dict[str, Path]:
 def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
     folder, cameras = turntable
     events: list[dict[str, Any]] = []
-    job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=folder, stage="poses", report=events.append)
-    capture = read(job, PosesSettings(), PhotoReader(tmp_path / "photographs"), job.warn)
+    job = captures.poses_job(folder, tmp_path, events.append)
+    capture = read(job, job.settings, PhotoReader(tmp_path / "photographs"), job.warn)
     assert capture.provenance.background == "left out"
     assert any("the background stands still" in event.get("text", "") for event in events)
     assert mask_choice(job.settings, capture.provenance) == "silhouette"

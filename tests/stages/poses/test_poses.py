@@ -11,7 +11,7 @@ from PIL import Image
 
 from efficientnerf.geometry.cameras import project
 from pipeline.errors import BadInput, UsageError
-from pipeline.stage import Job, settings_from
+from pipeline.stage import settings_from
 from stages.io import scene
 from stages.io.capture import Capture, Photo
 from stages.io.scene import Scene
@@ -26,8 +26,7 @@ from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS
 def run(source: Path, out: Path, **settings: Any) -> tuple[Scene, list[str]]:
     """The scene, and the warnings."""
     events: list[dict[str, Any]] = []
-    job = Job(settings=PosesSettings(**settings), out=out / "poses", work=out / "work", source=source, stage="poses", report=events.append)
-    poses.run(job)
+    poses.run(captures.poses_job(source, out, events.append, **settings))
     return scene.load(out / "poses"), [event["text"] for event in events if event["event"] == "warning"]
 
 
