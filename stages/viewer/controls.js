@@ -2,8 +2,8 @@
 
 import { projected } from "./camera.js";
 import { Measure } from "./measure.js";
+import { element } from "./payload.js";
 
-const element = (id) => document.getElementById(id);
 const MODES = ["colour", "depth", "normals", "colour without view dependence"];
 
 // Of what and how the asset was made, as far as it says so.

@@ -3,12 +3,10 @@
 import { FormatError, readAsset } from "./asset.js";
 import { Eye, uprightOf } from "./camera.js";
 import { Controls } from "./controls.js";
-import { facts, fromBase64, fromBase64Slow, inflated } from "./payload.js";
+import { element, facts, fromBase64, inflated } from "./payload.js";
 import { Renderer, Unsupported } from "./renderer.js";
-import { sha256Slow } from "./sha256.js";
 import { SplatRenderer, readSplats } from "./splats.js";
 
-const element = (id) => document.getElementById(id);
 const breath = () => new Promise((resolve) => setTimeout(resolve, 0));
 const BUDGET = 40; // milliseconds that a picture may take while the eye moves
 const REST = 180; // milliseconds without a movement until the picture is made whole
@@ -39,12 +37,12 @@ function boxOf(tree) {
 }
 
 class Viewer {
-  constructor(tree, renderer, cameras, home) {
+  constructor(tree, renderer, cameras) {
     this.tree = tree;
     this.renderer = renderer;
     this.canvas = renderer.canvas;
     this.box = boxOf(tree);
-    this.eye = new Eye(tree.meta.orbit || home, cameras, this.box, uprightOf(tree.meta));
+    this.eye = new Eye(tree.meta.orbit, cameras, this.box, uprightOf(tree.meta));
     this.options = { mode: 0, background: tree.background || [0, 0, 0], surroundings: tree.environment !== null, rough: false, range: [1, 2] };
     this.region = null;
     this.share = 0.5; // of the canvas' sides that is drawn while the eye moves
@@ -140,7 +138,7 @@ class Viewer {
   still(width, height) {
     if (this.fence !== null) this.renderer.gl.deleteSync(this.fence);
     this.fence = null;
-    this.renderer.begin(this.fixed ? { ...this.fixed, lens: this.fixed.lens } : this.eye.view(width, height), this.settings(false), width, height);
+    this.renderer.begin(this.fixed || this.eye.view(width, height), this.settings(false), width, height);
     while (!this.renderer.band(64));
     const out = this.renderer.pixels();
     this.touch();
@@ -184,7 +182,7 @@ async function start() {
   const checked = performance.now();
   await step("Textures …", 0.75, 0.75)(1);
   await breath();
-  const graphics = renderer.load(tree, null), viewer = new Viewer(tree, renderer, page.cameras, page.home);
+  const graphics = renderer.load(tree, null), viewer = new Viewer(tree, renderer, page.cameras);
   const controls = new Controls(viewer, page);
   element("loading").hidden = true;
   document.body.classList.add("ready");
@@ -218,8 +216,6 @@ globalThis.enerf = {
       throw error;
     }
   },
-  sha256: sha256Slow,
-  fromBase64: fromBase64Slow,
   async render(width, height) {
     return (await this.ready).viewer.still(width, height);
   },

@@ -2,8 +2,8 @@
 // same.
 
 import { projected, turned } from "./camera.js";
+import { element } from "./payload.js";
 
-const element = (id) => document.getElementById(id);
 const apart = (a, b) => Math.hypot(...a.map((x, axis) => x - b[axis]));
 const quoted = (text) => (/^[\w.,/-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7], SIDES = [[0, 1], [1, 3], [3, 2], [2, 0], [4, 5], [5, 7], [7, 6], [6, 4], [0, 4], [1, 5], [2, 6], [3, 7]]; // by bits x, y, z

@@ -99,7 +99,7 @@ def splats_page(
 def _page(packed: bytes, size: int, cameras: list[dict[str, Any]], title: str, **more: Any) -> bytes:
     """The page of a deflate stream of so many bytes."""
     title = printable(title, 200)
-    facts = {"title": title, "bytes": size, "cameras": cameras, "home": None, **more}
+    facts = {"title": title, "bytes": size, "cameras": cameras, **more}
     script, style = script_text(), (FOLDER / "viewer.css").read_text(encoding="utf-8")
     head = _template().render(title=title, policy=Markup(policy()), style=Markup(style), facts=Markup(json_for_html(facts)))
     parts = [head.encode("utf-8"), b"\n"]
@@ -127,8 +127,7 @@ def script_text() -> str:
         text = (FOLDER / f"{name}.js").read_text(encoding="utf-8")
         text = re.sub(r'^import \{[^}]*\} from "\./\w+\.js";\n', "", text, flags=re.MULTILINE)
         texts.append(f"// {name}.js\n" + re.sub(r"^export (?=(?:async function|function|class|const) )", "", text, flags=re.MULTILINE))
-    joined = "\n".join(texts).replace('const element = (id) => document.getElementById(id);\n', "")
-    return '"use strict";\n(() => {\nconst element = (id) => document.getElementById(id);\n' + joined + "})();\n"
+    return '"use strict";\n(() => {\n' + "\n".join(texts) + "})();\n"
 
 
 def _cameras(cameras: Sequence[Camera], photographs: Mapping[str, bytes] | None) -> list[dict[str, Any]]:

@@ -2,38 +2,18 @@
 
 import { FormatError } from "./asset.js";
 
-export const facts = () => JSON.parse(document.getElementById("facts").textContent);
-
-const DIGITS = new Int16Array(128).fill(-1);
-[..."ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"].forEach((digit, n) => (DIGITS[digit.charCodeAt(0)] = n));
+export const element = (id) => document.getElementById(id);
+export const facts = () => JSON.parse(element("facts").textContent);
 
 export function fromBase64(text) {
-  if (Uint8Array.fromBase64) {
-    try {
-      return Uint8Array.fromBase64(text);
-    } catch {
-      throw new FormatError("the page's data are no base64; the page is damaged");
-    }
+  try {
+    if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
+    const raw = atob(text), out = new Uint8Array(raw.length);
+    for (let n = 0; n < raw.length; n++) out[n] = raw.charCodeAt(n);
+    return out;
+  } catch {
+    throw new FormatError("the page's data are no base64; the page is damaged");
   }
-  return fromBase64Slow(text);
-}
-
-export function fromBase64Slow(text) {
-  const end = text.endsWith("==") ? 2 : text.endsWith("=") ? 1 : 0, length = text.length - end, out = new Uint8Array(Math.floor((length * 3) / 4));
-  let wrong = text.length % 4 ? 1 : 0;
-  for (let from = 0, to = 0; from < length; from += 4) {
-    let value = 0;
-    for (let n = 0; n < 4; n++) {
-      const code = from + n < length ? text.charCodeAt(from + n) : 65, digit = code < 128 ? DIGITS[code] : -1;
-      wrong |= digit < 0;
-      value = (value << 6) | (digit & 63);
-    }
-    out[to++] = value >> 16;
-    if (to < out.length) out[to++] = value >> 8;
-    if (to < out.length) out[to++] = value;
-  }
-  if (wrong) throw new FormatError("the page's data are no base64; the page is damaged");
-  return out;
 }
 
 // The asset's bytes, exactly `size` of them. Raises FormatError. `progress` is told a share from 0 to 1, and awaited.

@@ -32,7 +32,6 @@ export class Renderer {
     for (const each of Object.values(this.textures)) gl.deleteTexture(each);
     this.textures = {};
     this.tree = tree;
-    this.volume = { ...volume, coarse: null, density: null, base: null, layers: volume.layers.map(({ channels }) => ({ channels })) };
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     const [tx, ty, tz] = volume.tiles, pad = tree.brick + 2, b = tree.brick;
     const cube = (name, size, inner, format, type, data, filter = gl.NEAREST) => {
