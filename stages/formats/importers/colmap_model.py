@@ -21,20 +21,11 @@ from pipeline.text import printable
 from stages.formats.importers.lenses import image_size
 from stages.io.capture import SparsePoints
 
-# Number of each camera model in binary files: (name, how many parameters).
-MODEL_NUMBERS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-}
+# The camera models by their numbers in binary files.
+MODEL_NAMES = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+)  # fmt: skip
 # COLMAP's models of fewer parameters that are OPENCV_FISHEYE with the others zero: how many k they have, after f, cx, cy.
 FISHEYE = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2}
 MAX_FILE = 8 << 30  # bytes
@@ -183,10 +174,8 @@ def _cameras_bin(path: Path) -> dict[int, Camera]:
     file, cameras = _Bytes(path), {}
     for _ in range(file.count(24, "cameras", MAX_IMAGES)):
         number, model_number, width, height = file.take("<IiQQ")
-        if model_number not in MODEL_NUMBERS:
-            raise BadInput(f"{path}: camera {number} has model number {model_number}, which is not known. Undistort with `colmap image_undistorter` first.")
-        model, parameters = MODEL_NUMBERS[model_number]
-        cameras[number] = _lens(path, number, model, width, height, file.take(f"<{parameters}d"))
+        model = MODEL_NAMES[model_number] if 0 <= model_number < len(MODEL_NAMES) else f"model of number {model_number}"
+        cameras[number] = _lens(path, number, model, width, height, file.take(f"<{count_parameters(model) or 0}d"))
     file.finish()
     return cameras
 

@@ -82,8 +82,6 @@ def validated(camera: Camera, where: str) -> Camera:
         raise BadInput(f"{where}: focal length {min(named['fx'], named['fy']):g}; expected more than zero pixels. Write the data set again.")
     if not (np.abs(camera.world_from_camera) <= LARGEST_NUMBER).all():
         raise BadInput(f"{where}: the camera's place is not finite, or beyond {LARGEST_NUMBER:g}. Write the data set again.")
-    if camera.width <= 0 or camera.height <= 0:
-        raise BadInput(f"{where}: image size {camera.width}x{camera.height}; expected more than zero pixels. Write the data set again.")
     return camera
 
 

@@ -39,42 +39,34 @@ LARGEST_FRAME = 1 << 20  # bytes of a file with one camera
 # Polycam
 KEYFRAMES = "keyframes"
 POLYCAM_EXPECTED = f"{KEYFRAMES}/images with {KEYFRAMES}/cameras, or their corrected versions"
-POLYCAM_KINDS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
+POLYCAM_IMAGES = {"corrected_cameras": "corrected_images", "cameras": "images"}  # the folders of cameras, the better ones first, and of their images
 POLYCAM_AGAIN = "Export the raw data again."
 
 
 def _polycam_signs(source: Source) -> Sequence[Path]:
-    return next((found for _, cameras in POLYCAM_KINDS if (found := _polycam_cameras(source, cameras))), [])
+    """The cameras of the first folder that has any, and images."""
+    for cameras, images in POLYCAM_IMAGES.items():
+        found = sorted(path for path in (source.root / KEYFRAMES / cameras).glob("*.json") if path.is_file())
+        if found and images_in(source.root / KEYFRAMES / images):
+            return [source.check_inside(path) for path in found]
+    return []
 
 
 def _polycam(source: Source, signs: Sequence[Path]) -> Listed:
-    images, cameras = _polycam_kind(source)
-    where, found = f"{KEYFRAMES}/{cameras}", _polycam_cameras(source, cameras)
+    cameras = signs[0].parent.name
+    where, place = f"{KEYFRAMES}/{cameras}", source.root / KEYFRAMES / POLYCAM_IMAGES[cameras]
     raw = "keyframes/corrected_cameras is not there: the phone's own poses and images with some distortion are used. Process with loop closure."
-    posed, place = {path.stem for path in found}, source.root / KEYFRAMES / images
-    check_count(len(found), where)
-    listed = [Frame(path.stem, place, source.name_of(path), stated(_polycam_camera(source, path)), bare=True) for path in found]
+    posed = {path.stem for path in signs}
+    check_count(len(signs), where)
+    listed = [Frame(path.stem, place, source.name_of(path), stated(_polycam_camera(source, path)), bare=True) for path in signs]
     rejected = [(source.name_of(path), "without a camera file") for path in images_in(place) if path.stem not in posed]
     warnings = [raw] if cameras == "cameras" else []
-    return Listed(where, listed, found, rejected, warnings, Y_UP, metric=True, facts={"cameras": cameras}, depth=partial(_polycam_depth, source))
+    return Listed(where, listed, signs, rejected, warnings, Y_UP, metric=True, facts={"cameras": cameras}, depth=partial(_polycam_depth, source))
 
 
 def _polycam_depth(source: Source, frame: Frame, image: Path) -> DepthFile | None:
     place = source.root / KEYFRAMES
     return depth_file(source, place / f"depth/{image.stem}.png", MILLIMETRE, place / f"confidence/{image.stem}.png", POLYCAM_HIGH, SENSOR_RANGE)
-
-
-def _polycam_cameras(source: Source, name: str) -> list[Path]:
-    place = source.root / KEYFRAMES / name
-    return sorted(source.check_inside(path) for path in place.glob("*.json") if path.is_file()) if place.is_dir() else []
-
-
-def _polycam_kind(source: Source) -> tuple[str, str]:
-    """The folders of images and of cameras that are used."""
-    for images, cameras in POLYCAM_KINDS:
-        if _polycam_cameras(source, cameras) and images_in(source.root / KEYFRAMES / images):
-            return images, cameras
-    raise BadInput(f"{source.root}: no raw data of Polycam: expected {POLYCAM_EXPECTED}. Choose another format with --as.")
 
 
 def _polycam_camera(source: Source, path: Path) -> Camera:
@@ -152,7 +144,8 @@ SCANNER_AGAIN = "Export from 3D Scanner App again, as All Data."
 
 def _scanner_signs(source: Source) -> Sequence[Path]:
     """The JSON files of the pictures that have one."""
-    return [source.check_inside(path.with_suffix(".json")) for path in _scanner_pictures(_scanner_place(source)) if _scanner_is_posed(path)]
+    listed = (path.with_suffix(".json") for path in _scanner_pictures(_scanner_place(source)))
+    return [source.check_inside(path) for path in listed if path.is_file()]
 
 
 def _scanner_recognised(source: Source, signs: Sequence[Path]) -> bool:
@@ -165,14 +158,18 @@ def _scanner_recognised(source: Source, signs: Sequence[Path]) -> bool:
 
 
 def _scanner(source: Source, signs: Sequence[Path]) -> Listed:
-    place = _scanner_place(source)
-    pictures, where = _scanner_pictures(place), source.name_of(place / "frame_*.json")
-    posed = [path for path in pictures if _scanner_is_posed(path)]
-    check_count(len(posed), where)
+    place, posed = signs[0].parent, {path.stem: path for path in signs}
+    where = source.name_of(place / "frame_*.json")
+    check_count(len(signs), where)
+    listed: list[Frame] = []
+    rejected: list[tuple[str, str]] = []
+    for path in _scanner_pictures(place):
+        if path.stem in posed:
+            listed.append(Frame(path.name, place, source.name_of(posed[path.stem]), _scanner_camera(source, posed[path.stem])))
+        else:
+            rejected.append((source.name_of(path), "without a pose"))
     poses = sum(1 for path in place.glob("frame_*.json") if _FRAME.fullmatch(path.stem))
-    listed = [Frame(path.name, place, source.name_of(path.with_suffix(".json")), _scanner_camera(source, path.with_suffix(".json"))) for path in posed]
-    rejected = [(source.name_of(path), "without a pose") for path in pictures if path not in posed]
-    facts: dict[str, object] = {"poses_without_picture": poses - len(posed)}
+    facts: dict[str, object] = {"poses_without_picture": poses - len(listed)}
     return Listed(where, listed, signs, rejected, up=Y_UP, metric=True, facts=facts, depth=partial(_scanner_depth, source, place))
 
 
@@ -189,10 +186,6 @@ def _scanner_place(source: Source) -> Path:
 
 def _scanner_pictures(place: Path) -> list[Path]:
     return [path for path in images_in(place) if _FRAME.fullmatch(path.stem)]
-
-
-def _scanner_is_posed(picture: Path) -> bool:
-    return picture.with_suffix(".json").is_file()
 
 
 def _scanner_camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Camera]:

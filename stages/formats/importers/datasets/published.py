@@ -224,13 +224,9 @@ def _mvsnet_files(source: Source) -> Sequence[Path]:
         folder = source.root / place
         found = [path for path in folder.glob("*_cam.txt") if re.fullmatch(r"[0-9]{1,9}_cam\.txt", path.name) and path.is_file()] if folder.is_dir() else []
         if found:
-            numbered = {_mvsnet_number(path): source.check_inside(path) for path in sorted(found)}
+            numbered = {int(path.name.removesuffix("_cam.txt")): source.check_inside(path) for path in sorted(found)}
             return [path for _, path in sorted(numbered.items())]
     return []
-
-
-def _mvsnet_number(path: Path) -> int:
-    return int(path.name.removesuffix("_cam.txt"))
 
 
 def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
@@ -249,7 +245,7 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
         pose = from_world(numbers(found[1:17], 16, f"{where}: extrinsic").reshape(4, 4), f"{where}: extrinsic")
         camera = pinhole_frame(numbers(found[18:27], 9, f"{where}: intrinsic").reshape(3, 3), pose, where)
         if scans:
-            listed.append(Frame(f"rect_{_mvsnet_number(path) + 1:03d}_{DTU_LIGHT}_r5000.png", scans[0], where, camera))
+            listed.append(Frame(f"rect_{int(stem) + 1:03d}_{DTU_LIGHT}_r5000.png", scans[0], where, camera))
             continue
         folders = [source.root / name for name in ("images", "blended_images", "image", "rgb", ".")]
         images = next((folder for folder in folders if source.find(stem, folder).how == "listed"), source.root)
