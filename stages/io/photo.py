@@ -6,17 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL.ExifTags import IFD, Base
 
 from stages.io.pictures import UnreadableImage, exif_of, grey_of, opened, orientation_of, rgb_and_alpha
 
 FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm; the "35 mm equivalent" focal length refers to it
 
-_MAKE, _MODEL, _EXIF = 271, 272, 34665
-_FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X, _LENS = 37386, 41989, 41486, 41488, 40962, 42036
-_GPS = 34853
-_MAKER_NOTE, _APPLE, _ACCELERATION = 37500, b"Apple iOS\0", (8, 10, 3)  # of Apple's entry: tag, signed rationals, three of them
+_APPLE, _ACCELERATION = b"Apple iOS\0", (8, 10, 3)  # beginning of Apple's maker note; of its entry: tag, signed rationals, three of them
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_ORIENTATION = 274
 _SENSOR_TURNED = {1: np.eye(2), 3: -np.eye(2), 6: np.array([[0, -1], [1, 0]]), 8: np.array([[0, 1], [-1, 0]])}  # EXIF's number -> the picture's axes
 _FISHEYE = ("fisheye", "fish-eye", "fish eye")  # in names of lenses; rectilinear ones of the same focal lengths do not have it
 
@@ -63,8 +60,8 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
     """Decode a photograph; raises UnreadableImage."""
     with opened(path) as image:
         exif = exif_of(image)
-        details = dict(exif.get_ifd(_EXIF))
-        maker = " ".join(str(exif.get(tag, "")).strip(" \0") for tag in (_MAKE, _MODEL)).strip()
+        details = dict(exif.get_ifd(IFD.Exif))
+        maker = " ".join(str(exif.get(tag, "")).strip(" \0") for tag in (Base.Make, Base.Model)).strip()
         orientation = orientation_of(image)
         full = image.size
         # As the sensor has it, which the numbers of EXIF refer to: libheif has turned the pixels already.
@@ -78,14 +75,6 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
         opaque = resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
     size = width, height, rgb.shape[1], rgb.shape[0]
     return DecodedPhoto(*size, orientation, focal_from_exif(details, *taken), maker, names_fisheye(details), rgb, opaque)
-
-
-def read_alpha(path: Path) -> np.ndarray | None:
-    """(H, W) uint8 of an image file at full size, after EXIF rotation; None if it has no alpha channel. Raises UnreadableImage."""
-    with opened(path) as image:
-        orientation = orientation_of(image)
-        alpha = rgb_and_alpha(image, as_stored=True)[1]
-    return None if alpha is None else apply_exif_orientation(alpha, orientation)
 
 
 def read_mask_file(path: Path, photo: PhotoDetails) -> np.ndarray:
@@ -128,12 +117,12 @@ def focal_from_exif(details: Any, width: int, height: int) -> float | None:
     The 35 mm equivalent is defined by the diagonal of the frame (CIPA DCG-001); else the focal length in millimetres with the pixel
     density of the sensor, which is that of the image as taken (PixelXDimension), not as scaled since.
     """
-    equivalent, focal = _number(details.get(_FOCAL_35)), _number(details.get(_FOCAL))
+    equivalent, focal = _number(details.get(Base.FocalLengthIn35mmFilm)), _number(details.get(Base.FocalLength))
     if equivalent:
         return equivalent / FULL_FRAME_DIAGONAL * float(np.hypot(width, height))
-    density, unit = _number(details.get(_PLANE_X)), _UNIT_MM.get(details.get(_PLANE_UNIT, 2))
+    density, unit = _number(details.get(Base.FocalPlaneXResolution)), _UNIT_MM.get(details.get(Base.FocalPlaneResolutionUnit, 2))
     if focal and density and unit:
-        taken = _number(details.get(_PIXELS_X)) or width
+        taken = _number(details.get(Base.ExifImageWidth)) or width
         pixels = focal * density / unit * width / taken
         return pixels if 0.2 < pixels / max(width, height) < 20 else None  # many writers state a wrong density
     return None
@@ -141,13 +130,13 @@ def focal_from_exif(details: Any, width: int, height: int) -> float | None:
 
 def names_fisheye(details: Any) -> bool:
     """Whether the name of the lens in EXIF data says that it is a fisheye."""
-    return any(word in str(details.get(_LENS, "")).lower() for word in _FISHEYE)
+    return any(word in str(details.get(Base.LensModel, "")).lower() for word in _FISHEYE)
 
 
 def read_gps_position(path: Path) -> tuple[float, float, float] | None:
     """(latitude, longitude) in degrees and altitude in metres of a picture's EXIF data; None without any of them. Raises UnreadableImage."""
     with opened(path) as image:
-        tags = dict(exif_of(image).get_ifd(_GPS))
+        tags = dict(exif_of(image).get_ifd(IFD.GPSInfo))
     latitude, longitude = _degrees(tags.get(2), tags.get(1), "NS", 90.0), _degrees(tags.get(4), tags.get(3), "EW", 180.0)
     try:
         altitude = float(tags[6]) * (-1.0 if tags.get(5) in (1, b"\x01") else 1.0)
@@ -162,8 +151,8 @@ def read_gravity(path: Path) -> np.ndarray | None:
     UnreadableImage."""
     with opened(path) as image:
         exif = exif_of(image)
-        note = exif.get_ifd(_EXIF).get(_MAKER_NOTE)
-        turned = image.info.get("original_orientation", exif.get(_ORIENTATION, 1))  # libheif turns the pixels itself
+        note = exif.get_ifd(IFD.Exif).get(Base.MakerNote)
+        turned = image.info.get("original_orientation", exif.get(Base.Orientation, 1))  # libheif turns the pixels itself
     if not isinstance(note, bytes) or not note.startswith(_APPLE) or turned not in _SENSOR_TURNED:
         return None
     try:

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
+from PIL.ExifTags import Base
 
 from pipeline.errors import PipelineError
 from pipeline.text import printable
@@ -41,7 +42,6 @@ MAX_PIXELS = 178_956_970  # of a picture, from its header, before anything is de
 FEW_PIXELS = 32_000_000  # whatever the size of the file: memory stays within a few hundred MB
 PIXELS_A_BYTE = 10_000  # of a larger picture at most: deflate makes 1,032 bytes of one, which are 8,256 pixels of 1 bit
 
-_ORIENTATION = 274
 _JPEG = ("JPEG", "MPO")
 _LOWEST = 3  # rows and columns of a quantisation table that its coarseness is judged by; libjpeg's at quality 50 have this mean there
 _LOWEST_MEAN = 118 / 9
@@ -164,7 +164,7 @@ def read_header(path: Path) -> Header:
 
 def orientation_of(image: Any) -> int:
     """EXIF's number, 1-8, of an opened image whose pixels are not decoded yet."""
-    number = 1 if image.format == "HEIF" else exif_of(image).get(_ORIENTATION, 1)  # libheif turns the pixels itself
+    number = 1 if image.format == "HEIF" else exif_of(image).get(Base.Orientation, 1)  # libheif turns the pixels itself
     return int(number) if number in range(1, 9) else 1
 
 

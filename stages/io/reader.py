@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 
 from stages.io.capture import Photo, Silhouettes
-from stages.io.photo import PhotoDetails, read_alpha, read_photo
+from stages.io.photo import PhotoDetails, read_photo
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.png import FAST, read_png, write_png
-from stages.io.working_images import TRANSPARENT, mask_levels
+from stages.io.working_images import TRANSPARENT, decode, mask_levels
 from stages.scratch import note, noted
 
 SMALL = 160  # px, longest side
@@ -109,10 +109,10 @@ def _alpha_of(photo: Photo) -> np.ndarray | None:
     try:
         if not read_header(photo.image).alpha:
             return None
-        alpha = read_alpha(photo.image)
+        pixels = decode(photo.image, as_stored=True).pixels
     except UnreadableImage:
         return None
-    return None if alpha is None else reduced(alpha)
+    return reduced(pixels[..., 3]) if pixels.shape[2] == 4 else None
 
 
 def _mask_of(photo: Photo) -> np.ndarray | None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image
+from PIL.ExifTags import Base
 
 from efficientnerf.capture import frame_choice as choice
 from efficientnerf.capture.frame_motion import DETAIL, TRACKED, Motion, sharpness
@@ -24,7 +25,6 @@ from stages.video.reading import Frame, UnreadableVideo, Video, opened
 
 SLOWEST = 12.0  # frames a second that are looked at at least; of videos with more than twice as many, every n-th
 NEAREST = 0.25 / SLOWEST  # seconds between frames that are looked at, at least, of videos of an unknown rate
-_MAKER = 271  # EXIF's tag
 Progress = Callable[..., None]
 
 
@@ -50,7 +50,6 @@ class Chosen:
     """The frames of the videos."""
 
     paths: dict[str, Path]  # name -> PNG, in order of time within each video; a name is that of the video, /, the frame's number
-    camera: dict[str, str]  # name -> the camera that took it, in words; frames of one video have one
     record: list[dict[str, object]]  # for frames.json
 
 
@@ -73,17 +72,14 @@ def frames_of(videos: Mapping[str, Path], *, count: int, max_side: int, reader: 
     looked = {name: _looked(name, path, place, reader) for place, (name, path) in enumerate(videos.items())}
     limits = choice.shares([found.motion[-1] for found in looked.values()], count)
     paths: dict[str, Path] = {}
-    camera: dict[str, str] = {}
     record: list[dict[str, object]] = []
     for place, (name, found) in enumerate(looked.items()):
         verdicts = choice.choose(np.array(found.motion), np.array(found.sharpness), limits[place])
         numbers = [number for number, verdict in zip(found.index, verdicts, strict=True) if verdict == choice.CHOSEN]
         written = _written(name, videos[name], place, numbers, max_side, found, reader)
-        named = {f"{name}/{number:06d}.png": path for number, path in written.items()}
-        paths |= named
-        camera |= dict.fromkeys(named, found.maker or f"video {name}")
+        paths |= {f"{name}/{number:06d}.png": path for number, path in written.items()}
         record.append(_record(name, found, verdicts))
-    return Chosen(paths, camera, record)
+    return Chosen(paths, record)
 
 
 def _looked(name: str, path: Path, place: int, reader: Reader) -> Looked:
@@ -168,7 +164,7 @@ def _written(name: str, path: Path, place: int, numbers: list[int], max_side: in
 
 def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> None:
     exif = Image.Exif()
-    exif[_MAKER] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
+    exif[Base.Make] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
     with atomic(path, durable=False) as temporary:
         Image.fromarray(frame.rgb(max_side)).save(temporary, "PNG", compress_level=FAST, exif=exif)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from pipeline.files import atomic, remove
 from stages.io.photo import read_photo
@@ -18,8 +19,7 @@ from stages.io.png import FAST
 from stages.scratch import note, noted, once, same_as
 
 VIEWS = 8
-_MAKER, _EXIF = 271, 34665
-_FOCAL, _DENSITY, _UNIT, _MM, _WIDTH = 37386, 41486, 41488, 4, 40962
+_MILLIMETRE = 4  # EXIF's unit of the density of pixels
 
 
 def is_panorama(path: Path) -> bool:
@@ -90,7 +90,9 @@ def views_of(
 def _write(pixels: np.ndarray, path: Path) -> None:
     side = len(pixels)
     exif = Image.Exif()
-    exif[_MAKER] = "panorama"
-    exif[_EXIF] = {_FOCAL: 10.0, _DENSITY: side / 20, _UNIT: _MM, _WIDTH: side}  # mm; pixels a mm: half a side is the focal length
+    exif[Base.Make] = "panorama"
+    exif[IFD.Exif] = {  # half a side is the focal length
+        Base.FocalLength: 10.0, Base.FocalPlaneXResolution: side / 20, Base.FocalPlaneResolutionUnit: _MILLIMETRE, Base.ExifImageWidth: side,
+    }  # fmt: skip
     with atomic(path, durable=False) as temporary:
         Image.fromarray(pixels).save(temporary, "PNG", compress_level=FAST, exif=exif)

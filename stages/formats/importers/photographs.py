@@ -13,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from PIL.ExifTags import IFD, Base
 
 from pipeline.errors import BadInput
 from stages.formats.importers.masks import FOLDERS, masks_of
@@ -38,7 +39,6 @@ CORRECTED = "corrected_images"
 _REDUCED = re.compile(r"images_\d+")
 _MAP = re.compile(r"(?:depth|conf)_(\d+)\.png")  # of a phone's sensor
 _PREFERRED = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif", ".webp", ".bmp")  # of one picture in several formats
-_EXIF, _TAKEN, _FRACTION = 34665, 36867, 37521  # directory; DateTimeOriginal, SubSecTimeOriginal
 _SMALL, _ALIKE, _ANYWHERE = 64, 4.0, 48  # px, longest side; levels of 255 that formats differ by, in the mean and anywhere
 
 
@@ -178,9 +178,9 @@ def _are_alike(path: Path, changed: int, other: Path, other_changed: int) -> boo
 def _taken(path: Path) -> tuple[str, str] | None:
     """When a photograph was taken, by its EXIF data."""
     with opened(path) as image:
-        tags = dict(exif_of(image).get_ifd(_EXIF))
-    time = str(tags.get(_TAKEN, "")).strip(" \0")
-    return (time, str(tags.get(_FRACTION, "")).strip(" \0")) if any(digit in time for digit in "123456789") else None
+        tags = dict(exif_of(image).get_ifd(IFD.Exif))
+    time = str(tags.get(Base.DateTimeOriginal, "")).strip(" \0")
+    return (time, str(tags.get(Base.SubsecTimeOriginal, "")).strip(" \0")) if any(digit in time for digit in "123456789") else None
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:

@@ -8,13 +8,14 @@ import io
 from typing import Any
 
 from PIL import Image, ImageFile
+from PIL.ExifTags import IFD, Base
 from PIL.JpegImagePlugin import JpegImageFile
 
 from stages.io.decoders.jpeg_scans import MOST_SCANS, holds_more_scans
 
 _ORIENTATIONS = {0: 1, 3: 3, 5: 8, 6: 6}  # LibRaw's -> EXIF's
-_PLAIN, _EXIF = (271, 272), 34665  # make, model; the directory of
-_DETAILS = (37386, 41989, 41486, 41488, 40962, 42036)  # focal lengths, density of the sensor's pixels, name of the lens
+_FOCAL_LENGTHS = (Base.FocalLength, Base.FocalLengthIn35mmFilm)
+_DETAILS = (*_FOCAL_LENGTHS, Base.FocalPlaneXResolution, Base.FocalPlaneResolutionUnit, Base.ExifImageWidth, Base.LensModel)
 
 
 class RawFile(ImageFile.ImageFile):
@@ -63,14 +64,14 @@ class RawFile(ImageFile.ImageFile):
 def _exif(data: bytes, raw: Any, orientation: int) -> Any:
     """What of the camera's EXIF data is used; from the file itself where it is a TIFF, else from its preview."""
     exif = Image.Exif()
-    exif[274] = orientation
+    exif[Base.Orientation] = orientation
     for found in (_of_tiff(data), _of_preview(raw)):
-        details = dict(found.get_ifd(_EXIF)) if found is not None else {}
-        if found is None or not any(tag in details for tag in _DETAILS[:2]):
+        details = dict(found.get_ifd(IFD.Exif)) if found is not None else {}
+        if found is None or not any(tag in details for tag in _FOCAL_LENGTHS):
             continue
-        for tag in _PLAIN:
+        for tag in (Base.Make, Base.Model):
             exif[tag] = str(found.get(tag, ""))
-        exif[_EXIF] = {tag: details[tag] for tag in _DETAILS if tag in details}
+        exif[IFD.Exif] = {tag: details[tag] for tag in _DETAILS if tag in details}
         break
     return exif
 
@@ -79,7 +80,7 @@ def _of_tiff(data: bytes) -> Any:
     exif = Image.Exif()
     try:
         exif.load_from_fp(io.BytesIO(data))
-        exif.get_ifd(_EXIF)
+        exif.get_ifd(IFD.Exif)
     except Exception:  # whatever a parser of TIFF stumbles over in another format
         return None
     return exif

@@ -68,7 +68,7 @@ def test_postscript_named_as_a_photograph_is_not_interpreted(tmp_path: Path, mon
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", started)
     path = tmp_path / "a.png"
     path.write_bytes(EPS)
-    for attempt in (pictures.read_header, working_images.decode, photo.read_alpha, lambda path: photo.read_photo(path, 100)):
+    for attempt in (pictures.read_header, working_images.decode, lambda path: photo.read_photo(path, 100)):
         with pytest.raises(UnreadableImage):
             attempt(path)
 
@@ -214,7 +214,7 @@ def png_of_size(width: int, height: int) -> bytes:
 def test_exif_that_is_cut_off_leaves_out_that_picture_at_most(tmp_path: Path, exif: bytes) -> None:
     path = tmp_path / "a.jpg"
     path.write_bytes(jpeg(exif))
-    for attempt in (pictures.read_header, working_images.decode, photo.read_alpha, lambda path: photo.read_photo(path, 100)):
+    for attempt in (pictures.read_header, working_images.decode, lambda path: photo.read_photo(path, 100)):
         assert_reason_or_none(attempt, path)
 
 
@@ -226,7 +226,6 @@ def test_sizes_are_bounded_before_anything_is_decoded(tmp_path: Path, size: tupl
     for attempt in (
         pictures.read_header,
         working_images.decode,
-        photo.read_alpha,
         lambda path: photo.read_photo(path, 9),
         lambda path: photo.read_mask_file(path, fine),
     ):
