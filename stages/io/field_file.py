@@ -22,7 +22,7 @@ from efficientnerf.training.exposure.model import Exposure
 from efficientnerf.training.schedule import Schedule
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact, UsageError
-from pipeline.files import write_atomically
+from pipeline.files import json_value, write_atomically
 from pipeline.stage import settings_from
 from pipeline.text import printable
 from stages.artifacts import TrainOutputs
@@ -68,9 +68,9 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors and the metadata of a file of `write_tensors`; CorruptArtifact where it is damaged."""
     try:
         with opened(path), safe_open(path, framework="pt", device="cpu") as file:
-            about = json.loads((file.metadata() or {}).get("field", "null"), parse_constant=_refused)
+            about = json_value((file.metadata() or {}).get("field", "null").encode())
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, ValueError, OSError, RecursionError, TypeError, AttributeError) as error:  # the last two: types that NumPy or torch lack
+    except (SafetensorError, ValueError, OSError, TypeError, AttributeError) as error:  # the last two: types that NumPy or torch lack
         raise CorruptArtifact(f"{printable(path)}: not a readable field file ({printable(error, 80)}). Train again.") from None
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         found = shown(about.get("format")) if isinstance(about, dict) else None
@@ -78,10 +78,6 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if digest_of(tensors) != about.get("sha256"):
         raise CorruptArtifact(f"{path}: damaged field file: its tensors are not those that its SHA-256 was made of. Train again.")
     return tensors, about
-
-
-def _refused(name: str) -> Any:
-    raise ValueError(f"{name} is no number")
 
 
 def space_of(s: Scene) -> Space:

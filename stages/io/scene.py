@@ -87,11 +87,6 @@ class Scene:
         """Whether the field's space is contracted."""
         return self.space == "contracted" or (self.space == "auto" and self.background is None)
 
-    @property
-    def up(self) -> tuple[float, float, float]:
-        """+z: the poses stage rotates the capture so."""
-        return (0.0, 0.0, 1.0)
-
 
 def views_of(scene: Scene, split: str) -> tuple[View, ...]:
     """The views of one split, in order; "report" gives test, or val where there is no test."""
@@ -110,7 +105,7 @@ def save(scene: Scene, folder: Path) -> None:
     document = {
         "format": FORMAT,
         "kind": scene.kind,
-        "up": list(scene.up),
+        "up": [0.0, 0.0, 1.0],  # the poses stage rotates the capture so
         "bounds": scene.bounds.tolist(),
         "background": scene.background,
         "world_from_capture": similarity_to_json(scene.world_from_capture),

@@ -1,7 +1,5 @@
 """What a mesh file holds, in figures."""
 
-import os
-import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -9,8 +7,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from pipeline.errors import BadInput
-from pipeline.files import Unreadable, open_plain
-from stages.io.meshes.geometry import Damaged, Geometry
+from stages.io.meshes.geometry import Damaged, Geometry, opened
 from stages.io.meshes.glb import Glb
 from stages.io.meshes.ply import read_ply
 from stages.io.meshes.text import read_obj, read_stl, read_xyz
@@ -22,17 +19,9 @@ MESHES = (".glb", *READERS)  # what can be described
 def describe_mesh(path: Path) -> dict[str, Any]:
     """Vertices, faces (as triangles), bounds and, of faces, whether they are watertight; of a GLB with meshes that are placed several times each mesh once, and
     how often they are placed. Raises BadInput."""
-    try:
-        with open(open_plain(path), "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            suffix = path.suffix.lower()
-            found = _glb(file, size) if suffix == ".glb" else _facts([(READERS[suffix](file, size), [np.eye(4)])])
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror or error}).") from error
-    except (Damaged, Unreadable) as error:
-        raise BadInput(f"{path}: {error}. Write the file again with the program that made it.") from error
-    except (ValueError, OverflowError, struct.error) as error:  # numbers that are none
-        raise BadInput(f"{path}: cannot be read as {path.suffix} ({' '.join(str(error).split())[:200]}).") from error
+    suffix = path.suffix.lower()
+    with opened(path) as (file, size):
+        found = _glb(file, size) if suffix == ".glb" else _facts([(READERS[suffix](file, size), [np.eye(4)])])
     if not found["vertices"]:
         raise BadInput(f"{path}: holds no vertices.")
     return found

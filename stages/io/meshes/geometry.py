@@ -1,10 +1,17 @@
 """The shape that a file holds, and what may be wrong with one. N vertices, F triangles."""
 
+import os
+import struct
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+
+from pipeline.errors import BadInput
+from pipeline.files import Unreadable, open_plain
 
 AT_ONCE = 2**16  # rows
 MAX_LINE = 2**20  # bytes of a line: a polygon of a hundred thousand corners
@@ -36,6 +43,20 @@ class Geometry:
         edges = np.concatenate([np.minimum(a, b) * len(ids) + np.maximum(a, b) for a, b in zip(faces.T, np.roll(faces, 1, axis=1).T, strict=True)])  # (3 F,)
         edges.sort()
         return len(edges) > 0 and len(edges) % 2 == 0 and bool((edges[::2] == edges[1::2]).all() and (edges[1:-1:2] != edges[2::2]).all())
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[BinaryIO, int]]:
+    """A file to be described, and its size. Whatever shows it to be damaged raises BadInput."""
+    try:
+        with open(open_plain(path), "rb") as file:
+            yield file, os.fstat(file.fileno()).st_size
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read ({error.strerror or error}).") from error
+    except (Damaged, Unreadable) as error:
+        raise BadInput(f"{path}: {error}. Write the file again with the program that made it.") from error
+    except (ValueError, OverflowError, struct.error) as error:  # numbers that are none
+        raise BadInput(f"{path}: cannot be read as {path.suffix} ({' '.join(str(error).split())[:200]}).") from error
 
 
 def triangles_of(corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:

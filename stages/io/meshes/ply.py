@@ -1,5 +1,6 @@
 """PLY, binary or text: the places, colours and faces that it holds."""
 
+import os
 import re
 from array import array
 from collections.abc import Callable, Iterator
@@ -111,13 +112,12 @@ def _elements(lines: list[list[str]], order: str) -> list[Element]:
 def _rows(file: BinaryIO, element: Element, wanted: list[int]) -> np.ndarray:
     """(count, len(wanted)) of an element without lists."""
     row = np.dtype([(str(place), each.type) for place, each in enumerate(element.properties)])
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    if element.count * row.itemsize > left:
+        raise Damaged(f"it is cut short: {element.count} rows of '{printable(element.name, 40)}' in {left} bytes")
     if not wanted:
-        if element.count * row.itemsize > _left(file):
-            raise Damaged("it is cut short")
         file.seek(element.count * row.itemsize, 1)
         return np.empty((0, 0))
-    if element.count * row.itemsize > _left(file):
-        raise Damaged(f"{element.count} vertices in {_left(file)} bytes")
     found = np.empty((element.count, len(wanted)))
     for done in range(0, element.count, AT_ONCE):
         part = np.frombuffer(exactly(file, row.itemsize * min(AT_ONCE, element.count - done)), row)
@@ -225,13 +225,6 @@ def _next(lines: Iterator[list[bytes]]) -> list[bytes]:
     if words is None:
         raise Damaged("it is cut short")
     return words
-
-
-def _left(file: BinaryIO) -> int:
-    at = file.tell()
-    end = file.seek(0, 2)
-    file.seek(at)
-    return end - at
 
 
 def _bytes(colours: np.ndarray, kind: np.dtype[Any]) -> np.ndarray | None:

@@ -60,7 +60,6 @@ def test_a_scene_comes_back_as_it_was(tmp_path: Path) -> None:
     assert (again.kind, again.background, again.orbit, again.points, again.metric) == (whole.kind, whole.background, whole.orbit, False, True)
     np.testing.assert_array_equal(again.bounds, whole.bounds)
     np.testing.assert_array_equal(again.world_from_capture.matrix(), whole.world_from_capture.matrix())
-    assert again.up == (0, 0, 1)
     assert [len(scene.views_of(again, split)) for split in ("train", "val", "test", "report")] == [5, 0, 1, 1]
     (tmp_path / "again").mkdir()
     scene.save(again, tmp_path / "again")

@@ -5,7 +5,8 @@ Nothing that a header says is believed before the file's size allows it, and no 
 N Gaussians.
 """
 
-import os
+import gzip
+import io
 import re
 import struct
 import zipfile
@@ -17,11 +18,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from pipeline.errors import BadInput
-from pipeline.files import Unreadable, json_value, open_plain
+from pipeline.files import Unreadable, json_value
 from pipeline.text import printable
 from stages.formats.exporters.splats import gltf, spz
-from stages.io.meshes.geometry import AT_ONCE, Damaged, exactly
+from stages.io.meshes.geometry import AT_ONCE, Damaged, exactly, opened
 from stages.io.meshes.glb import Glb
 from stages.io.meshes.ply import Element, read_header
 
@@ -86,13 +86,8 @@ def describe_splats(path: Path) -> dict[str, Any] | None:
     """Format, number, degree of the harmonics, bounds, least and greatest standard deviation and opacity of the Gaussians in a file; None where the file is
     something else, as a mesh may be. In the file's own frame. Raises BadInput."""
     readers: dict[str, Callable[[BinaryIO, int], _Found | None]] = {".ply": _ply, ".spz": _spz, ".sog": _sog, ".glb": _glb}
-    try:
-        with open(open_plain(path), "rb") as file:
-            found = readers[path.suffix.lower()](file, os.fstat(file.fileno()).st_size)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror or error}).") from error
-    except (Damaged, Unreadable, struct.error) as error:
-        raise BadInput(f"{path}: {error}. Write the file again with the program that made it.") from error
+    with opened(path) as (file, size):
+        found = readers[path.suffix.lower()](file, size)
     return None if found is None else found.facts()
 
 
@@ -118,8 +113,8 @@ def _ply(file: BinaryIO, size: int) -> _Found | None:
     if above not in (0, 9, 24, 45, 72):
         raise Damaged(f"{above} columns f_rest_*; expected 0, 9, 24, 45 or 72")
     found = _Found("PLY (3DGS)", count, round((above / 3 + 1) ** 0.5) - 1, notes=[printable(comment, 200) for comment in comments])
-    for some in _pieces(count):
-        part = np.frombuffer(exactly(file, some * rows.itemsize), rows)
+    for raw in _rows(file, count, rows.itemsize):
+        part = np.frombuffer(raw, rows)
         found.places.add(np.stack([part[name] for name in "xyz"], axis=1))
         with np.errstate(over="ignore", invalid="ignore"):
             found.scales.add(np.exp(np.stack([part[f"scale_{k}"] for k in range(3)], axis=1).astype(np.float64)))
@@ -144,21 +139,22 @@ def _spz(file: BinaryIO, size: int) -> _Found:
     if file.read(4) == spz.MAGIC:
         return _spz4(file, size)
     file.seek(0)
-    inflated = _Inflated(file)
-    magic, version, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", inflated.take(16))
+    inflated = gzip.GzipFile(fileobj=file)
+    magic, version, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", next(_rows(inflated, 1, 16)))
     if magic != spz.MAGIC or version not in (1, 2, 3):
         raise Damaged(f"no SPZ of version 1 to 4: its header begins with {magic!r} and version {version}")
     found = _spz_header(version, count, degree, bits, flags, size)
-    for some in _pieces(count):
-        raw = inflated.take(some * (6 if version == 1 else 9))
-        found.places.add(np.frombuffer(raw, "<f2").reshape(some, 3) if version == 1 else spz.places(raw, bits))
-    for some in _pieces(count):
-        found.opacities.add(np.frombuffer(inflated.take(some), np.uint8)[:, None] / 255)
-    inflated.skip(3 * count)
-    for some in _pieces(count):
-        found.scales.add(spz.scales(inflated.take(3 * some)))
-    inflated.skip(count * ((3 if version < 3 else 4) + 3 * ((degree + 1) ** 2 - 1)))
-    inflated.finish(more=bool(flags & 2))
+    for raw in _rows(inflated, count, 6 if version == 1 else 9):
+        found.places.add(np.frombuffer(raw, "<f2").reshape(-1, 3) if version == 1 else spz.places(raw, bits))
+    for raw in _rows(inflated, count, 1):
+        found.opacities.add(np.frombuffer(raw, np.uint8)[:, None] / 255)
+    for _ in _rows(inflated, count, 3):
+        pass  # colours
+    for raw in _rows(inflated, count, 3):
+        found.scales.add(spz.scales(raw))
+    for _ in _rows(inflated, count, (3 if version < 3 else 4) + 3 * ((degree + 1) ** 2 - 1)):
+        pass  # rotations and harmonics
+    _finish(inflated, FEW if flags & 2 else 0)
     return found
 
 
@@ -178,41 +174,16 @@ def _spz4(file: BinaryIO, size: int) -> _Found:
         raise Damaged(f"{size} bytes; expected {table + 16 * streams + sum(stored)} for its streams")
     if unpacked[: len(widths)] != tuple(width * count for width in widths):
         raise Damaged(f"streams of {', '.join(map(str, unpacked[: len(widths)]))} bytes; expected {', '.join(str(width * count) for width in widths)}")
-    frames = [_Frame(exactly(file, some)) for some in stored[:4]]
-    for some in _pieces(count):
-        found.places.add(spz.places(frames[0].take(9 * some), bits))
-        found.opacities.add(np.frombuffer(frames[1].take(some), np.uint8)[:, None] / 255)
-        found.scales.add(spz.scales(frames[3].take(3 * some)))
-    for frame in (frames[0], frames[1], frames[3]):
-        frame.finish()
+    places, opacities, _, scales = (spz.zstd.ZstdFile(io.BytesIO(exactly(file, some))) for some in stored[:4])
+    for raw in _rows(places, count, 9):
+        found.places.add(spz.places(raw, bits))
+    for raw in _rows(opacities, count, 1):
+        found.opacities.add(np.frombuffer(raw, np.uint8)[:, None] / 255)
+    for raw in _rows(scales, count, 3):
+        found.scales.add(spz.scales(raw))
+    for stream in (places, opacities, scales):
+        _finish(stream)
     return found
-
-
-class _Frame:
-    """A frame of zstd, of which no more is unpacked than is asked for."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.stream = data, spz.zstd.ZstdDecompressor()
-
-    def take(self, count: int) -> bytes:
-        """So many bytes. Raises Damaged where they are not there."""
-        found: list[bytes] = []
-        while count and not self.stream.eof:
-            try:
-                found.append(self.stream.decompress(self.data, count))
-            except spz.zstd.ZstdError as error:
-                raise Damaged(f"it does not unpack as zstd ({error})") from error
-            if not found[-1] and not self.data and self.stream.needs_input:
-                break
-            self.data, count = b"", count - len(found[-1])
-        if count:
-            raise Damaged("its Gaussians end before as many have come as its header names")
-        return b"".join(found)
-
-    def finish(self) -> None:
-        """Raises Damaged where it goes on."""
-        if not self.stream.eof and self.stream.decompress(b"", 1):
-            raise Damaged("it goes on after its last Gaussian")
 
 
 def _spz_header(version: int, count: int, degree: int, bits: int, flags: int, size: int) -> _Found:
@@ -221,49 +192,6 @@ def _spz_header(version: int, count: int, degree: int, bits: int, flags: int, si
     if count < 1 or 9 * count > (DENSEST if count <= FEW else USUAL) * size:
         raise Damaged(f"its header names {count} Gaussians, and {size} bytes hold none, or not as many")
     return _Found(f"SPZ {version}", count, degree, notes=["antialiased"] if flags & 1 else [])
-
-
-class _Inflated:
-    """A gzip stream that is read forwards, no more than is asked for."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.file, self.stream, self.left = file, zlib.decompressobj(16 + zlib.MAX_WBITS), b""
-
-    def _part(self, most: int) -> bytes:
-        """Some bytes, at most so many. Raises Damaged where what is stored is no gzip, or its checksum another."""
-        self.left = self.left or self.file.read(AT_ONCE)
-        try:
-            part = self.stream.decompress(self.left, most)
-        except zlib.error as error:
-            raise Damaged(f"no SPZ of version 1 to 4, or a damaged one: it does not unpack as gzip ({error})") from error
-        if not part and not self.left and not self.stream.eof:
-            raise Damaged("it is cut short")
-        self.left = self.stream.unconsumed_tail
-        return part
-
-    def take(self, count: int) -> bytes:
-        """So many bytes."""
-        found: list[bytes] = []
-        while count:
-            if self.stream.eof:
-                raise Damaged("its Gaussians end before as many have come as its header names")
-            found.append(self._part(count))
-            count -= len(found[-1])
-        return b"".join(found)
-
-    def skip(self, count: int) -> None:
-        while count:
-            some = min(count, 16 * AT_ONCE)
-            self.take(some)
-            count -= some
-
-    def finish(self, more: bool) -> None:
-        """To the end, where gzip's checksum is; only if `more` may something come before it, and not much."""
-        left = FEW if more else 0
-        while not self.stream.eof:
-            left -= len(self._part(AT_ONCE))
-            if left < 0:
-                raise Damaged("it goes on after its last Gaussian")
 
 
 # SOG
@@ -358,6 +286,27 @@ def _glb_primitives(glb: Glb) -> _Found | None:
     return found
 
 
-def _pieces(count: int) -> Iterator[int]:
+# what files have in common
+
+
+def _rows(file: Any, count: int, width: int) -> Iterator[bytes]:
+    """So many rows of so many bytes, in pieces. Raises Damaged where they are not there, or do not unpack."""
     for done in range(0, count, AT_ONCE):
-        yield min(AT_ONCE, count - done)
+        wanted = width * min(AT_ONCE, count - done)
+        raw = _unpacked(file, wanted)
+        if len(raw) != wanted:
+            raise Damaged("its Gaussians end before as many have come as its header names")
+        yield raw
+
+
+def _finish(file: Any, most: int = 0) -> None:
+    """To the end, where gzip's checksum is. Raises Damaged where more than `most` bytes come before it."""
+    if len(_unpacked(file, most + 1)) > most:
+        raise Damaged("it goes on after its last Gaussian")
+
+
+def _unpacked(file: Any, most: int) -> bytes:
+    try:
+        return bytes(file.read(most))
+    except (zlib.error, gzip.BadGzipFile, spz.zstd.ZstdError, EOFError) as error:
+        raise Damaged(f"it does not unpack as gzip or zstd, or is cut short ({error})") from error

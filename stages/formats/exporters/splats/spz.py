@@ -33,7 +33,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-MAGIC, VERSIONS = b"NGSP", (3, 4)
+MAGIC = b"NGSP"
 LARGEST = 2**23 - 1  # of a place, in its steps
 BITS = 12  # fractional bits of places that other writers have; here there are at least as many where they fit
 STEPS = 4  # of places, in the thickness of the thinnest Gaussians but a twentieth
