@@ -85,13 +85,25 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
     rotation = gltf_from_capture(frame.up)
     buffer = Buffer()
     primitive = {**_geometry(mesh, rotation, buffer), "material": 0, "mode": 4}
-    write_document(_document(buffer, primitive, picture_of(mesh, picture), picture, frame, open_faces(mesh.faces)), buffer, path)
+    more = _materials(buffer, picture_of(mesh, picture), picture, open_faces(mesh.faces))
+    write_document("surface", primitive, "KHR_materials_unlit", frame, buffer, path, more)
 
 
-def write_document(document: dict[str, Any], buffer: Buffer, path: Path) -> None:
-    """Write a document with its one buffer, whose lists it is given here."""
-    listed = document | {"accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": buffer.size}]}
-    described = json.dumps(listed, separators=(",", ":"), allow_nan=False).encode()
+def write_document(
+    name: str, primitive: dict[str, Any], extension: str, frame: SourceFrame, buffer: Buffer, path: Path, more: dict[str, Any] | None = None
+) -> None:
+    """Write one node with one primitive, whose data are in the buffer. `more`: of the document, as materials."""
+    document = {
+        "asset": {"version": "2.0", "generator": "efficientnerf"},
+        "extensionsUsed": [extension],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": name, "mesh": 0, "extras": source_extras(frame)}],
+        "meshes": [{"name": name, "primitives": [primitive]}],
+        **(more or {}),
+        "accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": buffer.size}],
+    }  # fmt: skip
+    described = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     described += b" " * (-len(described) % 4)
     header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(described) + 8 + buffer.size)
     write_parts(path, [header, struct.pack("<I4s", len(described), b"JSON"), described, struct.pack("<I4s", buffer.size, b"BIN\0"), *buffer.parts])
@@ -118,22 +130,14 @@ def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: Buffer) -> dict[str, Any
     return {"attributes": attributes, "indices": buffer.accessor(np.asarray(faces, "<u4").reshape(-1), _INDICES)}
 
 
-def _document(
-    buffer: Buffer, primitive: dict[str, Any], colours: bytes | None, picture: Picture, frame: SourceFrame, both_sides: bool
-) -> dict[str, Any]:
-    """The JSON part; the texture goes into the buffer."""
+def _materials(buffer: Buffer, colours: bytes | None, picture: Picture, both_sides: bool) -> dict[str, Any]:
+    """The material and its texture, which goes into the buffer."""
     material: dict[str, Any] = {"name": "captured light", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}}
     images = [] if colours is None else [{"bufferView": buffer.view(colours), "mimeType": MIME[picture], "name": "colours"}]
     if images:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     material["extensions"] = {"KHR_materials_unlit": {}}
     return {
-        "asset": {"version": "2.0", "generator": "efficientnerf"},
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "surface", "mesh": 0, "extras": source_extras(frame)}],
-        "meshes": [{"name": "surface", "primitives": [primitive]}],
         "materials": [material | ({"doubleSided": True} if both_sides else {})],
         **({"textures": [{"source": 0, "sampler": 0}], "images": images,
             "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}]} if images else {}),

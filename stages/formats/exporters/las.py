@@ -28,7 +28,8 @@ def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS
     header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")
     header.creation_date = None  # today's would make other bytes of the same points
     header.system_identifier, header.generating_software = "efficientnerf", "efficientnerf"
-    header.scales = np.full(3, step_of(float((high - low).max()), float(np.abs([low, high]).max())))
+    finest = max(float((high - low).max()) * FINENESS, float(np.abs([low, high]).max()) * 1e-15, 1e-30)
+    header.scales = np.full(3, 10.0 ** math.floor(math.log10(finest)))
     header.offsets = np.floor((low + high) / 2 / header.scales[0]) * header.scales[0]
     if frame.metric:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(METRES))
@@ -44,9 +45,3 @@ def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS
     memory = io.BytesIO()
     record.write(memory, do_compress=path.suffix.lower() == ".laz", laz_backend=laspy.LazBackend.Lazrs)
     write_parts(path, [memory.getbuffer()])
-
-
-def step_of(reach: float, largest: float) -> float:
-    """The step of the coordinates of points that reach so far, of which the largest coordinate is this: a power of ten."""
-    finest = max(reach * FINENESS, largest * 1e-15, 1e-30)
-    return 10.0 ** math.floor(math.log10(finest))

@@ -14,7 +14,7 @@ import numpy as np
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.rendering.harmonics import C0
 from efficientnerf.splats.gaussians import Gaussians
-from stages.formats.exporters.glb import VERTICES, Buffer, source_extras, write_document
+from stages.formats.exporters.glb import VERTICES, Buffer, write_document
 from stages.formats.exporters.splats.frames import check_gaussians, with_y_up
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame
 
@@ -34,15 +34,7 @@ def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_
             EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective", "sortingMethod": "cameraDistance"}
         },
     }
-    document = {
-        "asset": {"version": "2.0", "generator": "efficientnerf"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "splats", "mesh": 0, "extras": source_extras(frame)}],
-        "meshes": [{"name": "splats", "primitives": [primitive]}],
-    }
-    write_document(document, buffer, path)
+    write_document("splats", primitive, EXTENSION, frame, buffer, path)
 
 
 def _attributes(gaussians: Gaussians, buffer: Buffer) -> dict[str, Any]:
