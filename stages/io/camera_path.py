@@ -54,7 +54,8 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
         where = f"{path}: camera_path[{k}]"
         if not isinstance(entry, dict):
             raise BadInput(f"{where}: expected an object, found {shown(entry)}.")
-        pose = world_from_capture.pose(_pose(entry.get("camera_to_world"), f"{where}.camera_to_world"))
+        matrix = np.reshape(numbers(entry.get("camera_to_world"), 16, f"{where}.camera_to_world", "Export the path again."), (4, 4))
+        pose = world_from_capture.pose(pose_from_opengl(rigid(matrix, f"{where}.camera_to_world")))
         vertical = _number(entry.get("fov", document.get("default_fov")), f"{where}.fov", "degrees between 0 and 180", MIN_ANGLE, 180.0 - MIN_ANGLE)
         focal = 0.5 * size[1] / math.tan(math.radians(vertical / 2))
         cameras.append(Camera(f"frame_{k:04d}", size[0], size[1], "SIMPLE_PINHOLE", (focal, size[0] / 2, size[1] / 2), pose))
@@ -76,12 +77,6 @@ def _size(document: dict[str, Any], path: Path, width: int | None, height: int |
     if height is not None:
         return max(1, round(height * found[0] / found[1])), height
     return found[0], found[1]
-
-
-def _pose(value: Any, where: str) -> np.ndarray:
-    """camera_to_world with the project's axes, its rotation made exactly orthonormal."""
-    matrix = numbers(value, 16, where, "Export the path again.")
-    return pose_from_opengl(rigid(np.reshape(matrix, (4, 4)), where))
 
 
 def _number(value: Any, where: str, expected: str, low: float, high: float) -> float:

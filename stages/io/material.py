@@ -94,7 +94,10 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
             f"{job.source}: frames that differ: {len(chosen.paths)}; at least {MIN_IMAGES} are needed, and 50 or more from all sides are better."
             " Walk round the subject while filming."
         )
-    _write_record(job, chosen.record, chosen.paths)
+    outputs = PosesOutputs(job.out)
+    write_json(outputs.frames, {"videos": chosen.record})
+    write_frames_plot(chosen.record, outputs.frames_plot)
+    write_frames_sheet(chosen.record, chosen.paths, outputs.frames_sheet)
     return Material(found.paths | chosen.paths, found.masks)
 
 
@@ -121,10 +124,3 @@ def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material
     views = views_of(panoramas, max_side=max_side, work=job.work / "panoramas", safe_point=job.safe_point, progress=job.progress, warn=warn)
     left = {name: path for name, path in found.paths.items() if name not in panoramas}
     return Material(left | views, {name: mask for name, mask in found.masks.items() if name not in panoramas})
-
-
-def _write_record(job: Job, record: list[dict[str, object]], paths: Mapping[str, Path]) -> None:
-    outputs = PosesOutputs(job.out)
-    write_json(outputs.frames, {"videos": record})
-    write_frames_plot(record, outputs.frames_plot)
-    write_frames_sheet(record, paths, outputs.frames_sheet)

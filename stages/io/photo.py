@@ -74,7 +74,8 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
     if alpha is not None and (alpha < 128).any():
         opaque = resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
     size = width, height, rgb.shape[1], rgb.shape[0]
-    return DecodedPhoto(*size, orientation, focal_from_exif(details, *taken), maker, names_fisheye(details), rgb, opaque)
+    fisheye = any(word in str(details.get(Base.LensModel, "")).lower() for word in _FISHEYE)
+    return DecodedPhoto(*size, orientation, focal_from_exif(details, *taken), maker, fisheye, rgb, opaque)
 
 
 def read_mask_file(path: Path, photo: PhotoDetails) -> np.ndarray:
@@ -126,11 +127,6 @@ def focal_from_exif(details: Any, width: int, height: int) -> float | None:
         pixels = focal * density / unit * width / taken
         return pixels if 0.2 < pixels / max(width, height) < 20 else None  # many writers state a wrong density
     return None
-
-
-def names_fisheye(details: Any) -> bool:
-    """Whether the name of the lens in EXIF data says that it is a fisheye."""
-    return any(word in str(details.get(Base.LensModel, "")).lower() for word in _FISHEYE)
 
 
 def read_gps_position(path: Path) -> tuple[float, float, float] | None:

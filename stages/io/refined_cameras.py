@@ -60,11 +60,10 @@ def load_scene(poses: Path, train: Path) -> Scene:
 
 def as_trained(s: Scene, cameras: Mapping[str, Camera], left_out: Collection[str]) -> Scene:
     """The scene with other cameras for some views, by their images, and without those in training that were left out."""
-    views = [_with_camera(s, view, cameras[view.image]) if view.image in cameras else view for view in s.views]
-    return replace(s, views=tuple(replace(view, split=LEFT_OUT) if view.image in left_out else view for view in views))
-
-
-def _with_camera(s: Scene, view: View, camera: Camera) -> View:
-    """The view with another camera, and its source camera with that one's pose."""
-    pose = s.world_from_capture.inverse().pose(camera.world_from_camera)
-    return replace(view, camera=replace(camera, name=view.camera.name), source_camera=replace(view.source_camera, world_from_camera=pose))
+    views = []
+    for view in s.views:
+        if (camera := cameras.get(view.image)) is not None:
+            pose = s.world_from_capture.inverse().pose(camera.world_from_camera)
+            view = replace(view, camera=replace(camera, name=view.camera.name), source_camera=replace(view.source_camera, world_from_camera=pose))
+        views.append(replace(view, split=LEFT_OUT) if view.image in left_out else view)
+    return replace(s, views=tuple(views))

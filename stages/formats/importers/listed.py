@@ -58,6 +58,7 @@ class ListFormat:
     signs: Callable[[Source], Sequence[Path]]  # files that a folder of this format has
     listed: Callable[[Source, Sequence[Path]], Listed]  # what the source states; BadInput where it cannot be read
     recognised: Callable[[Source, Sequence[Path]], bool] = lambda source, signs: True  # whether they are of this format, where their being there does not tell
+    single: bool = False  # whether there may be one such file alone
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         source = Source(folder, allow_outside)
@@ -111,6 +112,9 @@ class ListFormat:
         signs = self.signs(source)
         if not signs:
             raise BadInput(f"{source.root}: nothing of {self.kind}: expected {self.expected}. Name the folder that holds it, or choose a format with --as.")
+        if self.single and len(signs) > 1:
+            names = abbreviated([source.name_of(path) for path in signs])
+            raise BadInput(f"{source.root}: {len(signs)} files with cameras of {self.kind} ({names}); one is read. Take the others out.")
         return source, self.listed(source, signs)
 
 

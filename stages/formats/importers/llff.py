@@ -87,15 +87,15 @@ def _camera(row: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Cam
     return camera
 
 
-def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
-    """(N, 17) float64, finite, N at most `max_frames`; nothing but plain numbers is read from the file. Raises BadInput."""
+def read_rows(path: Path) -> np.ndarray:
+    """(N, 17) float64, finite, N at most `MAX_FRAMES`; nothing but plain numbers is read from the file. Raises BadInput."""
     try:
         with path.open("rb") as file:
-            data = file.read(17 * 8 * max_frames + 4097)
+            data = file.read(17 * 8 * MAX_FRAMES + 4097)
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error
-    if len(data) > 17 * 8 * max_frames + 4096:
-        raise BadInput(f"{path}: {path.stat().st_size} bytes; more than {max_frames} poses are not read.")
+    if len(data) > 17 * 8 * MAX_FRAMES + 4096:
+        raise BadInput(f"{path}: {path.stat().st_size} bytes; more than {MAX_FRAMES} poses are not read.")
     return rows_of_npy(data, str(path), 17, "3x5 poses, near and far", "Write it again with LLFF's imgs2poses.")
 
 

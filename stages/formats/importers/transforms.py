@@ -114,15 +114,15 @@ def _fact(value: Any, depth: int = 2) -> Any:
     return value if value is None or isinstance(value, bool) or finite(value, 2.0**53) is not None else shown(value)
 
 
-def read_document(file: Path, max_frames: int = MAX_FRAMES) -> dict[str, Any]:
-    """The document of a transforms.json that lists 1 to `max_frames` frames. Raises BadInput."""
+def read_document(file: Path) -> dict[str, Any]:
+    """The document of a transforms.json that lists 1 to `MAX_FRAMES` frames. Raises BadInput."""
     document = read_json(file, "Write the data set again, or repair that place.")
     if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
         raise BadInput(f"{file}: no data set: expected an object with a list `frames`. Name the folder of a data set, or choose a format with --as.")
     if not document["frames"]:
         raise BadInput(f"{file}: its list of frames is empty. At least {MIN_IMAGES} are needed.")
-    if len(document["frames"]) > max_frames:
-        raise BadInput(f"{file}: {len(document['frames'])} frames; at most {max_frames} are read.")
+    if len(document["frames"]) > MAX_FRAMES:
+        raise BadInput(f"{file}: {len(document['frames'])} frames; at most {MAX_FRAMES} are read.")
     return document
 
 

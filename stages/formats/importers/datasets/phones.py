@@ -61,12 +61,12 @@ def _polycam(source: Source, signs: Sequence[Path]) -> Listed:
     listed = [Frame(path.stem, place, source.name_of(path), stated(_polycam_camera(source, path)), bare=True) for path in signs]
     rejected = [(source.name_of(path), "without a camera file") for path in images_in(place) if path.stem not in posed]
     warnings = [raw] if cameras == "cameras" else []
-    return Listed(where, listed, signs, rejected, warnings, Y_UP, metric=True, facts={"cameras": cameras}, depth=partial(_polycam_depth, source))
 
+    def depth(frame: Frame, image: Path) -> DepthFile | None:
+        name, maps = f"{image.stem}.png", source.root / KEYFRAMES
+        return depth_file(source, maps / "depth" / name, MILLIMETRE, maps / "confidence" / name, POLYCAM_HIGH, SENSOR_RANGE)
 
-def _polycam_depth(source: Source, frame: Frame, image: Path) -> DepthFile | None:
-    place = source.root / KEYFRAMES
-    return depth_file(source, place / f"depth/{image.stem}.png", MILLIMETRE, place / f"confidence/{image.stem}.png", POLYCAM_HIGH, SENSOR_RANGE)
+    return Listed(where, listed, signs, rejected, warnings, Y_UP, metric=True, facts={"cameras": cameras}, depth=depth)
 
 
 def _polycam_camera(source: Source, path: Path) -> Camera:
@@ -82,10 +82,6 @@ def _polycam_camera(source: Source, path: Path) -> Camera:
 # Record3D
 METADATA, IMAGES = "metadata.json", "rgb"
 RECORD3D_AGAIN = "Export from Record3D again, as EXR + JPG."
-
-
-def _record3d_depth(source: Source, place: Path, frame: Frame, image: Path) -> DepthFile | None:
-    return depth_file(source, place / f"depth/{image.stem}.exr", 1.0, farthest=SENSOR_RANGE)
 
 
 def _record3d_signs(source: Source) -> Sequence[Path]:
@@ -122,7 +118,11 @@ def _record3d(source: Source, signs: Sequence[Path]) -> Listed:
         fx, fy, cx, cy = common or numbers(coefficients[index], 4, f"{what}: perFrameIntrinsicCoeffs", RECORD3D_AGAIN)
         camera = brown_camera("", size, (fx, fy), (cx, cy), _record3d_pose(numbers(poses[index], 7, f"{what}: pose", RECORD3D_AGAIN), what), what)
         listed.append(Frame(image.name, image.parent, what, stated(camera)))
-    return Listed(where, listed, signs, unposed, up=Y_UP, metric=True, depth=partial(_record3d_depth, source, place))
+
+    def depth(frame: Frame, image: Path) -> DepthFile | None:
+        return depth_file(source, place / f"depth/{image.stem}.exr", 1.0, farthest=SENSOR_RANGE)
+
+    return Listed(where, listed, signs, unposed, up=Y_UP, metric=True, depth=depth)
 
 
 def _record3d_pose(values: list[float], where: str) -> np.ndarray:
@@ -170,12 +170,12 @@ def _scanner(source: Source, signs: Sequence[Path]) -> Listed:
             rejected.append((source.name_of(path), "without a pose"))
     poses = sum(1 for path in place.glob("frame_*.json") if _FRAME.fullmatch(path.stem))
     facts: dict[str, object] = {"poses_without_picture": poses - len(listed)}
-    return Listed(where, listed, signs, rejected, up=Y_UP, metric=True, facts=facts, depth=partial(_scanner_depth, source, place))
 
+    def depth(frame: Frame, image: Path) -> DepthFile | None:
+        digits = image.stem.removeprefix("frame_")
+        return depth_file(source, place / f"depth_{digits}.png", MILLIMETRE, place / f"conf_{digits}.png", SCANNER_HIGH, SENSOR_RANGE)
 
-def _scanner_depth(source: Source, place: Path, frame: Frame, image: Path) -> DepthFile | None:
-    digits = image.stem.removeprefix("frame_")
-    return depth_file(source, place / f"depth_{digits}.png", MILLIMETRE, place / f"conf_{digits}.png", SCANNER_HIGH, SENSOR_RANGE)
+    return Listed(where, listed, signs, rejected, up=Y_UP, metric=True, facts=facts, depth=depth)
 
 
 def _scanner_place(source: Source) -> Path:

@@ -333,8 +333,6 @@ def _tanks_files(source: Source) -> Sequence[Path]:
 
 
 def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
-    if len(signs) > 1:
-        raise BadInput(f"{source.root}: {len(signs)} trajectories; one is read. Take the others out.")
     names = ("intrinsics.txt", "intrinsic.txt", "intrinsic.json", "intrinsics.json", "camera_intrinsic.json")
     lens = next((source.root / name for name in names if (source.root / name).is_file()), None)
     if lens is None:
@@ -364,4 +362,4 @@ KAPTURE = ListFormat("kapture", f"{SENSORS} and {RECORDS}", _kapture_files, _kap
 MVSNET = ListFormat("mvsnet", "cams/00000000_cam.txt and so on", _mvsnet_files, _mvsnet)
 IDR = ListFormat("idr", "cameras_sphere.npz or cameras.npz", _idr_files, _idr)
 NSVF = ListFormat("nsvf", "intrinsics.txt and pose/<name>.txt", _nsvf_files, _nsvf)
-TANKS = ListFormat("tanks-and-temples", "one trajectory (.log) next to the folder of images", _tanks_files, _tanks)
+TANKS = ListFormat("tanks-and-temples", "one trajectory (.log) next to the folder of images", _tanks_files, _tanks, single=True)

@@ -43,8 +43,6 @@ def _camera_files(source: Source) -> list[Path]:
 
 
 def _listed(source: Source, found: Sequence[Path]) -> Listed:
-    if len(found) > 1:
-        raise BadInput(f"{source.root}: {len(found)} files with cameras of Metashape; one is expected. Take the others out.")
     where = source.name_of(found[0])
     root = read_xml(source.real(found[0]))
     chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
@@ -150,4 +148,4 @@ def _world(transform: Element | None, where: str) -> tuple[Similarity, bool, np.
     return Similarity(scale, turn, np.zeros(3)), metric, up, warning
 
 
-FORMAT = ListFormat("metashape", "an XML file with the cameras of Metashape next to the photographs", _camera_files, _listed)
+FORMAT = ListFormat("metashape", "an XML file with the cameras of Metashape next to the photographs", _camera_files, _listed, single=True)

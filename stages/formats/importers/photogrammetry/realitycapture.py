@@ -44,9 +44,6 @@ def _signs(source: Source) -> Sequence[Path]:
 
 def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     tables, sidecars = _tables(source), _sidecars(source)
-    if len(tables) > 1:
-        names = ", ".join(source.name_of(path) for path in tables)
-        raise BadInput(f"{source.root}: several tables of cameras ({names}); one is expected. Take the others out.")
     if not tables:
         return _from_sidecars(source, sidecars)
     warnings = [f"{source.name_of(tables[0])} is read; the XMP files next to the photographs are not."] if sidecars else []
@@ -197,4 +194,4 @@ def _sidecar(stated: Callable[[str], str | None], where: str) -> Callable[[str, 
     return _lens(value("FocalLength35mm", "0"), (value("PrincipalPointU", "0"), value("PrincipalPointV", "0")), radial, tangential, pose, where)
 
 
-FORMAT = ListFormat("realitycapture", f"a CSV file with the columns {', '.join(REQUIRED)}, or XMP files next to the photographs", _signs, _listed)
+FORMAT = ListFormat("realitycapture", f"a CSV file with the columns {', '.join(REQUIRED)}, or XMP files next to the photographs", _signs, _listed, single=True)
