@@ -71,9 +71,6 @@ def test_photographs_in_other_folders_are_named(tmp_path: Path) -> None:
     assert read(write(tmp_path / "alone", "1.png", "2.png", "3.png", "masks/1.png"))[1] == ""
 
 
-# --- masks
-
-
 # --- one picture in two formats
 
 

@@ -38,7 +38,6 @@ HOSTILE: dict[str, str] = {  # as JSON texts
 PLACES = {
     "nerfstudio": ["w", "h", "fl_x", "fl_y", "cx", "k1", "camera_model", "ply_file_path", "applied_transform", "train_filenames", "orientation_override"],
     "instant-ngp": ["aabb_scale", "scale", "offset", "camera_angle_x", "is_fisheye"],
-    "blender": ["camera_angle_x"],
 }
 IN_FRAMES = ["file_path", "transform_matrix", "mask_path", "fl_x", "k4", "transform_matrix_start"]
 

@@ -18,7 +18,7 @@ from pipeline.stage import Job
 from stages.formats import importers
 from stages.formats.importers.description import describe_source
 from stages.formats.importers.source import Source
-from stages.io import pictures, scene
+from stages.io import scene
 from stages.poses import run as poses
 from stages.poses.settings import PosesSettings
 from tests.stages import captures
@@ -166,13 +166,3 @@ def test_a_run_below_its_source_is_no_part_of_it(tmp_path: Path) -> None:
     described = describe_source(source)
     assert described["count"] == 3
     assert "shots/run: a run inside the source folder; what was made there is not read." in described["warnings"]
-
-
-def test_pictures_are_read_where_the_gate_leads(tmp_path: Path) -> None:
-    """Headers, masks and pixels are asked for by paths without links."""
-    source = captures.colmap_bin(tmp_path / "source")
-    (source / "images").rename(source / "stored")
-    (source / "images").symlink_to("stored")
-    capture = importers.IMPORTERS["colmap"].read(source, Settings())
-    assert {photo.image.parent for photo in capture.photos} == {source / "stored"}
-    assert all(pictures.read_header(photo.image).size == (32, 24) for photo in capture.photos)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import rotated_clockwise
 from stages.formats import importers
 from stages.formats.importers.description import describe_source
 from tests.stages import captures
@@ -131,24 +130,6 @@ def test_images_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
     capture = read(folder)
     assert_same_rays(capture, captures.cameras())
     assert any("not of the stated size" in warning for warning in capture.warnings)
-
-
-@pytest.mark.parametrize("orientation", [6, 8])
-def test_cameras_stated_for_the_pixels_as_stored_turn_with_them(tmp_path: Path, orientation: int) -> None:
-    from PIL import Image
-
-    folder = captures.nerfstudio(tmp_path / "a")
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    for index in range(6):
-        captures.write_picture(folder / f"images/img_{index}.png", captures.picture(index), exif=exif)
-    capture = read(folder)
-    assert any("the cameras were rotated too" in warning for warning in capture.warnings)
-    turns = {6: 1, 8: 3}[orientation]
-    truth = captures.cameras()
-    for _ in range(turns):
-        truth = [rotated_clockwise(camera) for camera in truth]
-    assert_same_rays(capture, truth)
 
 
 def shared(name: str) -> Path:

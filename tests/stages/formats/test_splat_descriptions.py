@@ -20,7 +20,7 @@ from stages.formats.exporters.splats.description import describe_splats
 from stages.formats.exporters.splats.frames import with_y_down, with_y_up
 from stages.formats.exporters.splats.spz import zstd
 from tests.stages.formats.gaussians import scattered
-from tests.stages.io.meshes import Y_DOWN, Z_UP, block
+from tests.stages.io.meshes import Y_DOWN, Z_UP, block, glb_bytes, glb_parts
 
 COUNT = 41
 
@@ -155,13 +155,9 @@ def test_what_is_cut_short_is_named(extension: str, tmp_path: Path) -> None:
 
 def glb_with(change: Callable[[dict[str, Any]], None]) -> Callable[[bytes], bytes]:
     def damaged(whole: bytes) -> bytes:
-        size = struct.unpack_from("<I", whole, 12)[0]
-        document = json.loads(whole[20 : 20 + size])
+        document, data = glb_parts(whole)
         change(document)
-        text = json.dumps(document).encode()
-        text += b" " * (-len(text) % 4)
-        rest = whole[20 + size :]
-        return struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON") + text + rest
+        return glb_bytes(document, data)
 
     return damaged
 

@@ -30,7 +30,11 @@ def block() -> Mesh:
 
 
 def glb_document(path: Path) -> tuple[dict, bytes]:
-    data = path.read_bytes()
+    """The document and the binary part of a file."""
+    return glb_parts(path.read_bytes())
+
+
+def glb_parts(data: bytes) -> tuple[dict, bytes]:
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
     size, kind = struct.unpack_from("<I4s", data, 12)
@@ -41,6 +45,15 @@ def glb_document(path: Path) -> tuple[dict, bytes]:
     assert kind == b"BIN\0"
     assert binary == document["buffers"][0]["byteLength"] == len(data) - 28 - size
     return document, data[28 + size :]
+
+
+def glb_bytes(document: object, data: bytes = b"") -> bytes:
+    """A GLB of a document and its binary part, which may be none."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    data += bytes(-len(data) % 4)
+    parts = struct.pack("<I4s", len(text), b"JSON") + text + (struct.pack("<I4s", len(data), b"BIN\0") + data if data else b"")
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
 
 def accessor(document: dict, blob: bytes, index: int) -> np.ndarray:

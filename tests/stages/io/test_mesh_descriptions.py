@@ -1,7 +1,6 @@
 """What `inspect` says of mesh files: as another library reads them, in memory that the file's size bounds, whatever a file says of itself."""
 
 import copy
-import json
 import struct
 import time
 import tracemalloc
@@ -18,18 +17,10 @@ from efficientnerf.surface.mesh import PointCloud
 from pipeline.errors import BadInput
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from stages.io.meshes.description import MESHES, describe_mesh
-from tests.stages.io.meshes import Y_DOWN, block
+from tests.stages.io.meshes import Y_DOWN, block, glb_bytes
 from workflows.cli.main import main
 
 TIMES, ROOM = 16, 4_000_000  # of the file's bytes, and more, that describing a file may take
-
-
-def glb(document: dict[str, Any], data: bytes = b"") -> bytes:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    data += bytes(-len(data) % 4)
-    parts = struct.pack("<I", len(text)) + b"JSON" + text + (struct.pack("<I", len(data)) + b"BIN\0" + data if data else b"")
-    return b"glTF" + struct.pack("<II", 2, 12 + len(parts)) + parts
 
 
 def box_glb(**nodes: Any) -> tuple[dict[str, Any], bytes]:
@@ -71,16 +62,16 @@ def test_nodes_place_meshes_and_instances_are_counted(tmp_path: Path) -> None:
     turned = {"translation": [0, 0, 10], "rotation": [half, 0, 0, half], "scale": [2, 1, 1]}  # x doubled, then z for y
     moved = {"matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1], "children": [3]}
     document["nodes"] = [{"children": [1, 2]}, {"mesh": 0, **turned}, moved, {"mesh": 0}, {"mesh": 0}]
-    found = described(tmp_path / "a.glb", glb(document, data))
+    found = described(tmp_path / "a.glb", glb_bytes(document, data))
     assert (found["vertices"], found["faces"], found["instances"], found["watertight"]) == (8, 12, 2, True)
     np.testing.assert_allclose(found["bounds"], [[-1, -1.5, -1.5], [5.5, 1.5, 11]], atol=1e-6)
     one = copy.deepcopy(document)
     one["nodes"] = [{"mesh": 0, **turned}]
-    found = described(tmp_path / "a.glb", glb(one, data))
+    found = described(tmp_path / "a.glb", glb_bytes(one, data))
     assert "instances" not in found
     np.testing.assert_allclose(found["bounds"], [[-1, -1.5, 9], [1, 1.5, 11]], atol=1e-6)
     path = tmp_path / "b.glb"
-    path.write_bytes(glb(document, data))
+    path.write_bytes(glb_bytes(document, data))
     np.testing.assert_allclose(trimesh.load(path, process=False).bounds, [[-1, -1.5, -1.5], [5.5, 1.5, 11]], atol=1e-6)
 
 
@@ -89,7 +80,7 @@ def hostile_glbs() -> dict[str, Callable[[], bytes]]:
         def made() -> bytes:
             document, data = box_glb()
             change(document)
-            return glb(document, data + bytes(more))
+            return glb_bytes(document, data + bytes(more))
 
         return made
 
@@ -123,7 +114,7 @@ def hostile_glbs() -> dict[str, Callable[[], bytes]]:
         "one view by many accessors": changed(_by_many_accessors, 2**17),
         "one accessor by many primitives": changed(_by_many_primitives, 2**17),
         "one accessor by many meshes": changed(_by_many_meshes, 2**17),
-        "no document": lambda: glb([], b""),  # type: ignore[arg-type]
+        "no document": lambda: glb_bytes([]),
     }  # fmt: skip
 
 
@@ -178,14 +169,14 @@ def large(name: str) -> bytes:
         document, data = box_glb()
         document["nodes"] = [{"mesh": 0, "translation": [k, 0, 0]} for k in range(2000)]
         document["scenes"] = [{"nodes": [*range(2000)]}]
-        return glb(document, data)
+        return glb_bytes(document, data)
     if name == "strip of bytes":
         document, data = box_glb()
         count = 4_000_000
         document["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": count})
         document["accessors"][1] = {"bufferView": 2, "componentType": 5121, "count": count, "type": "SCALAR"}
         document["meshes"][0]["primitives"][0]["mode"] = 5
-        return glb(document, data + bytes(count))
+        return glb_bytes(document, data + bytes(count))
     ply = PLY.format(little, 3, "{}").format
     return {
         "blocks.obj": lambda: b"".join(BLOCK.replace(b"%", b"%d" % k) for k in range(5000)),

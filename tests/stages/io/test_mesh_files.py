@@ -1,6 +1,5 @@
 """The mesh of a run, read again from its files: what was written, or a word about what is wrong."""
 
-import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +15,7 @@ from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import MOST_TEXELS
 from stages.io.png import write_png
 from stages.mesh.files import read_mesh
-from tests.stages.io.meshes import Y_DOWN, block
+from tests.stages.io.meshes import Y_DOWN, block, glb_bytes, glb_document
 
 
 def textured() -> Mesh:
@@ -48,14 +47,9 @@ def test_what_is_read_is_what_was_written(mesh: Mesh, tmp_path: Path) -> None:
 
 def rewritten(path: Path, change: Callable[[dict], None]) -> None:
     """The JSON part of a GLB, changed."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + size])
+    document, data = glb_document(path)
     change(document)
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    whole = 20 + len(text) + len(data) - 20 - size
-    path.write_bytes(data[:8] + struct.pack("<I", whole) + struct.pack("<I", len(text)) + data[16:20] + text + data[20 + size :])
+    path.write_bytes(glb_bytes(document, data))
 
 
 SPOILT: dict[str, Callable[[MeshOutputs], object]] = {
