@@ -29,8 +29,8 @@ Progress = Callable[..., None]
 
 
 @dataclass(frozen=True)
-class Looked:
-    """The result of the first reading of a video: number, time, sharpness and motion of each frame looked at."""
+class FirstReading:
+    """What the first reading of a video finds: number, time, sharpness and motion of each frame that is examined."""
 
     # width, height: upright, pixels
     width: int
@@ -69,7 +69,7 @@ def frames_of(videos: Mapping[str, Path], *, count: int, max_side: int, reader: 
 
     count     frames of all together, at most
     """
-    looked = {name: _looked(name, path, place, reader) for place, (name, path) in enumerate(videos.items())}
+    looked = {name: _first_reading_of(name, path, place, reader) for place, (name, path) in enumerate(videos.items())}
     limits = choice.shares([found.motion[-1] for found in looked.values()], count)
     paths: dict[str, Path] = {}
     record: list[dict[str, object]] = []
@@ -82,14 +82,14 @@ def frames_of(videos: Mapping[str, Path], *, count: int, max_side: int, reader: 
     return Chosen(paths, record)
 
 
-def _looked(name: str, path: Path, place: int, reader: Reader) -> Looked:
+def _first_reading_of(name: str, path: Path, place: int, reader: Reader) -> FirstReading:
     """The first reading, or what an earlier call found."""
     file = reader.work / f"video_{place}.json"
-    found = noted(file, Looked, once(reader.warn), _check)
+    found = noted(file, FirstReading, once(reader.warn), _check)
     if found is None:
         reader.work.mkdir(parents=True, exist_ok=True)
         with _naming(name):
-            found = look(path, reader)
+            found = first_reading(path, reader)
         note(file, asdict(found))
     if found.damaged:
         reader.warn(f"{name}: damaged: {found.damaged} frames or packets are skipped.")
@@ -98,7 +98,7 @@ def _looked(name: str, path: Path, place: int, reader: Reader) -> Looked:
     return found
 
 
-def _check(found: Looked, outputs: object) -> None:
+def _check(found: FirstReading, outputs: object) -> None:
     if not len(found.index) == len(found.time) == len(found.sharpness) == len(found.motion) >= 1:
         raise ValueError("lists of different lengths")
 
@@ -112,13 +112,13 @@ def _naming(name: str) -> Iterator[None]:
         raise UnreadableVideo(f"{name}: {error}") from error
 
 
-def look(path: Path, reader: Reader) -> Looked:
+def first_reading(path: Path, reader: Reader) -> FirstReading:
     """Sharpness and motion of the frames of a video. Raises UnreadableVideo."""
-    found = _look(path, reader, reader.threads)
-    return _look(path, reader, 1) if found.damaged and reader.threads > 1 else found
+    found = _read_once(path, reader, reader.threads)
+    return _read_once(path, reader, 1) if found.damaged and reader.threads > 1 else found
 
 
-def _look(path: Path, reader: Reader, threads: int) -> Looked:
+def _read_once(path: Path, reader: Reader, threads: int) -> FirstReading:
     motion = Motion()
     rows: list[tuple[int, float, float, float]] = []
     with opened(path, threads) as video:
@@ -135,10 +135,10 @@ def _look(path: Path, reader: Reader, threads: int) -> Looked:
         about = (video.width, video.height, round(video.duration, 3), video.maker, video.hdr, video.damaged)
     if not rows:
         raise UnreadableVideo("unreadable: no frame in it can be decoded (truncated?)")
-    return Looked(*about, *(list(column) for column in zip(*rows, strict=True)))
+    return FirstReading(*about, *(list(column) for column in zip(*rows, strict=True)))
 
 
-def _written(name: str, path: Path, place: int, numbers: list[int], max_side: int, found: Looked, reader: Reader) -> dict[int, Path]:
+def _written(name: str, path: Path, place: int, numbers: list[int], max_side: int, found: FirstReading, reader: Reader) -> dict[int, Path]:
     """The second reading: the chosen frames as PNG by number, or those that an earlier call wrote."""
     folder, file = reader.work / f"frames_{place}", reader.work / f"frames_{place}.json"
     targets = {number: folder / f"{number:06d}.png" for number in numbers}
@@ -169,7 +169,7 @@ def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> 
         Image.fromarray(frame.rgb(max_side)).save(temporary, "PNG", compress_level=FAST, exif=exif)
 
 
-def _record(name: str, found: Looked, verdicts: list[str]) -> dict[str, object]:
+def _record(name: str, found: FirstReading, verdicts: list[str]) -> dict[str, object]:
     """A video's entry in frames.json: columns with an entry for each frame that was looked at."""
     return {
         "video": name,

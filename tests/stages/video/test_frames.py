@@ -15,7 +15,7 @@ from stages.formats.importers import candidates, files
 from stages.io.material import find_material, photographs_of, with_frames
 from stages.io.photo import read_photo
 from stages.poses.settings import PosesSettings
-from stages.video.frames import Chosen, Reader, frames_of, look
+from stages.video.frames import Chosen, Reader, first_reading, frames_of
 from stages.video.reading import opened
 from tests.stages import captures, clips
 
@@ -144,6 +144,6 @@ def test_video_of_an_unknown_rate_is_looked_at_by_its_times(tmp_path: Path) -> N
         path = without_rate(clips.write_clip(tmp_path / f"{milliseconds}.webm", clips.pan(60, 2.0), times=times, codec="libvpx-vp9"))
         with opened(path) as video:
             assert not video.known_rate
-        looked = look(path, Reader(1, tmp_path / "work", lambda *values: None, lambda: None, lambda text: None))
+        looked = first_reading(path, Reader(1, tmp_path / "work", lambda *values: None, lambda: None, lambda text: None))
         assert len(looked.index) == expected
         assert np.diff(looked.time).min() >= 0.02
