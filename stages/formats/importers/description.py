@@ -88,7 +88,7 @@ def _photographs(folder: Path) -> dict[str, Any]:
     images = photographs(source) if folder.is_dir() else [folder]
     if is_video(images[0]):
         return _videos(source, images)
-    sizes, rejected, turned = [], [], 0
+    sizes, rejected = [], []
     for image in images:
         try:
             header = read_header(source.real(image))
@@ -96,13 +96,7 @@ def _photographs(folder: Path) -> dict[str, Any]:
             rejected.append({"name": source.name_of(image), "reason": str(error)})
             continue
         sizes.append(header.size)
-        turned += header.orientation != 1
-    warnings = source.warnings()
-    if turned:
-        warnings.append(f"{turned} images are rotated by their EXIF orientation.")
-    if len(set(sizes)) > 1:
-        warnings.append("images are of mixed sizes.")
-    return _unposed(sizes, rejected, warnings, masks=len(masks_of(source, images)))
+    return _unposed(sizes, rejected, source.warnings(), masks=len(masks_of(source, images)))
 
 
 def _unposed(sizes: list[tuple[int, int]], rejected: list[dict[str, str]], warnings: list[str], masks: int = 0, **more: Any) -> dict[str, Any]:

@@ -51,7 +51,6 @@ class Listing:
     missing: list[str] = field(default_factory=list)  # names, as they may be shown
     repeated: list[tuple[str, str]] = field(default_factory=list)  # (name, reason) of those that name an image again
     places: list[tuple[str, str]] = field(default_factory=list)  # (listed, found) of those found at another place
-    extensions: list[tuple[str, str]] = field(default_factory=list)  # (listed, found) of those with another extension
 
 
 def check_count(count: int, where: str) -> None:
@@ -138,9 +137,6 @@ def located(source: Source, frames: Sequence[Frame]) -> Listing:
             continue
         seen.add(path)
         listing.found.append((frame, path))
-        how = result.how if result.path is not None else "elsewhere"
-        if not frame.bare and how == "elsewhere":
+        if not frame.bare and (result.elsewhere or result.path is None):
             listing.places.append((name, source.name_of(path)))
-        elif not frame.bare and how == "extension":
-            listing.extensions.append((name, source.name_of(path)))
     return listing

@@ -83,7 +83,10 @@ class ListFormat:
         warnings = [*stated.warnings, *_missing_warning(stated, listing, len(photos), settings.strict)]
         if len(photos) < MIN_IMAGES:
             raise BadInput(f"{where}: {len(photos)} usable images of {count} cameras; at least {MIN_IMAGES} are needed.")
-        warnings += _moved_warnings(where, listing) + lenses.fit_warnings(where, remarks)
+        if listing.places:
+            (name, found), *_ = listing.places
+            warnings.append(f"{where}: {len(listing.places)} images are not where they are listed and were found by name, e.g. {name} as {found}.")
+        warnings += lenses.fit_warnings(where, remarks)
         warnings += [f"{name}: {why}; left out." for name, why, _ in unreadable]
         for why, several in Counter(why for _, why in stated.rejected).most_common():
             names = abbreviated([name for name, one in stated.rejected if one == why])
@@ -155,18 +158,6 @@ def _missing_warning(stated: Listed, listing: Listing, kept: int, strict: bool) 
     if strict:
         raise BadInput(f"{sentence} Refused by --strict. {stated.remedy}")
     return [sentence]
-
-
-def _moved_warnings(where: str, listing: Listing) -> list[str]:
-    """Warnings about images found elsewhere than listed."""
-    warnings = []
-    if listing.places:
-        (name, found), *_ = listing.places
-        warnings.append(f"{where}: {len(listing.places)} images are not where they are listed and were found by name, e.g. {name} as {found}.")
-    if listing.extensions:
-        (name, found), *_ = listing.extensions
-        warnings.append(f"{where}: {len(listing.extensions)} images have another extension than listed, e.g. {name} is {found}.")
-    return warnings
 
 
 def places_of(kept: Sequence[Frame]) -> dict[str, int]:

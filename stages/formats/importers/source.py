@@ -60,7 +60,7 @@ class Found:
     """The file of a listed name."""
 
     path: Path | None  # the file, or None
-    how: str = "listed"  # "listed", "extension" (another one than listed) or "elsewhere" (at another place in the source)
+    elsewhere: bool = False  # whether it lies at another place than listed
 
 
 @dataclass
@@ -184,31 +184,29 @@ class Source:
             if not inside and not self.allow_outside:
                 raise BadInput(f"{printable(name, 200)}: leads out of the source folder {self.root}. Copy it into the folder, or pass --allow-outside.")
             found = self._with_any_suffix(here, suffixes)
-            if found.path is not None:
-                return found
+            if found is not None:
+                return Found(found)
         for drop in range(max(0 if absolute else 1, len(parts) - MAX_DEPTH), len(parts)):
-            found = self._with_any_suffix(self.root.joinpath(*parts[drop:]), suffixes) if ".." not in parts[drop:] else Found(None)
-            if found.path is not None:
-                return Found(found.path, "elsewhere")
+            found = self._with_any_suffix(self.root.joinpath(*parts[drop:]), suffixes) if ".." not in parts[drop:] else None
+            if found is not None:
+                return Found(found, elsewhere=True)
         if absolute and parts:
             alike = self._by_name.get(name_key(parts[-1]), [])
             if len(alike) == 1:
-                return Found(self.check_inside(alike[0]), "elsewhere")
+                return Found(self.check_inside(alike[0]), elsewhere=True)
             if here is not None and os.path.isfile(here) and not inside:
                 raise BadInput(f"{printable(name, 200)}: lies outside the source folder {self.root}. Copy it into the folder, or pass --allow-outside.")
         return Found(None)
 
-    def _with_any_suffix(self, path: Path, suffixes: Sequence[str]) -> Found:
+    def _with_any_suffix(self, path: Path, suffixes: Sequence[str]) -> Path | None:
         if os.path.isfile(path):
-            return Found(self.check_inside(path))
+            return self.check_inside(path)
         stem = path.stem if path.suffix.lower() in suffixes else path.name
         usable = [other for other in self._folder(path.parent).get(name_key(stem), []) if other.suffix.lower() in suffixes]
         if not usable:
-            return Found(None)
-        composed = [unicodedata.normalize("NFC", name) for name in (stem, path.name)]
-        best = min(usable, key=lambda other: (unicodedata.normalize("NFC", other.stem) != composed[0], suffixes.index(other.suffix.lower())))
-        another = path.suffix.lower() in suffixes and unicodedata.normalize("NFC", best.name) != composed[1]
-        return Found(self.check_inside(best), "extension" if another else "listed")
+            return None
+        composed = unicodedata.normalize("NFC", stem)
+        return self.check_inside(min(usable, key=lambda other: (unicodedata.normalize("NFC", other.stem) != composed, suffixes.index(other.suffix.lower()))))
 
     def _folder(self, folder: Path) -> dict[str, list[Path]]:
         """The files of a folder by the key of their stem."""

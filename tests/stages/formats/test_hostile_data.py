@@ -166,20 +166,3 @@ def test_numbers_in_colmap_texts(tmp_path: Path, name: str, word: str) -> None:
         assert_read_or_refused(lambda: importers.IMPORTERS["colmap"].read(source, Settings()))
     path.write_text("\n".join([f"# Number of {name[:6]}: {word}", *lines[first:]]) + "\n")
     assert_read_or_refused(lambda: importers.IMPORTERS["colmap"].read(source, Settings()))
-
-
-@pytest.mark.parametrize("value", [1e300, np.nan, -1.0])
-def test_lenses_and_places_of_colmap_are_bounded(tmp_path: Path, value: float) -> None:
-    for offset in range(0, 8 * 3, 8):
-        source = captures.colmap_bin(tmp_path / str(offset))
-        path = source / "sparse/0/cameras.bin"
-        data = bytearray(path.read_bytes())
-        data[32 + offset : 40 + offset] = struct.pack("<d", value)
-        path.write_bytes(data)
-        assert_read_or_refused(lambda source=source: importers.IMPORTERS["colmap"].read(source, Settings()))
-    source = captures.colmap_bin(tmp_path / "places")
-    path = source / "sparse/0/images.bin"
-    data = bytearray(path.read_bytes())
-    data[8 + 4 + 32 : 8 + 4 + 40] = struct.pack("<d", value)
-    path.write_bytes(data)
-    assert_read_or_refused(lambda: importers.IMPORTERS["colmap"].read(source, Settings()))

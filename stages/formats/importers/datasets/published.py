@@ -248,7 +248,7 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
             listed.append(Frame(f"rect_{int(stem) + 1:03d}_{DTU_LIGHT}_r5000.png", scans[0], where, camera))
             continue
         folders = [source.root / name for name in ("images", "blended_images", "image", "rgb", ".")]
-        images = next((folder for folder in folders if source.find(stem, folder).how == "listed"), source.root)
+        images = next((folder for folder in folders if not source.find(stem, folder).elsewhere), source.root)
         listed.append(Frame(stem, images, where, camera, bare=True))
     return Listed(source.name_of(place), listed, signs, facts={"cameras": source.name_of(place)})
 
