@@ -9,22 +9,18 @@ from stages.figures.plots import to_uint8
 NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
-def background_from_text(text: str) -> tuple[float, float, float] | None:
-    """The sRGB colour (0-1) of "white", "black" or "#rrggbb"; None for "transparent". UsageError for anything else."""
+def frame_background(text: str) -> tuple[float, float, float] | None:
+    """The sRGB colour (0-1) of "white", "black", "#rrggbb" or "auto": white, unless the asset's environment takes its place. None for "transparent".
+    UsageError for anything else."""
     if text == "transparent":
         return None
-    if text in NAMED:
-        return NAMED[text]
+    if text in ("auto", *NAMED):
+        return NAMED["white" if text == "auto" else text]
     digits = text.removeprefix("#")
     if text.startswith("#") and len(digits) == 6 and all(digit in "0123456789abcdefABCDEF" for digit in digits):
         red, green, blue = (int(digits[k : k + 2], 16) / 255.0 for k in (0, 2, 4))
         return red, green, blue
     raise UsageError(f"background: found {text!r}, expected white, black, transparent or #rrggbb")
-
-
-def frame_background(text: str) -> tuple[float, float, float] | None:
-    """The same of the setting, which may be "auto" too: white, unless the asset's environment takes its place."""
-    return NAMED["white"] if text == "auto" else background_from_text(text)
 
 
 def frame_from_rendering(colour: np.ndarray, opacity: np.ndarray, background: tuple[float, float, float] | None) -> np.ndarray:
