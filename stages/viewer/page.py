@@ -18,6 +18,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from efficientnerf.asset.captured import captured_of
 from efficientnerf.asset.format import FormatError, contents, load, serialize
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, Similarity
@@ -151,12 +152,10 @@ def _captured_path(asset: bytes) -> list[dict[str, Any]]:
     """The cameras of the asset's captured path, as far as it is one: FORMAT.md states no rule for it that a reader checks."""
     try:
         header = json.loads(asset[8 : 8 + int.from_bytes(asset[:8], "little")])
-        found = json.loads(header["__metadata__"]["nerftree"])["captured_path"]
-        width, height, focal = int(found["width"]), int(found["height"]), float(found["focal"])
-        poses = [np.vstack([np.asarray(pose, np.float64).reshape(3, 4), (0, 0, 0, 1)]) for pose in found["poses"][:64]]
+        found = captured_of(json.loads(header["__metadata__"]["nerftree"]))
     except (KeyError, TypeError, ValueError):
         return []
-    if not (0 < width < 2**16 and 0 < height < 2**16 and 0 < focal < 1e9 and all(np.isfinite(pose).all() for pose in poses)):
+    if found is None:
         return []
-    params = (focal, width / 2, height / 2)
-    return [_camera(Camera(f"camera {n}", width, height, "SIMPLE_PINHOLE", params, pose), None) for n, pose in enumerate(poses, 1)]
+    size, params = (int(found.width), int(found.height)), (found.focal, found.width / 2, found.height / 2)
+    return [_camera(Camera(f"camera {n}", *size, "SIMPLE_PINHOLE", params, pose), None) for n, pose in enumerate(found.poses, 1)]

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
+import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,8 +130,7 @@ def write_grids(grids: list[Grid], path: Path, unit: str = "unknown") -> None:
     for tree in trees:
         for part in (tree.descriptor(), tree.head, tree.leaves.tobytes(), tree.masks.tobytes(), tree.values.tobytes()):
             digest.update(part)
-    name = digest.hexdigest()
-    identity = "-".join((name[:8], name[8:12], name[12:16], name[16:20], name[20:32])).upper()
+    identity = str(uuid.UUID(digest.hexdigest()[:32])).upper()
     head = struct.pack("<qI2IB", MAGIC, VERSION, *LIBRARY, 1) + identity.encode("ascii")
     about = _table({"creator": ("string", b"efficientnerf"), "unit": ("string", unit.encode("ascii"))})
     write_parts(path, _parts(head + about + struct.pack("<i", len(grids)), trees))
@@ -160,8 +160,6 @@ class _Tree:
         place = ((root.reshape(-1) << 3 * UPPER | _offset(at, LEAF + LOWER, UPPER)) << 3 * LOWER | _offset(at, LEAF, LOWER)) << 3 * LEAF | _offset(at, 0, LEAF)
         order = np.argsort(place, kind="stable")
         place = place[order]
-        if len(place) > 1 and (np.diff(place) == 0).any():
-            raise ValueError("a voxel is listed twice")
         self.name, self.roots = grid.name, roots << ROOT
         self.half = grid.values.dtype == np.float16
         self.values = np.ascontiguousarray(grid.values[order]).astype("<f2" if self.half else "<f4")
