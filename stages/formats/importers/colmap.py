@@ -5,17 +5,17 @@ a small reprojection error is no sign of a good one.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, pose_from_colmap
+from efficientnerf.geometry.cameras import pose_from_colmap
 from pipeline.text import printable
 from stages.formats.importers import lenses
 from stages.formats.importers.colmap_model import MAX_NAME, Model, PosedImage, count_images, model_files, read_model, read_points
-from stages.formats.importers.frames import Frame
+from stages.formats.importers.frames import CameraOf, Frame
 from stages.formats.importers.listed import Listed, ListFormat
 from stages.formats.importers.source import Source, abbreviated
 from stages.io.capture import Capture, SparsePoints
@@ -68,7 +68,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     return Listed(where, frames, model_files(place) or [], facts=facts, finish=finish, remedy=remedy)
 
 
-def _camera(model: Model, image: PosedImage, where: str) -> Callable[[str, tuple[int, int]], Camera]:
+def _camera(model: Model, image: PosedImage, where: str) -> CameraOf:
     lens, pose = model.cameras[image.camera], pose_from_colmap(np.array(image.quaternion), np.array(image.translation))
     return lambda name, size: lenses.validated(replace(lens, name=name, world_from_camera=pose), f"{where}: camera {image.camera}")
 

@@ -17,7 +17,11 @@ from stages.formats.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAG
 
 MAX_NAME = 200  # characters of a listed name that are shown
 USUAL_FOLDERS = ("images", "image", "rgb", "input", "photos", "color")  # which of several that hold a bare name is meant
-_BESIDE_IMAGES = NOT_PHOTOGRAPHS | {"confidence"}  # folders with files of the names of images
+_NOT_IMAGES = NOT_PHOTOGRAPHS | {"confidence"}  # folders with files of the names of images
+
+
+# (name, (width, height) of the upright image) -> its camera, at the size that the file states or at that of the image
+CameraOf = Callable[[str, tuple[int, int]], Camera]
 
 
 @dataclass(frozen=True)
@@ -27,8 +31,7 @@ class Frame:
     name: str  # as listed, relative to `folder`
     folder: Path
     where: str  # what messages call it
-    # (name, (width, height) of the upright image) -> Camera, at the size that the file states or at that of the image
-    camera: Callable[[str, tuple[int, int]], Camera]
+    camera: CameraOf
     bare: bool = False  # the format states no folder: the name alone is looked for, and its place is not reported
     mask: Path | None = None  # where the format names masks; else one next to the image is looked for
     split: str | None = None
@@ -38,7 +41,7 @@ class Frame:
     own: Any = None  # what the format keeps of it for itself
 
 
-def stated(camera: Camera) -> Callable[[str, tuple[int, int]], Camera]:
+def stated(camera: Camera) -> CameraOf:
     """For a frame: a camera whose size the file states."""
     return lambda name, size: replace(camera, name=name)
 
@@ -61,7 +64,7 @@ def check_count(count: int, where: str) -> None:
         raise BadInput(f"{where}: {count} cameras; at most {MAX_FRAMES} are read.")
 
 
-def relocated(source: Source, names: Sequence[str], present: Iterable[str], taken: set[Path], bare: bool = False) -> dict[str, Path]:
+def relocate(source: Source, names: Sequence[str], present: Iterable[str], taken: set[Path], bare: bool = False) -> dict[str, Path]:
     """Listed name -> image, of missing names whose folders stand elsewhere in the source.
 
     names    that were not found
@@ -97,7 +100,7 @@ def _best_folder(source: Source, names: Sequence[str], parts: tuple[str, ...], t
             stem, suffix = name_key(PurePosixPath(last).stem), PurePosixPath(last).suffix.lower()
         for path in source.images_by_stem.get(stem, ()):
             folder = path.parent
-            if path in taken or _BESIDE_IMAGES & {part.lower() for part in folder.relative_to(source.root).parts}:
+            if path in taken or _NOT_IMAGES & {part.lower() for part in folder.relative_to(source.root).parts}:
                 continue
             images = by_folder.setdefault(folder, {})
             if name not in images or path.suffix.lower() == suffix:
@@ -117,14 +120,14 @@ def _best_folder(source: Source, names: Sequence[str], parts: tuple[str, ...], t
     return {name: source.check_inside(path) for name, path in by_folder[ranked[0]].items()}
 
 
-def located(source: Source, frames: Sequence[Frame]) -> Listing:
+def locate(source: Source, frames: Sequence[Frame]) -> Listing:
     """The frames with their images, in the order of the frames. Raises BadInput for an image outside of the source."""
     listing = Listing()
     results = [source.find(frame.name, frame.folder) for frame in frames]
     taken = {result.path for result in results if result.path is not None}
     present = [frame.name for frame, result in zip(frames, results, strict=True) if result.path is not None]
     missing = [frame.name for frame, result in zip(frames, results, strict=True) if result.path is None]
-    elsewhere = relocated(source, missing, present, taken, all(frame.bare for frame in frames)) if missing else {}
+    elsewhere = relocate(source, missing, present, taken, all(frame.bare for frame in frames)) if missing else {}
     seen: set[Path] = set()
     for frame, result in zip(frames, results, strict=True):
         path = result.path or elsewhere.get(frame.name)

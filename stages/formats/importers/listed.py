@@ -11,7 +11,7 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from stages.formats.importers import lenses
 from stages.formats.importers.depth import DepthFile, with_depth
-from stages.formats.importers.frames import Frame, Listing, check_count, located
+from stages.formats.importers.frames import Frame, Listing, check_count, locate
 from stages.formats.importers.masks import masks_of
 from stages.formats.importers.source import MIN_IMAGES, ImportSettings, Source, abbreviated
 from stages.io.capture import Capture, Photo, SparsePoints
@@ -22,7 +22,7 @@ Y_UP, Z_UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 _SPLITS = ("train", "val", "test", None)
 
 
-def stated_or_beside(source: Source, found: Sequence[tuple[Frame, Path]]) -> Masks:
+def listed_or_adjacent(source: Source, found: Sequence[tuple[Frame, Path]]) -> Masks:
     """The masks that frames name; of those that name none, the masks next to their images."""
     stated = {image: frame.mask for frame, image in found if frame.mask is not None}
     return {image: (mask, "black") for image, mask in (stated | masks_of(source, [image for _, image in found if image not in stated])).items()}
@@ -41,12 +41,12 @@ class Listed:
     bounds: np.ndarray | None = None
     metric: bool = False
     facts: dict[str, object] = field(default_factory=dict)
-    masks: Callable[[Source, Sequence[tuple[Frame, Path]]], Masks] = stated_or_beside  # of frames with their images
+    masks: Callable[[Source, Sequence[tuple[Frame, Path]]], Masks] = listed_or_adjacent  # of frames with their images
     depth: Callable[[Frame, Path], DepthFile | None] = lambda frame, image: None  # of a frame and its image
     # adds to the capture what depends on the photos; with the frames in their order
     finish: Callable[[Capture, Sequence[Frame]], Capture] = lambda capture, frames: capture
     remedy: str = "Copy them into the source folder, or export again without them."  # for images that are missing
-    unsaid: Sequence[str] = ()  # remarks of `lenses.fit_to_images` that are no news
+    expected_remarks: Sequence[str] = ()  # remarks of `lenses.fit_to_images` that are no news
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ListFormat:
     def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
         """What states the cameras, the images, their masks and depth maps. Raises BadInput."""
         source, stated = self._read(folder, settings)
-        found = located(source, stated.frames).found
+        found = locate(source, stated.frames).found
         maps = [one for frame, image in found if (one := stated.depth(frame, image)) is not None]
         masks = [mask for mask, _ in stated.masks(source, found).values()]
         return [*stated.files, *(image for _, image in found), *masks, *(path for one in maps for path in (one.file, one.confidence) if path is not None)]
@@ -78,7 +78,7 @@ class ListFormat:
         source, stated = self._read(folder, settings)
         where, count = stated.where, len(stated.frames)
         check_count(count, where)
-        listing = located(source, stated.frames)
+        listing = locate(source, stated.frames)
         photos, unreadable, remarks = _photos(source, stated, listing)
         warnings = [*stated.warnings, *_missing_warning(stated, listing, len(photos), settings.strict)]
         if len(photos) < MIN_IMAGES:
@@ -140,7 +140,7 @@ def _photos(
         readable.append((frame, image))
     masks, photos = stated.masks(source, listing.found), []
     for (frame, image), (camera, remark) in zip(readable, lenses.fit_to_images(cameras), strict=True):
-        if remark is not None and remark not in stated.unsaid:
+        if remark is not None and remark not in stated.expected_remarks:
             remarks.setdefault(remark, []).append(camera.name)
         mask, ignore = masks.get(image, (None, "black"))
         photo = Photo(camera, source.real(image), None if mask is None else source.real(mask), ignore, frame.split, frame.near, frame.far)

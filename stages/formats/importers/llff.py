@@ -6,7 +6,7 @@ h, w, f are those of the full images; the images at hand may be smaller, and f i
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -16,7 +16,7 @@ from efficientnerf.geometry.cameras import Camera, pose_from_llff
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import colmap, lenses
-from stages.formats.importers.frames import Frame
+from stages.formats.importers.frames import CameraOf, Frame
 from stages.formats.importers.listed import Listed, ListFormat
 from stages.formats.importers.source import MAX_FRAMES, Source, images_in, name_key
 from stages.io.json_file import LARGEST_NUMBER
@@ -52,7 +52,7 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
         where = f"{POSES}: row {index} ({source.name_of(image)})"
         frames.append(Frame(image.name, image.parent, where, _camera(row, where), near=float(row[15]), far=float(row[16])))
     facts: dict[str, object] = {"image_folder": printable(images[0].parent.name), "factor": factor}
-    return Listed(POSES, frames, signs, warnings=warnings, facts=facts, unsaid=("resized",))  # for that the folders are there
+    return Listed(POSES, frames, signs, warnings=warnings, facts=facts, expected_remarks=("resized",))  # for that the folders are there
 
 
 def _signs(source: Source) -> list[Path]:
@@ -73,7 +73,7 @@ def _rows(source: Source) -> np.ndarray:
     return read_rows(source.real(source.root / POSES))
 
 
-def _camera(row: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
+def _camera(row: np.ndarray, where: str) -> CameraOf:
     def camera(name: str, size: tuple[int, int]) -> Camera:
         matrix, (near, far) = row[:15].reshape(3, 5), row[15:]
         pose = pose_from_llff(matrix[:, :4])

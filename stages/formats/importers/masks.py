@@ -18,14 +18,14 @@ _SUFFIX = (".mask",)  # IMG_1.mask, whatever format it has
 
 def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
     """Image -> mask, of those that have one."""
-    masks_in, files_inside, files_beside = cache(_masks_in), cache(_files_inside), cache(_files_beside)  # each folder is read once
+    masks_in, files_inside, files_adjacent = cache(_masks_in), cache(_files_inside), cache(_files_adjacent)  # each folder is read once
     photographs = set(images)
     found = {}
     for image in images:
         stem, name = name_key(image.stem), name_key(image.name)
         endings = [f"{each}{ending}" for each in (stem, name) for ending in reversed(MASK_ENDINGS)]
         listings = [(files_inside(place), [name, stem, *endings]) for place in dict.fromkeys(_places(source, image, masks_in))]
-        listings.append((files_beside(image.parent), endings))
+        listings.append((files_adjacent(image.parent), endings))
         candidates = (listing[key] for listing, keys in listings for key in keys if key in listing)
         mask = next((path for path in candidates if path not in photographs), None)
         if mask is not None:
@@ -59,7 +59,7 @@ def _files_inside(folder: Path) -> dict[str, Path]:
     return {name_key(path.stem): path for path in reversed([*images_in(folder), *files_in(folder, _SUFFIX)])}
 
 
-def _files_beside(folder: Path) -> dict[str, Path]:
+def _files_adjacent(folder: Path) -> dict[str, Path]:
     """The masks in a folder of photographs by the key of their name without what follows the ending."""
     named = {name_key(path.stem): path for path in reversed(pictures_in(folder)) if name_key(path.stem).endswith(MASK_ENDINGS)}
     return named | {name_key(path.name): path for path in files_in(folder, _SUFFIX)}

@@ -68,7 +68,7 @@ def _all(source: Source) -> list[Path]:
         _remark_on_others(source, found)
     else:
         everything = source.walk()
-        usable = [path for path in everything if not _is_beside(path, folder)]
+        usable = [path for path in everything if not _is_by_product(path, folder)]
         found = _corrected_once(_without_maps(one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES))))
         videos = files_in(folder, SUFFIXES) or sorted(filter(is_video, usable))
         if not found and not videos:
@@ -99,7 +99,7 @@ def _count(paths: Sequence[Path], what: str, source: Source) -> str:
     return f"{len(paths)} {what if len(paths) > 1 else what[:-1]} ({abbreviated([source.name_of(path) for path in paths])}) {'are' if len(paths) > 1 else 'is'}"
 
 
-def _is_beside(path: Path, folder: Path) -> bool:
+def _is_by_product(path: Path, folder: Path) -> bool:
     """Whether a file lies in a folder that conversions leave next to photographs."""
     return not NOT_PHOTOGRAPHS.isdisjoint(map(name_key, path.relative_to(folder).parts[:-1]))
 
@@ -111,7 +111,7 @@ def _remark_on_others(source: Source, found: Sequence[Path]) -> None:
         everything = source.walk()
     except BadInput:  # more files than a data set has
         return
-    images = (path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and path.parent != here and not _is_beside(path, folder))
+    images = (path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and path.parent != here and not _is_by_product(path, folder))
     others = one_of_each([path for path in images if not any(_REDUCED.fullmatch(part) for part in path.relative_to(folder).parts)])
     if others:
         count = f"{len(others)} more images" if len(others) > 1 else "1 more image"

@@ -52,7 +52,7 @@ def test_a_page_renders_what_the_cpu_renders(made: Any, chromium: Any, tmp_path:
                 assert decibels(page.rendered(camera, background=(0.2, 0.5, 0.9)), expected) > 40
             page.page.select_option("#subject", "subject")
             page.page.wait_for_selector("#loading", state="hidden")
-            page.page.wait_for_function("enerf.ready.then(({viewer}) => viewer.renderer.subject)")
+            page.page.wait_for_function("enerf.ready.then(({viewer}) => viewer.renderer.region !== null)")
         assert page.page.evaluate("enerf.ready.then(({viewer}) => viewer.renderer.worker !== null)")
         page.page.click("#spin")
         page.page.wait_for_function("enerf.ready.then(({viewer}) => viewer.frames.length > 0)")

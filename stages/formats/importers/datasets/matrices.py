@@ -3,7 +3,6 @@
 import re
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera, without_skew
+from stages.formats.importers.frames import CameraOf
 from stages.formats.importers.llff import rows_of_npy
 from stages.formats.importers.source import MAX_FRAMES
 from stages.formats.importers.texts import numbers, read_text
@@ -20,13 +20,13 @@ from stages.io import json_file
 
 MAX_CAMERA_BYTES = 1 << 16  # of a text file with one camera
 MAX_ARCHIVE_BYTES, MAX_MATRIX_BYTES = 256 << 20, 4096
-_REMEDY = "Write or download the data set again, or choose another format with --as."
+REMEDY = "Write or download the data set again, or choose another format with --as."
 
 
 def _pinhole(name: str, size: tuple[int, int], k: np.ndarray, pose: np.ndarray, where: str) -> Camera:
     """A camera from its (3, 3) matrix K, the centre of the first pixel being at 0.5, 0.5. Raises BadInput."""
     if abs(k[2] - (0, 0, 1)).max() > 1e-6 or k[1, 0]:
-        raise BadInput(f"{where}: no matrix of a camera: rows {k[1].tolist()} and {k[2].tolist()}, expected 0 fy cy and 0 0 1. {_REMEDY}")
+        raise BadInput(f"{where}: no matrix of a camera: rows {k[1].tolist()} and {k[2].tolist()}, expected 0 fy cy and 0 0 1. {REMEDY}")
     camera = brown_camera(name, size, (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), pose, where)
     lenses.validated(camera, where)
     without_skew(k[0, 1], k[1, 1], size, k[1, 2], "a skew of", where)
@@ -39,7 +39,7 @@ def _pinhole(name: str, size: tuple[int, int], k: np.ndarray, pose: np.ndarray, 
     return camera
 
 
-def pinhole_frame(k: np.ndarray, pose: np.ndarray, where: str, stated: tuple[int, int] | None = None) -> Callable[[str, tuple[int, int]], Camera]:
+def pinhole_frame(k: np.ndarray, pose: np.ndarray, where: str, stated: tuple[int, int] | None = None) -> CameraOf:
     """For a frame: the camera of K and a pose, at the stated (width, height) or else at the image's."""
     return lambda name, size: _pinhole(name, stated or size, k, pose, where)
 
@@ -54,7 +54,7 @@ def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarr
     """(3, 4) K [R t] -> K (3, 3) with a positive diagonal and 1 at its end, and the pose (4, 4), camera to world. Raises BadInput."""
     left = projection[:, :3]
     if not abs(np.linalg.det(left)) > 1e-12 * max(np.abs(left).max(), 1e-30) ** 3:
-        raise BadInput(f"{where}: no projection matrix (its left part is singular). {_REMEDY}")
+        raise BadInput(f"{where}: no projection matrix (its left part is singular). {REMEDY}")
     if np.linalg.det(left) < 0:
         projection, left = -projection, -left  # P and -P project alike
     q, r = np.linalg.qr(left[::-1].T)  # RQ by QR of the reversed rows
@@ -79,25 +79,25 @@ def intrinsics_of(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
         fx, fy, cx, cy = numbers(found, 4, where)
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), None
     if len(found) < 6:
-        raise BadInput(f"{where}: {len(found)} numbers; expected a matrix of 3x3 or 4x4, fx fy cx cy, or f cx cy first and height, width last. {_REMEDY}")
+        raise BadInput(f"{where}: {len(found)} numbers; expected a matrix of 3x3 or 4x4, fx fy cx cy, or f cx cy first and height, width last. {REMEDY}")
     focal, cx, cy = numbers(found[:3], 3, where)
     height, width = numbers(found[-2:], 2, where)
-    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), lenses.image_size(width, height, where, _REMEDY)
+    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), lenses.image_size(width, height, where, REMEDY)
 
 
 def _open3d_intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int]]:
     """Of a JSON file: width, height, and intrinsic_matrix, column by column."""
-    document, where = json_file.read_object(path, path.name, _REMEDY), path.name
-    matrix = json_file.numbers(document.get("intrinsic_matrix"), 9, f"{where}: intrinsic_matrix, column by column,", _REMEDY)
-    width, height = (json_file.number(document, key, where, _REMEDY) for key in ("width", "height"))
-    return np.array(matrix).reshape(3, 3).T, lenses.image_size(width, height, where, _REMEDY)
+    document, where = json_file.read_object(path, path.name, REMEDY), path.name
+    matrix = json_file.numbers(document.get("intrinsic_matrix"), 9, f"{where}: intrinsic_matrix, column by column,", REMEDY)
+    width, height = (json_file.number(document, key, where, REMEDY) for key in ("width", "height"))
+    return np.array(matrix).reshape(3, 3).T, lenses.image_size(width, height, where, REMEDY)
 
 
 def archive_matrices(path: Path, where: str) -> dict[str, np.ndarray]:
     """world_mat_<i> and scale_mat_<i>, (4, 4) float64, of an archive, of which nothing but plain numbers is read. Raises BadInput."""
     found: dict[str, np.ndarray] = {}
     if path.stat().st_size > MAX_ARCHIVE_BYTES:
-        raise BadInput(f"{where}: larger than {MAX_ARCHIVE_BYTES >> 20} MiB. {_REMEDY}")
+        raise BadInput(f"{where}: larger than {MAX_ARCHIVE_BYTES >> 20} MiB. {REMEDY}")
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
@@ -109,14 +109,14 @@ def archive_matrices(path: Path, where: str) -> dict[str, np.ndarray]:
                 with archive.open(info) as entry:
                     found[match[1]] = _archive_matrix(entry.read(MAX_MATRIX_BYTES + 1), f"{where}: {match[1]}")
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-        raise BadInput(f"{where}: not a NumPy archive, or truncated ({printable(error, 80)}). {_REMEDY}") from None
+        raise BadInput(f"{where}: not a NumPy archive, or truncated ({printable(error, 80)}). {REMEDY}") from None
     return found
 
 
 def _archive_matrix(data: bytes, where: str) -> np.ndarray:
     if len(data) > MAX_MATRIX_BYTES:
-        raise BadInput(f"{where}: more than {MAX_MATRIX_BYTES} bytes; expected a 4x4 matrix. {_REMEDY}")
-    matrix = rows_of_npy(data, where, 4, "4x4 matrices", _REMEDY)
+        raise BadInput(f"{where}: more than {MAX_MATRIX_BYTES} bytes; expected a 4x4 matrix. {REMEDY}")
+    matrix = rows_of_npy(data, where, 4, "4x4 matrices", REMEDY)
     if len(matrix) != 4:
-        raise BadInput(f"{where}: {len(matrix)} rows; expected a 4x4 matrix. {_REMEDY}")
+        raise BadInput(f"{where}: {len(matrix)} rows; expected a 4x4 matrix. {REMEDY}")
     return matrix

@@ -14,7 +14,7 @@ y up, metres. Depth is the sensor's.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import islice
@@ -27,7 +27,7 @@ from pipeline.errors import BadInput
 from stages.formats.importers import lenses
 from stages.formats.importers.brown import brown_camera
 from stages.formats.importers.depth import MILLIMETRE, DepthFile, depth_file
-from stages.formats.importers.frames import Frame, check_count, stated
+from stages.formats.importers.frames import CameraOf, Frame, check_count, stated
 from stages.formats.importers.listed import Y_UP, Listed, ListFormat
 from stages.formats.importers.source import Source, images_in
 from stages.io.json_file import number, numbers, read_json, read_object, shown
@@ -188,7 +188,7 @@ def _scanner_pictures(place: Path) -> list[Path]:
     return [path for path in images_in(place) if _FRAME.fullmatch(path.stem)]
 
 
-def _scanner_camera(source: Source, path: Path) -> Callable[[str, tuple[int, int]], Camera]:
+def _scanner_camera(source: Source, path: Path) -> CameraOf:
     """The camera of a frame for a picture of a size, which the frame does not state. Raises BadInput, as does what is returned."""
     where = source.name_of(path)
     document = read_object(source.real(path), where, SCANNER_AGAIN, limit=LARGEST_FRAME)

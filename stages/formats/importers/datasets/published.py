@@ -25,20 +25,18 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.colmap_model import FISHEYE, as_traced, count_parameters
-from stages.formats.importers.datasets.matrices import MAX_CAMERA_BYTES, archive_matrices, decomposed, from_world, intrinsics_of, pinhole_frame
+from stages.formats.importers.datasets.matrices import MAX_CAMERA_BYTES, REMEDY, archive_matrices, decomposed, from_world, intrinsics_of, pinhole_frame
 from stages.formats.importers.frames import Frame
 from stages.formats.importers.listed import Z_UP, Listed, ListFormat, places_of, sparse_points
 from stages.formats.importers.source import MAX_FRAMES, Source, images_in
 from stages.formats.importers.texts import head, number, numbers, read_text
-from stages.formats.importers.transforms import read_document
-from stages.formats.importers.transforms_camera import camera_of
+from stages.formats.importers.transforms import camera_of, read_document
 from stages.io.capture import SparsePoints
 from stages.io.json_file import LARGEST_NUMBER, read_json
 
 MAX_POINTS = 5_000_000
 MAX_RIGS = 8  # within each other
 DTU_LIGHT = 3  # of seven: each view has it
-_REMEDY = "Write or download the data set again, or choose another format with --as."
 
 
 def _folder(base: Path, names: Sequence[str]) -> Path:
@@ -73,7 +71,7 @@ def _scannetpp(source: Source, signs: Sequence[Path]) -> Listed:
     images, masks = (_folder(base, names) for names in SCANNETPP_LISTS[f"nerfstudio/{file.name}"])
     more = document.get("test_frames", [])
     if not isinstance(more, list):
-        raise BadInput(f"{where}: test_frames is no list. {_REMEDY}")
+        raise BadInput(f"{where}: test_frames is no list. {REMEDY}")
     entries = [*((entry, "train" if more else None) for entry in document["frames"]), *((entry, "test") for entry in more)]
     frames.check_count(len(entries), where)
     lists = base / "train_test_lists.json"
@@ -81,7 +79,7 @@ def _scannetpp(source: Source, signs: Sequence[Path]) -> Listed:
     listed, bad = [], []
     for index, (entry, split) in enumerate(entries):
         if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-            raise BadInput(f"{where}: frame {index} has no `file_path`. {_REMEDY}")
+            raise BadInput(f"{where}: frame {index} has no `file_path`. {REMEDY}")
         image = entry["file_path"]
         if entry.get("is_bad") is True:
             bad.append((printable(image, frames.MAX_NAME), "marked as bad by the data set"))
@@ -95,12 +93,12 @@ def _scannetpp(source: Source, signs: Sequence[Path]) -> Listed:
 
 def _scannetpp_splits(source: Source, path: Path) -> dict[str, str]:
     """Image -> split."""
-    document = read_json(source.real(path), _REMEDY)
+    document = read_json(source.real(path), REMEDY)
     splits: dict[str, str] = {}
     for split in ("train", "test"):
         names = document.get(split, []) if isinstance(document, dict) else None
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise BadInput(f"{source.name_of(path)}: {split} is no list of names. {_REMEDY}")
+            raise BadInput(f"{source.name_of(path)}: {split} is no list of names. {REMEDY}")
         splits |= dict.fromkeys(names, split)
     return splits
 
@@ -144,7 +142,7 @@ def _kapture(source: Source, signs: Sequence[Path]) -> Listed:
     listed, unposed = [], []
     for where, (timestamp, sensor, name, *_) in _rows(source, RECORDS, 3):
         if sensor not in devices.lenses:
-            raise BadInput(f"{where}: sensor {printable(sensor, 40)} is no camera of {SENSORS}. {_REMEDY}")
+            raise BadInput(f"{where}: sensor {printable(sensor, 40)} is no camera of {SENSORS}. {REMEDY}")
         found = devices.pose(timestamp, sensor)
         if found is None:
             unposed.append((printable(name, frames.MAX_NAME), "without a pose"))
@@ -166,7 +164,7 @@ def _rows(source: Source, name: str, least: int) -> Iterator[tuple[str, list[str
             continue
         values = [value.strip() for value in line.split(",")]
         if len(values) < least:
-            raise BadInput(f"{name}: line {index} has {len(values)} values, expected {least} or more. {_REMEDY}")
+            raise BadInput(f"{name}: line {index} has {len(values)} values, expected {least} or more. {REMEDY}")
         yield f"{name}: line {index}", values
 
 
@@ -175,7 +173,7 @@ def _transform(values: list[str], where: str) -> np.ndarray:
     found = numbers(values, 7, where)
     length = float(np.linalg.norm(found[:4]))
     if not 0.99 < length < 1.01:
-        raise BadInput(f"{where}: quaternion of length {length:g}, expected 1. {_REMEDY}")
+        raise BadInput(f"{where}: quaternion of length {length:g}, expected 1. {REMEDY}")
     return np.linalg.inv(pose_from_colmap(found[:4], found[4:]))
 
 
@@ -189,7 +187,7 @@ def _kapture_devices(source: Source) -> _Devices:
             supported = ", ".join([*MODELS, *FISHEYE])
             raise BadInput(f"{where}: camera model {printable(model, 40) or 'missing'}; supported are {supported}. Undistort the images first.")
         lens = numbers(params, 2 + count, where)
-        devices.lenses[values[0]] = Camera("", *lenses.image_size(lens[0], lens[1], where, _REMEDY), *as_traced(model, tuple(lens[2:].tolist())), np.eye(4))
+        devices.lenses[values[0]] = Camera("", *lenses.image_size(lens[0], lens[1], where, REMEDY), *as_traced(model, tuple(lens[2:].tolist())), np.eye(4))
     for where, values in _rows(source, RIGS, 9):
         devices.mounts.setdefault(values[1], []).append((values[0], _transform(values[2:9], where)))
     for where, values in _rows(source, TRAJECTORIES, 9):
@@ -211,7 +209,7 @@ def _kapture_points(source: Source, places: dict[str, int]) -> SparsePoints | No
         index = number(values[0], where)
         first = 1 if len(values) % 2 else 2  # from version 1.1 on with the type of the features
         if index != int(index) or not 0 <= index < len(rows):
-            raise BadInput(f"{where}: point {index:g} of {len(rows)}. {_REMEDY}")
+            raise BadInput(f"{where}: point {index:g} of {len(rows)}. {REMEDY}")
         tracks[int(index)].update(places[name] for name in values[first::2] if name in places)
     array = np.array(rows)
     return sparse_points(array[:, :3], array[:, 3:], [tuple(sorted(track)) for track in tracks])
@@ -241,7 +239,7 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
         where, stem = source.name_of(path), path.name.removesuffix("_cam.txt")
         found = read_text(source.real(path), MAX_CAMERA_BYTES).split()
         if len(found) < 27 or found[0] != "extrinsic" or found[17] != "intrinsic":
-            raise BadInput(f"{where}: expected `extrinsic` with 16 numbers and `intrinsic` with 9. {_REMEDY}")
+            raise BadInput(f"{where}: expected `extrinsic` with 16 numbers and `intrinsic` with 9. {REMEDY}")
         pose = from_world(numbers(found[1:17], 16, f"{where}: extrinsic").reshape(4, 4), f"{where}: extrinsic")
         camera = pinhole_frame(numbers(found[18:27], 9, f"{where}: intrinsic").reshape(3, 3), pose, where)
         if scans:
@@ -272,7 +270,7 @@ def _idr(source: Source, signs: Sequence[Path]) -> Listed:
     for index, image in enumerate(images):
         place = f"{where}: world_mat_{index}"
         if f"world_mat_{index}" not in matrices:
-            raise BadInput(f"{place}: not there, with {count} cameras. {_REMEDY}")
+            raise BadInput(f"{place}: not there, with {count} cameras. {REMEDY}")
         k, pose = decomposed(matrices[f"world_mat_{index}"][:3], place)
         k = k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         mask = source.check_inside(masks[index]) if masks else None
@@ -287,7 +285,7 @@ def _idr_bounds(matrices: dict[str, np.ndarray], where: str) -> np.ndarray | Non
         return None
     radius = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     if not 1e-9 < radius < LARGEST_NUMBER:
-        raise BadInput(f"{where}: scale_mat_0 scales by {radius:g}; expected a positive number. {_REMEDY}")
+        raise BadInput(f"{where}: scale_mat_0 scales by {radius:g}; expected a positive number. {REMEDY}")
     return np.stack([matrix[:3, 3] - radius, matrix[:3, 3] + radius])
 
 
@@ -317,7 +315,7 @@ def _nsvf(source: Source, signs: Sequence[Path]) -> Listed:
         return Listed("pose", listed, signs)
     corners = numbers(read_text(source.real(box), MAX_CAMERA_BYTES).split()[:6], 6, box.name).reshape(2, 3)
     if not (corners[0] < corners[1]).all():
-        raise BadInput(f"{box.name}: {corners.tolist()}; expected the lower corner, then the upper one. {_REMEDY}")
+        raise BadInput(f"{box.name}: {corners.tolist()}; expected the lower corner, then the upper one. {REMEDY}")
     return Listed("pose", listed, [*signs, box], bounds=corners)
 
 
@@ -342,7 +340,7 @@ def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
     where = source.name_of(signs[0])
     words = read_text(source.real(signs[0])).split()
     if len(words) % 19 or not words:
-        raise BadInput(f"{where}: {len(words)} numbers; expected three and a matrix of 4x4 for each image. {_REMEDY}")
+        raise BadInput(f"{where}: {len(words)} numbers; expected three and a matrix of 4x4 for each image. {REMEDY}")
     if len(words) > 19 * MAX_FRAMES:
         raise BadInput(f"{where}: {len(words) // 19} cameras; at most {MAX_FRAMES} are read.")
     listed = []

@@ -5,7 +5,7 @@ camera with x right, y down, z forward. Lengths of the lens are shares of the im
 is in metres where the photographs have GPS (`reference_lla`). Points that tracks.csv knows are registered in their images.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -93,7 +93,7 @@ def rotation_of(vector: np.ndarray) -> np.ndarray:
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
-def _camera(lens: dict[str, Any], pose: np.ndarray, where: str) -> Callable[[str, tuple[int, int]], Camera]:
+def _camera(lens: dict[str, Any], pose: np.ndarray, where: str) -> frames.CameraOf:
     value = partial(number, lens, where=f"{where}: its camera", remedy=_REMEDY)
     kind = lens.get("projection_type")
     if not isinstance(kind, str) or kind not in _BROWN | _FISHEYE:

@@ -119,7 +119,7 @@ def _about(axis: str, angle: float) -> np.ndarray:
 
 def _lens(
     focal: float, principal: tuple[float, float], radial: Sequence[float], tangential: tuple[float, float], pose: np.ndarray, where: str
-) -> Callable[[str, tuple[int, int]], Camera]:
+) -> frames.CameraOf:
     """The camera of an image by its size: lengths are stated as shares of its longer side."""
 
     def camera(name: str, size: tuple[int, int]) -> Camera:
@@ -170,7 +170,7 @@ def _stated(description: Element, key: str) -> str | None:
     return value if value is not None else description.findtext(f"{XCR}{key}")
 
 
-def _sidecar(stated: Callable[[str], str | None], where: str) -> Callable[[str, tuple[int, int]], Camera]:
+def _sidecar(stated: Callable[[str], str | None], where: str) -> frames.CameraOf:
     def value(key: str, default: str) -> float:
         return number(stated(key) or default, f"{where}: {key}")
 
