@@ -16,7 +16,6 @@ What is not sRGB by the picture's ICC profile is converted to it then (`decoders
 import errno
 import io
 import os
-import stat
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,6 +28,7 @@ from PIL import Image, UnidentifiedImageError
 from PIL.ExifTags import Base
 
 from pipeline.errors import PipelineError
+from pipeline.files import open_plain
 from pipeline.text import printable
 from stages.io.decoders.colour_profile import AS_IT_IS, Conversion, conversion_of
 from stages.io.decoders.jpeg_scans import has_more_scans, most_scans
@@ -80,7 +80,7 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     UnreadableImage, but for MemoryError, and OSError where the process has no more memory or open files, or the file cannot be read now.
     """
     try:
-        with _regular_file(path) as file, warnings.catch_warnings():
+        with _Bounded(open_plain(path)) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
             raw = path.suffix.lower() in RAW_SUFFIXES and "RAW" in formats
             image: Any
@@ -103,23 +103,13 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
 class _Bounded(io.BufferedReader):
     """A file that never allocates more than it holds: decoders ask for as many bytes as a length in the file says."""
 
-    def __init__(self, descriptor: int, size: int) -> None:
+    def __init__(self, descriptor: int) -> None:
         super().__init__(io.FileIO(descriptor))
-        self.size = size
+        self.size = os.fstat(descriptor).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
         left = max(0, self.size - self.tell())
         return super().read(left if size is None or size < 0 else min(size, left))
-
-
-def _regular_file(path: Path) -> _Bounded:
-    """The file, open; a pipe or a device is not waited for."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    about = os.fstat(descriptor)
-    if not stat.S_ISREG(about.st_mode):
-        os.close(descriptor)
-        raise UnreadableImage("unreadable: not a regular file")
-    return _Bounded(descriptor, about.st_size)
 
 
 def _check_size(width: int, height: int, size: int) -> None:

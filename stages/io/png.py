@@ -12,10 +12,10 @@ FAST = 1  # compression of what is read once and thrown away
 USUAL = 6
 
 
-def write_png(pixels: np.ndarray, path: Path, *, compress_level: int = USUAL, durable: bool = True) -> None:
+def write_png(pixels: np.ndarray, path: Path, *, compress_level: int = USUAL, durable: bool = True, exif: Image.Exif | None = None) -> None:
     """Write (H, W), (H, W, 3) or (H, W, 4) uint8; see `pipeline.files.atomic`."""
     with atomic(path, durable=durable) as temporary:
-        Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, "PNG", compress_level=compress_level)
+        Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, "PNG", compress_level=compress_level, exif=exif)
 
 
 def read_png(path: Path) -> np.ndarray:

@@ -18,8 +18,8 @@ from PIL.ExifTags import Base
 
 from efficientnerf.capture import frame_choice as choice
 from efficientnerf.capture.frame_motion import DETAIL, TRACKED, Motion, sharpness
-from pipeline.files import atomic, remove
-from stages.io.png import FAST
+from pipeline.files import remove
+from stages.io.png import FAST, write_png
 from stages.scratch import note, noted, once, same_as
 from stages.video.reading import Frame, UnreadableVideo, Video, opened
 
@@ -165,8 +165,7 @@ def _written(name: str, path: Path, place: int, numbers: list[int], max_side: in
 def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> None:
     exif = Image.Exif()
     exif[Base.Make] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
-    with atomic(path, durable=False) as temporary:
-        Image.fromarray(frame.rgb(max_side)).save(temporary, "PNG", compress_level=FAST, exif=exif)
+    write_png(frame.rgb(max_side), path, compress_level=FAST, durable=False, exif=exif)
 
 
 def _record(name: str, found: FirstReading, verdicts: list[str]) -> dict[str, object]:

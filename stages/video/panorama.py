@@ -12,10 +12,10 @@ import numpy as np
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from pipeline.files import atomic, remove
+from pipeline.files import remove
 from stages.io.photo import read_photo
 from stages.io.pictures import MAX_SIDE, UnreadableImage, opened
-from stages.io.png import FAST
+from stages.io.png import FAST, write_png
 from stages.scratch import note, noted, once, same_as
 
 VIEWS = 8
@@ -94,5 +94,4 @@ def _write(pixels: np.ndarray, path: Path) -> None:
     exif[IFD.Exif] = {  # half a side is the focal length
         Base.FocalLength: 10.0, Base.FocalPlaneXResolution: side / 20, Base.FocalPlaneResolutionUnit: _MILLIMETRE, Base.ExifImageWidth: side,
     }  # fmt: skip
-    with atomic(path, durable=False) as temporary:
-        Image.fromarray(pixels).save(temporary, "PNG", compress_level=FAST, exif=exif)
+    write_png(pixels, path, compress_level=FAST, durable=False, exif=exif)
