@@ -4,6 +4,7 @@ import contextlib
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from efficientnerf.geometry.cameras import Camera, project
@@ -13,6 +14,10 @@ from stages.io.pictures import UnreadableImage
 from tests.stages import captures, exports
 from tests.stages.captures import Settings
 from tests.stages.exports import read
+
+
+def write_exr(path: Path, **channels: np.ndarray) -> None:
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(str(path))
 
 
 def sharp(folder: Path) -> tuple[Path, list[Camera]]:
@@ -76,15 +81,13 @@ def test_depth_of_transforms(key: str, unit: float, more: dict[str, float], tmp_
 
 
 def test_record3ds_depth(tmp_path: Path) -> None:
-    openexr = pytest.importorskip("OpenEXR")
     folder, _ = exports.record3d(tmp_path / "a")
     place = folder / "EXR_RGBD/depth"
     place.mkdir()
     for photo in read(folder).photos:
         values = np.ascontiguousarray(exports.plane_depth(photo.camera, 64, 48), np.float32)
         values[:5] = np.nan
-        header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-        openexr.File(header, {"R": values}).write(str(place / f"{photo.image.stem}.exr"))
+        write_exr(place / f"{photo.image.stem}.exr", R=values)
     capture = read(folder)
     assert np.abs(capture.points.xyz[:, 2]).max() < 0.01
     assert place / "3.exr" in importers.files(folder, Settings())
@@ -97,20 +100,16 @@ def test_record3ds_depth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("channels", "side"), [(60, 40), (12, 3000), (1, 5000)])
 def test_an_exr_of_many_pixels_is_refused_before_they_are_decoded(channels: int, side: int, tmp_path: Path) -> None:
     """60 channels of nothing were 550 kB, 570 MB of memory and five seconds."""
-    openexr = pytest.importorskip("OpenEXR")
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
     empty = np.zeros((side, side), np.float16)
-    openexr.File(header, {f"c{number:02}": empty for number in range(channels)}).write(str(tmp_path / "a.exr"))
+    write_exr(tmp_path / "a.exr", **{f"c{number:02}": empty for number in range(channels)})
     with pytest.raises(UnreadableImage, match="pixels"):
         depth._exr(tmp_path / "a.exr")
 
 
 def test_an_exr_that_is_cut_short_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """The library prints to standard output, where --json has objects alone."""
-    openexr = pytest.importorskip("OpenEXR")
     path = tmp_path / "a.exr"
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    openexr.File(header, {"R": np.random.default_rng(0).random((64, 64), np.float32)}).write(str(path))
+    write_exr(path, R=np.random.default_rng(0).random((64, 64), np.float32))
     data = path.read_bytes()
     for end in range(300, len(data), len(data) // 7):
         path.write_bytes(data[:end])
