@@ -3,16 +3,14 @@
 N points, R rays, V source views, K views of a ray, W x H pixels of a view.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.fields.gradient_buffer import GradientBuffer
+from efficientnerf.fields.field import Field
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.rendering.compositing import ray_of_sample
@@ -126,20 +124,11 @@ def as_logit(colour: Tensor) -> Tensor:
     return torch.logit(colour.clamp(DARKEST, 1 - DARKEST))
 
 
-class SourceViewField(nn.Module, ABC):
+class SourceViewField(Field):
     """A field (`efficientnerf.fields.field`) whose density and colour depend on the source views, which are chosen for each ray."""
 
     activation = "exp"
-    degree = 0  # one coefficient a colour, of a constant
-    gradient_buffers: ClassVar[dict[str, GradientBuffer]] = {}
     views: SourceViews
-
-    @abstractmethod
-    def along_rays(self, points: Tensor, directions: Tensor, first: Tensor) -> Tensor:
-        """(N, 4): raw density, and the colour's logits."""
-
-    def harmonics(self, directions: Tensor) -> Tensor:
-        return torch.ones_like(directions[:, :1])  # the colour depends on the direction by itself
 
     def density(self, points: Tensor) -> Tensor:
         """As seen from any source view, another one for each point: the density depends on who looks, and density voxels average over it.

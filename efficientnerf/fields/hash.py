@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from efficientnerf.backends import dispatch
 from efficientnerf.backends.torch.hash_grid import HashLevels
 from efficientnerf.backends.torch.linear_chain import fused_precision_of
-from efficientnerf.fields.bakeable import BakeableField
+from efficientnerf.fields.field import BakeableField
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.settings import resolved

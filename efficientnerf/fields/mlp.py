@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from efficientnerf.backends.torch.linear_chain import chain, precision_of
-from efficientnerf.fields.bakeable import BakeableField
+from efficientnerf.fields.field import BakeableField, Field
 from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.training.settings import TrainSettings
 
@@ -45,33 +45,41 @@ def linear_layers(shapes: list[tuple[int, int]], generator: torch.Generator) -> 
     return weights, biases
 
 
-class MlpField(BakeableField):
-    """`layers` of `hidden` units; the input enters again in the middle. See `efficientnerf.fields.field`.
+class PositionNetwork(Field):
+    """`layers` of `hidden` units over the encoded position, which enters again in the middle; then `outputs` numbers, the raw density first.
 
     precision  "auto", "float32" or "bfloat16": what products are computed in (`efficientnerf.backends.torch.linear_chain`)
     """
 
     activation = "softplus"
 
-    def __init__(self, *, hidden: int, layers: int, degree: int, generator: torch.Generator, precision: str = "float32") -> None:
+    def __init__(self, *, hidden: int, layers: int, outputs: int, generator: torch.Generator, precision: str) -> None:
         super().__init__()
-        self.degree, self.precision = degree, precision
+        self.precision = precision
         self.skip = layers // 2 or None
         inputs = 3 + 6 * FREQUENCIES
         widths = [inputs] + [hidden + (inputs if layer == self.skip else 0) for layer in range(1, layers)] + [hidden]
-        outputs = [*[hidden] * layers, 1 + 3 * harmonics_count(degree)]
-        self.weights, self.biases = linear_layers(list(zip(widths, outputs, strict=True)), generator)
-
-    def forward(self, points: Tensor) -> Tensor:
-        return self._network(points, self.weights[-1], self.biases[-1])
+        self.weights, self.biases = linear_layers(list(zip(widths, [*[hidden] * layers, outputs], strict=True)), generator)
 
     def density(self, points: Tensor) -> Tensor:
-        return self._network(points, self.weights[-1][:1], self.biases[-1][:1])[:, 0]
+        return self.network(points, self.weights[-1][:1], self.biases[-1][:1])[:, 0]
 
-    def _network(self, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def network(self, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """What the last layer gives at points (N, 3), with these rows of its weights and biases."""
         weights, biases = [*list(self.weights)[:-1], weight], [*list(self.biases)[:-1], bias]
         precision = precision_of(self.precision, points.device.type)
         return chain(positional_encoding(points * 2 - 1), weights, biases, skip=self.skip, precision=precision)
+
+
+class MlpField(PositionNetwork, BakeableField):
+    """The paper's network; see `efficientnerf.fields.field`."""
+
+    def __init__(self, *, hidden: int, layers: int, degree: int, generator: torch.Generator, precision: str = "float32") -> None:
+        super().__init__(hidden=hidden, layers=layers, outputs=1 + 3 * harmonics_count(degree), generator=generator, precision=precision)
+        self.degree = degree
+
+    def forward(self, points: Tensor) -> Tensor:
+        return self.network(points, self.weights[-1], self.biases[-1])
 
 
 def coarse_and_fine(s: TrainSettings, generator: torch.Generator) -> tuple[MlpField, MlpField]:

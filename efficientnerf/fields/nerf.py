@@ -4,56 +4,35 @@ The trunk is that of `efficientnerf.fields.mlp`. From it come the density and a 
 frequencies, 27 numbers) goes through one layer of half the width to the colour. With 8 layers of 256: 595,844 parameters.
 """
 
-from typing import ClassVar
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from efficientnerf.backends.torch.linear_chain import chain, precision_of
-from efficientnerf.fields.gradient_buffer import GradientBuffer
-from efficientnerf.fields.mlp import FREQUENCIES, linear_layers, positional_encoding
+from efficientnerf.fields.mlp import PositionNetwork, linear_layers, positional_encoding
 from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.training.settings import TrainSettings
 
 DIRECTION_FREQUENCIES = 4
 
 
-class NerfField(nn.Module):
+class NerfField(PositionNetwork):
     """See `efficientnerf.fields.field`; its values are the density and the colour before its sigmoid."""
 
-    activation = "softplus"
-    degree = 0  # one coefficient a colour, of a constant
-    gradient_buffers: ClassVar[dict[str, GradientBuffer]] = {}
-
     def __init__(self, *, hidden: int, layers: int, generator: torch.Generator, precision: str = "float32") -> None:
-        super().__init__()
-        self.precision = precision
-        self.skip = layers // 2 or None
-        inputs, directions = 3 + 6 * FREQUENCIES, 3 + 6 * DIRECTION_FREQUENCIES
-        widths = [inputs] + [hidden + (inputs if layer == self.skip else 0) for layer in range(1, layers)]
-        # Density and feature in one product: row 0 is the density.
-        shapes = [(width, hidden) for width in widths] + [(hidden, 1 + hidden)]
-        self.weights, self.biases = linear_layers(shapes, generator)
+        super().__init__(hidden=hidden, layers=layers, outputs=1 + hidden, generator=generator, precision=precision)
+        directions = 3 + 6 * DIRECTION_FREQUENCIES
         self.colour_weights, self.colour_biases = linear_layers([(hidden + directions, hidden // 2), (hidden // 2, 3)], generator)
 
     def forward(self, points: Tensor, directions: Tensor) -> Tensor:
         """(N, 4) at points (N, 3) in grid coordinates, along unit directions (N, 3)."""
-        precision = precision_of(self.precision, points.device.type)
-        both = chain(positional_encoding(points * 2 - 1), list(self.weights), list(self.biases), skip=self.skip, precision=precision)
+        both = self.network(points, self.weights[-1], self.biases[-1])
         inputs = torch.cat([both[:, 1:], positional_encoding(directions, DIRECTION_FREQUENCIES)], dim=-1)
+        precision = precision_of(self.precision, points.device.type)
         colour = chain(inputs, list(self.colour_weights), list(self.colour_biases), precision=precision)
         return torch.cat([both[:, :1], colour], dim=-1)
 
     def along_rays(self, points: Tensor, directions: Tensor, first: Tensor) -> Tensor:
         return self.forward(points, directions[ray_of_sample(first, len(points))])
-
-    def harmonics(self, directions: Tensor) -> Tensor:
-        return torch.ones_like(directions[:, :1])  # the colour is the network's
-
-    def density(self, points: Tensor) -> Tensor:
-        weights, biases = [*list(self.weights)[:-1], self.weights[-1][:1]], [*list(self.biases)[:-1], self.biases[-1][:1]]
-        precision = precision_of(self.precision, points.device.type)
-        return chain(positional_encoding(points * 2 - 1), weights, biases, skip=self.skip, precision=precision)[:, 0]
 
 
 def coarse_and_fine(s: TrainSettings, generator: torch.Generator) -> tuple[NerfField, NerfField]:

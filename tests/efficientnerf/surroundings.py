@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.fields.bakeable import BakeableField
+from efficientnerf.fields.field import BakeableField
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from efficientnerf.fields.bakeable import BakeableField
+from efficientnerf.fields.field import BakeableField
 from efficientnerf.model import Model, render_rays, restore, state_of
 from tests.efficientnerf.balls import pixels, untrained
 

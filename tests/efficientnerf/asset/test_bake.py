@@ -10,7 +10,7 @@ from torch import Tensor
 from efficientnerf.asset.bake import Visibility, chosen_voxels, grid_of, visible_voxels, voxel_values
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.tree import tree_from_voxels
-from efficientnerf.fields.bakeable import BakeableField
+from efficientnerf.fields.field import BakeableField
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
