@@ -4,12 +4,11 @@ Both samplings begin with the same weights, and differ in nothing else: uniform 
 ones, with density voxels that are swept before the first step. Finetunings are kept under OUT/runs as others are.
 """
 
-import dataclasses
 import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,8 +23,9 @@ from efficientnerf.evaluation.metrics import psnr
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model
 from efficientnerf.rendering.field_renderer import FieldRenderer
+from efficientnerf.sampling.occupancy import reset_cells, sweep_cells
 from efficientnerf.training import loop
-from efficientnerf.training.occupancy_update import sweep_occupancy
+from efficientnerf.training.occupancy_update import update_at_cells
 from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
 from pipeline.run import NAME, Run
@@ -46,6 +46,7 @@ UNIFORM = 128  # samples of a ray: MVSNeRF's, and IBRNet's 64 + 64
 SHARE_OF_ITERATIONS = 0.3  # of those of the other rows, which begin from nothing
 # Before its activation: valid is a voxel above it. A voxel that a surface cuts is empty in part, so that its mean is below zero, where the paper prunes.
 LEAST_DENSITY = -3.0
+SWEPT = 2**14  # voxels that are queried at a time: what source views say of more does not fit the cache
 REFERENCES = 6  # views whose volumes MVSNeRF encodes, spread over the scene
 CHECKS = (0.0, 0.1, 0.25, 0.5, 1.0)  # shares of the steps after which test views are rendered
 SEEDS = (0, 1)
@@ -109,13 +110,13 @@ def finetuned(request: Request, data: Path, method: str, sampling: Sampling, set
         run_stages(run, [stage for stage in asset.STAGES if stage.name == "poses"], device=request.device, report=request.report)
     train = finetuning_settings(settings["train"], sampling, seed)
     network = pretrained_network(method)
-    key = {"weights": digest_of(dict(network.state_dict())), "settings": dataclasses.asdict(train)}
+    key = {"weights": digest_of(dict(network.state_dict())), "settings": asdict(train)}
     kept = folder / f"{method}-{sampling}-{seed}.json"
     if kept.exists() and (found := json.loads(kept.read_text(encoding="utf-8")))["of"] == key:
         return Finetuned(**found["figures"])
     request.say(f"{data.name}, {method}, {sampling} sampling, seed {seed}: finetuning {train.iterations} steps")
     out = _finetune(run.folder("poses"), network, train)
-    write_json(kept, {"of": key, "figures": dataclasses.asdict(out)})
+    write_json(kept, {"of": key, "figures": asdict(out)})
     return out
 
 
@@ -158,8 +159,15 @@ def observed(
     m = model(space, settings, background, fields=(network.coarse, network.fine))
     m.voxels.threshold = LEAST_DENSITY
     if m.prunes:
-        sweep_occupancy(m, settings.seed)
+        sweep(m, settings.seed)
     return m
+
+
+@torch.no_grad()
+def sweep(m: Model, seed: int) -> None:
+    """Set every voxel to the density at a random point in it: the coarse field knows the scene before it is trained."""
+    update_at_cells(replace(m, voxels=replace(m.voxels, beta=1.0)), *sweep_cells(m.voxels, 0, 1, seed), SWEPT)
+    reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
 
 
 def _psnr(renderer: FieldRenderer, folder: Path, views: tuple[View, ...], background: tuple[float, float, float] | None) -> float:

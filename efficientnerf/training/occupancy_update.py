@@ -1,7 +1,5 @@
 """Updates of the density voxels in training: with the coarse field's densities on the rays of a step, and at random voxels now and then."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,7 +11,6 @@ from efficientnerf.sampling.occupancy import apply_decay, cell_of, random_cells,
 
 SWEEP_PARTS = 8  # updates of the warm-up that together query every voxel
 BLOCK = 2**17  # voxels that are queried at a time
-SWEPT = 2**14  # the same in a sweep: what source views say of more does not fit the cache
 
 
 @torch.no_grad()
@@ -51,17 +48,11 @@ def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> N
         cell, point = sweep_cells(m.voxels, number // m.settings.occupancy_update_interval, SWEEP_PARTS, seed)
     else:
         cell, point = random_cells(m.voxels, int(m.settings.occupancy_update_fraction * m.voxels.side**3), seed)
-    _update_at_cells(m, cell, point)
+    update_at_cells(m, cell, point)
 
 
-@torch.no_grad()
-def sweep_occupancy(m: Model, seed: int = 0) -> None:
-    """Set every voxel to the density at a random point in it, for a coarse field that knows the scene before it is trained."""
-    _update_at_cells(replace(m, voxels=replace(m.voxels, beta=1.0)), *sweep_cells(m.voxels, 0, 1, seed), SWEPT)
-    reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
-
-
-def _update_at_cells(m: Model, cell: Tensor, point: Tensor, block: int = BLOCK) -> None:
+def update_at_cells(m: Model, cell: Tensor, point: Tensor, block: int = BLOCK) -> None:
+    """Query the coarse field at points (N, 3) in some voxels (N,), `block` at a time."""
     for begin in range(0, len(cell), block):
         part = point[begin : begin + block]
         update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + block])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.paper.ibrnet import IbrNet, RayAttention, moments, normalised
 from benchmarks.paper.mvsnerf import ENCODING, SIDE, MvsNerf, cost_volume
-from benchmarks.paper.pretrained import SourceViewNetwork
+from benchmarks.paper.pretrained import SourceViewNetwork, sweep
 from benchmarks.paper.source_view_training import SETTINGS, WHITE, PosedImages, pretrain
 from benchmarks.paper.source_views import SourceViews, as_logit, bilinear, look_up, source_views, trilinear
 from efficientnerf.geometry.cameras import project, rays
@@ -19,7 +19,6 @@ from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import model
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.sampling.occupancy import sweep_cells
-from efficientnerf.training.occupancy_update import sweep_occupancy
 from tests.efficientnerf.balls import cameras, picture
 
 BOX = BoundedSpace(np.array([[-1.0, -0.8, -0.9], [1.0, 0.8, 0.9]]))
@@ -253,7 +252,7 @@ def test_a_sweep_sets_every_voxel_to_the_density_at_a_point_in_it(network: Sourc
     with torch.no_grad():
         expected = m.coarse.density(points)
         nothing = not (expected > m.voxels.threshold).any()
-    sweep_occupancy(m, 3)
+    sweep(m, 3)
     torch.testing.assert_close(m.voxels.values.flatten(), torch.full_like(expected, m.voxels.start) if nothing else expected)
 
 
