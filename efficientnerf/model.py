@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from efficientnerf.backends import dispatch
 from efficientnerf.fields.field import Field
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import RayBundle, Space, voxel_centres
-from efficientnerf.rendering.compositing import Composite
+from efficientnerf.rendering.compositing import Composite, ray_of_sample
 from efficientnerf.rendering.harmonics import C0, harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples
@@ -63,11 +63,10 @@ class Model:
         """Whether the density voxels are used."""
         return self.strategy.prunes
 
-    @property
-    def distortion(self) -> float:
-        """Weight of the distortion loss."""
+    def distortion_weight(self, fraction: float) -> float:
+        """Of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean of `RayOutputs.distortion`; fraction of the schedule, 0 to 1."""
         stated = resolved(self.settings.distortion_loss_weight)
-        return self.space.distortion_loss_weight if stated is None else stated
+        return self.space.distortion_schedule(fraction) * (self.space.distortion_loss_weight if stated is None else stated)
 
     @property
     def num_coarse_samples(self) -> int:
@@ -79,6 +78,10 @@ class Model:
     @property
     def device(self) -> torch.device:
         return self.voxels.values.device
+
+    def rays_at_once(self, most: int) -> int:
+        """How many rays to render at once, at most `most`: without pruning a ray has all samples."""
+        return most if self.prunes else min(most, max(64, 2**19 // (self.num_coarse_samples + self.settings.num_importance_samples)))
 
     def snapped_points(self, points: Tensor) -> Tensor:
         """Points (N, 3) in grid coordinates at which the fields are queried: these, or with `train.discretise` the centres of their voxels."""
@@ -121,6 +124,27 @@ class RayOutputs(NamedTuple):
     fine_weight: Tensor
     fine_rgb: Tensor
     distortion: Tensor
+
+    @property
+    def fine_ray(self) -> Tensor:
+        """(N,) which ray each fine sample belongs to."""
+        return ray_of_sample(self.fine.first, len(self.fine.start))
+
+    @property
+    def fine_middle(self) -> Tensor:
+        """(N,) distance along the ray of the middle of each fine sample."""
+        return self.fine.start + self.fine.extent / 2
+
+    def opacity_of(self, chosen: Tensor, ray: Tensor) -> Tensor:
+        """(R,) opacity of some of the fine samples, (N,) bool; `ray` is `fine_ray`."""
+        return torch.zeros_like(self.fine_opacity).index_add(0, ray, self.fine_weight * chosen)
+
+    def surface_distance(self, ray: Tensor) -> Tensor:
+        """(R,) distance in the world of the first fine sample at which half of a ray's light is gone; infinity where less is. `ray` is `fine_ray`."""
+        gone = torch.cumsum(self.fine_weight.double(), dim=0)
+        gone = gone - torch.cat([gone.new_zeros(1), gone])[self.fine.first[:-1]][ray]
+        distance = torch.where(gone >= 0.5, self.rays.world_distance(self.fine_middle, ray), torch.inf)
+        return torch.full_like(self.fine_opacity, torch.inf).scatter_reduce(0, ray, distance, reduce="amin")
 
 
 def model(
@@ -195,24 +219,19 @@ def render_rays(
     """
     rays = m.space.rays(origins, directions, near, far)
     request = SamplingRequest(rays, offset, samples_per_pivot or m.settings.samples_per_pivot, prune, rng, capacity, explored)
-    stage = m.strategy.coarse(request)
-    if stage is None:
-        pivotal, fine = m.strategy.fine(request, None, None)
+    if isinstance(m.strategy, Uniform):
+        fine = m.strategy.samples(request)
         fine_raw, out = _composited(m, m.fine, directions, fine, behind)
-        nothing = fine.start[:0]
-        none = Samples(torch.zeros_like(fine.first), nothing, nothing, nothing, fine.point[:0], fine.tried)
-        return RayOutputs(
-            rays, none, fine_raw[:0], out.weight[:0], None, pivotal, fine, fine_raw, out.colour, out.opacity, out.weight, out.sample_colour, out.distortion
-        )
+        none = Samples(torch.zeros_like(fine.first), *(column[:0] for column in fine[1:5]), fine.tried)
+        pivotal = torch.zeros(0, dtype=torch.bool, device=m.device)
+        return RayOutputs(rays, none, fine_raw[:0], out.weight[:0], None, pivotal, fine, fine_raw, *out[:2], *out[3:], out.distortion)
+    stage = m.strategy.coarse(request)
     coarse = stage.samples
     coarse_raw, coarse_out = _composited(m, m.coarse, directions, coarse, behind)
     pivotal, fine = m.strategy.fine(request, stage, coarse_out.weight.detach())
     fine_raw, out = _composited(m, m.fine, directions, fine, behind)
     distortion = out.distortion + coarse_out.distortion
-    return RayOutputs(
-        rays, coarse, coarse_raw, coarse_out.weight, coarse_out.colour, pivotal,
-        fine, fine_raw, out.colour, out.opacity, out.weight, out.sample_colour, distortion,
-    )  # fmt: skip
+    return RayOutputs(rays, coarse, coarse_raw, coarse_out.weight, coarse_out.colour, pivotal, fine, fine_raw, *out[:2], *out[3:], distortion)
 
 
 def _composited(m: Model, field: Field, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:
@@ -228,10 +247,16 @@ def state_of(m: Model) -> dict[str, Tensor]:
 
 def restore(m: Model, state: dict[str, Tensor]) -> None:
     """Put `state_of`'s tensors back; ValueError names what does not fit."""
-    wanted: dict[str, Any] = dict(m.parameters()) | {"voxels": m.voxels.values}
+    wanted = state_of(m)
+    check_tensors(state, wanted)
+    for name, tensor in wanted.items():
+        tensor.copy_(state[name])
+
+
+def check_tensors(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    """ValueError names the first tensor that is missing, or of another type or shape than the wanted one."""
     for name, tensor in wanted.items():
         if name not in state:
             raise ValueError(f"tensor '{name}' is missing")
         if state[name].shape != tensor.shape or state[name].dtype != tensor.dtype:
             raise ValueError(f"tensor '{name}' is {state[name].dtype} {tuple(state[name].shape)}; expected {tensor.dtype} {tuple(tensor.shape)}")
-        tensor.data.copy_(state[name])

@@ -98,7 +98,6 @@ class BoundedSpace(Box):
     contracted: ClassVar[bool] = False  # whether space beyond the box is contracted into a shell
     unbounded: ClassVar[bool] = False  # whether the space has no end, so that densities spread along rays and the distortion loss is needed
     reaches_infinity: ClassVar[bool] = False  # whether the box itself reaches to infinity, so that nothing can lie behind it
-    scales_near_gradients: ClassVar[bool] = False  # whether rays crowd together before the cameras, so that gradients there are scaled by the distance
     reach: ClassVar[float] = 1.0  # the largest contracted coordinate
     num_coarse_samples: ClassVar[int] = 128
     occupancy_resolution: ClassVar[int] = 128
@@ -148,7 +147,6 @@ class ContractedSpace(BoundedSpace):
 
     contracted: ClassVar[bool] = True
     unbounded: ClassVar[bool] = True
-    scales_near_gradients: ClassVar[bool] = True
     reach: ClassVar[float] = 2.0
     occupancy_resolution: ClassVar[int] = 192
 

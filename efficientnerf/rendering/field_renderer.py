@@ -13,7 +13,7 @@ from torch import Tensor
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.spaces import Box
 from efficientnerf.model import Model, RayOutputs, render_rays
-from efficientnerf.rendering.compositing import activate, ray_of_sample
+from efficientnerf.rendering.compositing import activate
 
 RAYS_PER_BLOCK = 8192
 Limits = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (R, 3), directions (R, 3), distances (R,) -> distances (R,)
@@ -100,26 +100,26 @@ class FieldRenderer:
         limits  for `nearer`: from where the light is half gone (infinity: nowhere) on rays to where on them to look; distances of the world
         """
         m = self.model
+        split = m.space if box is None else Box(box)
+        around = split if reach is None else Box(reach)
         parts, counts = [], SampleCounts()
         for origins, directions, slant, beyond, outputs in self._blocks(camera, progress):
             intervals = outputs.coarse.tried if m.space.contracted else len(origins) * (self.far - self.near) / m.step
             counts += SampleCounts(len(origins), intervals, valid_count(m, outputs), int(outputs.pivotal.sum()), len(outputs.fine.start))
-            split = split_by_box(m, slant, outputs, beyond, box)
-            found = [*split, opacity_within(m, outputs, box if reach is None else reach)]
+            found = [*split_by_box(slant, outputs, beyond, split), opacity_within(outputs, around)]
             if limits is not None:
-                stated = limits(*(a.double().cpu().numpy() for a in (origins, directions, split[2] / slant)))
+                stated = limits(*(a.double().cpu().numpy() for a in (origins, directions, found[2] / slant)))
                 found.append(opacity_nearer(outputs, torch.as_tensor(stated, dtype=torch.float32, device=m.device)))
             parts.append([part.cpu().numpy() for part in found])
         shape = (camera.height, camera.width)
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        colour, opacity, depth, before, behind, inside, within, *nearer = (column.reshape(*shape, *column.shape[1:]) for column in columns)
-        return FieldRendering(colour, opacity, depth, before, behind, inside, counts, within, nearer[0] if nearer else None)
+        columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+        images = [column.reshape(*shape, *column.shape[1:]) for column in columns]
+        return FieldRendering(*images[:6], counts, *images[6:])
 
     def _blocks(self, camera: Camera, progress: Callable[..., Any] | None) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, RayOutputs]]:
         """Rays of an image, some at a time: origins, directions, their cosine to the view axis, the colour behind all samples, and what they meet."""
         m, count = self.model, camera.width * camera.height
-        # Without pruning a ray has all samples.
-        block = RAYS_PER_BLOCK if m.prunes else min(RAYS_PER_BLOCK, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
+        block = m.rays_at_once(RAYS_PER_BLOCK)
         for begin in range(0, count, block):
             index = np.arange(begin, min(count, begin + block))
             pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)
@@ -132,57 +132,44 @@ class FieldRenderer:
                 progress(begin + len(index), count)
 
 
-def opacity_within(m: Model, outputs: RayOutputs, box: np.ndarray | None) -> Tensor:
-    """Opacity (R,) of all that lies before a ray leaves a box (2, 3), None: that of the space; 0 where it misses it."""
-    enter, leave = (m.space if box is None else Box(box)).intersect(outputs.rays.origins, outputs.rays.directions)
-    leave = torch.where(leave <= torch.clamp(enter, min=0), -torch.inf, leave)
-    ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
-    chosen = outputs.fine.start + outputs.fine.extent / 2 <= leave[ray]
-    return torch.zeros_like(leave).index_add(0, ray, outputs.fine_weight * chosen)
+def crossings(outputs: RayOutputs, box: Box) -> tuple[Tensor, Tensor]:
+    """Distances (R,) at which rays enter and leave a box; minus infinity both where they miss it."""
+    enter, leave = box.intersect(outputs.rays.origins, outputs.rays.directions)
+    misses = leave <= torch.clamp(enter, min=0)
+    return torch.where(misses, -torch.inf, enter), torch.where(misses, -torch.inf, leave)
+
+
+def opacity_within(outputs: RayOutputs, box: Box) -> Tensor:
+    """Opacity (R,) of all that lies before a ray leaves a box; 0 where it misses it."""
+    ray = outputs.fine_ray
+    return outputs.opacity_of(outputs.fine_middle <= crossings(outputs, box)[1][ray], ray)
 
 
 def opacity_nearer(outputs: RayOutputs, limits: Tensor) -> Tensor:
     """Opacity (R,) of the samples whose middle is nearer than the limits (R,), distances of the world."""
-    ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
-    chosen = outputs.rays.world_distance(outputs.fine.start + outputs.fine.extent / 2, ray) < limits[ray]
-    return torch.zeros_like(limits).index_add(0, ray, outputs.fine_weight * chosen)
+    ray = outputs.fine_ray
+    return outputs.opacity_of(outputs.rays.world_distance(outputs.fine_middle, ray) < limits[ray], ray)
 
 
-def split_by_box(m: Model, slant: Tensor, outputs: RayOutputs, behind: Tensor, box: np.ndarray | None = None) -> tuple[Tensor, ...]:
+def split_by_box(slant: Tensor, outputs: RayOutputs, behind: Tensor, box: Box) -> tuple[Tensor, ...]:
     """Colour, opacity, depth, before, behind and inside_opacity of a FieldRendering for rays (R, ...): each fine sample belongs in front of the box, in it or
-    beyond it.
+    beyond it. A ray that misses the box sees only what lies beyond."""
+    ray, middle = outputs.fine_ray, outputs.fine_middle
+    enter, leave = crossings(outputs, box)
 
-    box  (2, 3) in the world, where that is the space's frame; None: that of the space
-    """
-    count = len(slant)
-    ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
-    middle = outputs.fine.start + outputs.fine.extent / 2
-    origins, directions = outputs.rays.origins, outputs.rays.directions
-    enter, leave = (m.space if box is None else Box(box)).intersect(origins, directions)
-    misses = leave <= torch.clamp(enter, min=0)  # such a ray sees only what lies beyond
-    enter = torch.where(misses, -torch.inf, enter)
-    leave = torch.where(misses, -torch.inf, leave)
-
-    def opacity_of(chosen: Tensor) -> Tensor:
-        return outputs.fine_weight.new_zeros(count).index_add(0, ray, outputs.fine_weight * chosen)
-
-    def gathered(chosen: Tensor) -> tuple[Tensor, Tensor]:
+    def colour_of(chosen: Tensor) -> Tensor:
         weight = outputs.fine_weight * chosen
-        return weight.new_zeros(count, 3).index_add(0, ray, weight[:, None] * outputs.fine_rgb), opacity_of(chosen)
+        return weight.new_zeros(len(slant), 3).index_add(0, ray, weight[:, None] * outputs.fine_rgb)
 
     in_front, beyond = middle < enter[ray], middle > leave[ray]
-    before, before_opacity = gathered(in_front)
-    inside_opacity = opacity_of(~in_front & ~beyond)
-    after, after_opacity = gathered(beyond)
+    before_opacity, after_opacity = outputs.opacity_of(in_front, ray), outputs.opacity_of(beyond, ray)
+    inside_opacity = outputs.opacity_of(~in_front & ~beyond, ray)
     reaching_box = (1 - before_opacity).clamp(min=0)
     passing_box = (reaching_box - inside_opacity).clamp(min=0)
     rest = (passing_box - after_opacity).clamp(min=0)
     # The colour beyond the box is unknown, and does not matter, where hardly any light passes the box.
-    beyond_colour = torch.where((passing_box > 1e-4)[:, None], (after + rest[:, None] * behind) / passing_box.clamp(min=1e-4)[:, None], behind)
-    inside = torch.where(reaching_box > 1e-4, inside_opacity / reaching_box.clamp(min=1e-4), torch.zeros_like(inside_opacity))
-    # Depth: the first sample at which half of the light is gone.
-    gone = torch.cumsum(outputs.fine_weight.double(), dim=0)
-    gone = gone - torch.cat([gone.new_zeros(1), gone])[outputs.fine.first[:-1]][ray]
-    distance = torch.where(gone >= 0.5, outputs.rays.world_distance(middle, ray), torch.inf)
-    depth = torch.full_like(slant, torch.inf).scatter_reduce(0, ray, distance, reduce="amin")
-    return outputs.fine_colour, outputs.fine_opacity, depth * slant, torch.cat([before, before_opacity[:, None]], dim=1), beyond_colour, inside.clamp(max=1)
+    after = (colour_of(beyond) + rest[:, None] * behind) / passing_box.clamp(min=1e-4)[:, None]
+    beyond_colour = torch.where((passing_box > 1e-4)[:, None], after, behind)
+    inside = torch.where(reaching_box > 1e-4, inside_opacity / reaching_box.clamp(min=1e-4), 0)
+    before = torch.cat([colour_of(in_front), before_opacity[:, None]], dim=1)
+    return outputs.fine_colour, outputs.fine_opacity, outputs.surface_distance(ray) * slant, before, beyond_colour, inside.clamp(max=1)

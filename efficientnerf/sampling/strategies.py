@@ -5,12 +5,15 @@
     Hierarchical  stratified samples, then importance samples of the fine field (NeRF)
     Uniform       stratified samples of the fine field alone
 
+`prunes` says whether a strategy uses the density voxels; `coarse` gives the coarse samples, and `fine`, by the weights (N,) of these without gradient, which
+of them are pivotal (N,) bool, and the fine samples. `Uniform` has `samples` alone.
+
 R rays, N coarse samples.
 """
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -43,21 +46,6 @@ class CoarseStage(NamedTuple):
 
     samples: Samples
     distance: Tensor | None = None
-
-
-class Strategy(Protocol):
-    """A sampling strategy.
-
-    prunes                            whether it uses the density voxels
-    coarse(request)                   the coarse samples; None: the strategy has no coarse stage
-    fine(request, coarse, weight)     which coarse samples are pivotal (N,) bool, and the fine samples; weight (N,) without gradient
-    """
-
-    prunes: ClassVar[bool]
-
-    def coarse(self, request: SamplingRequest) -> CoarseStage | None: ...
-
-    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]: ...
 
 
 @dataclass(frozen=True)
@@ -116,9 +104,7 @@ class Efficient:
     def coarse(self, request: SamplingRequest) -> CoarseStage:
         return CoarseStage(self.intervals.valid(request, self.unpruned_fraction))
 
-    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
-        assert coarse is not None
-        assert weight is not None
+    def fine(self, request: SamplingRequest, coarse: CoarseStage, weight: Tensor) -> tuple[Tensor, Samples]:
         pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
         if request.explored is not None:
             pivotal = pivotal | request.explored
@@ -138,9 +124,7 @@ class _ImportanceSampled:
     max_pivots: int
     num_importance_samples: int
 
-    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
-        assert coarse is not None
-        assert weight is not None
+    def fine(self, request: SamplingRequest, coarse: CoarseStage, weight: Tensor) -> tuple[Tensor, Samples]:
         pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
         quantile = _quantiles(len(request.offset), self.num_importance_samples, request.rng, request.offset.device)
         distance = distances_at(coarse.samples, request.offset) if coarse.distance is None else coarse.distance
@@ -177,13 +161,12 @@ class Uniform:
     intervals: Intervals
     num_importance_samples: int
 
-    def coarse(self, request: SamplingRequest) -> None:
-        return None
-
-    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
+    def samples(self, request: SamplingRequest) -> Samples:
         capacity = None if request.capacity is None else request.capacity.fine
-        samples = self.intervals.stratified(request, self.intervals.count + self.num_importance_samples, capacity).samples
-        return torch.zeros(0, dtype=torch.bool, device=samples.start.device), samples
+        return self.intervals.stratified(request, self.intervals.count + self.num_importance_samples, capacity).samples
+
+
+Strategy = Efficient | Valid | Hierarchical | Uniform
 
 
 def distances_at(samples: Samples, offset: Tensor) -> Tensor:

@@ -27,14 +27,13 @@ from efficientnerf.sampling.strategies import Efficient
 from efficientnerf.training.batch import ray_count
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure.model import Exposure, is_learned
-from efficientnerf.training.losses import distortion_weight
 from efficientnerf.training.occupancy_update import update_in_turn
 from efficientnerf.training.optimiser import Adam, ParameterGroup, parameter_groups
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.readback import AsyncReadback, StepCounts, counts_of
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.sparse_depth import SparseDepthRays, sparse_depth_weight
-from efficientnerf.training.step import Learner, StepInputs, StepNumbers, StepPlan, drawn_step, explored_of, step_on_rays
+from efficientnerf.training.step import Learner, StepInputs, StepNumbers, StepPlan, drawn_step, step_on_rays
 from efficientnerf.training.step_graphs import StepGraphs
 from efficientnerf.training.view_checks.checks import ViewChecks, follow_checks
 
@@ -118,11 +117,7 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
 def _check(t: Trainer, state: dict[str, Tensor]) -> tuple[int, float]:
     """The step and the samples on a ray of a state; ValueError where a tensor is missing, unknown or of another type or shape, or a number impossible."""
     wanted = state_of(t)
-    for name, tensor in wanted.items():
-        if name not in state:
-            raise ValueError(f"tensor '{name}' is missing")
-        if state[name].shape != tensor.shape or state[name].dtype != tensor.dtype:
-            raise ValueError(f"tensor '{name}' is {state[name].dtype} {tuple(state[name].shape)}; expected {tensor.dtype} {tuple(tensor.shape)}")
+    models.check_tensors(state, wanted)
     if unknown := sorted(state.keys() - wanted.keys()):
         raise ValueError(f"tensor '{unknown[0]}' is of no part of the model")
     step, samples_per_ray = (float(number) for number in state["progress"])
@@ -155,7 +150,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
             readback.restart()  # rays will have other numbers of samples from now on
 
         weight = sparse_depth_weight(settings.sparse_depth_loss_weight, fraction) if m.space.unbounded else 0.0
-        numbers = StepNumbers(t.adam.step_size(number, t.schedule.learning_rate_at(number)), distortion_weight(m, fraction), weight)
+        numbers = StepNumbers(t.adam.step_size(number, t.schedule.learning_rate_at(number)), m.distortion_weight(fraction), weight)
         count = ray_count(settings, t.samples_per_ray)
         with graphs.ordered():
             count = count if readback is None else graphs.rays(count)
@@ -189,12 +184,14 @@ def _not_waited_for(
     learner: Learner, graphs: StepGraphs, readback: AsyncReadback, plan: StepPlan, inputs: StepInputs, numbers: StepNumbers, rng: np.random.Generator
 ) -> StepCounts:
     """A step on a device; statistics of some steps before."""
-    inputs = inputs._replace(explored=explored_of(learner.model, plan.capacity, rng))
+    m = learner.model
+    if isinstance(m.strategy, Efficient):
+        inputs = inputs._replace(explored=m.strategy.explored(plan.capacity, rng, m.device))
 
     def body(inputs: StepInputs, numbers: StepNumbers) -> Tensor:
         return counts_of(*step_on_rays(learner, plan, inputs, numbers, rng))
 
     # Strategies that draw as they sample, and samples that are counted, cannot be replayed.
-    if plan.capacity is None or not isinstance(learner.model.strategy, Efficient):
+    if plan.capacity is None or not isinstance(m.strategy, Efficient):
         return readback.record(graphs.launch(inputs, numbers, body))
     return readback.record(graphs.take(plan, inputs, numbers, body))

@@ -42,11 +42,6 @@ def colour_losses(
     return losses[0], losses[1] if len(losses) > 1 else None
 
 
-def distortion_weight(m: Model, fraction: float) -> float:
-    """Of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean of `RayOutputs.distortion`; fraction of the schedule, 0 to 1."""
-    return m.space.distortion_schedule(fraction) * m.distortion
-
-
 def scale_gradients_by_distance(m: Model, origins: Tensor, outputs: RayOutputs) -> None:
     """Scale gradients by the square of the distance to the camera, up to the distance of the box's centre: those of the first rays of the outputs, with
     `origins` (R, 3), and not those of rays after them.

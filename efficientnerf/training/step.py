@@ -9,7 +9,6 @@ from torch import Tensor
 
 from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.sampling.samples import SampleCapacity, complete_rays
-from efficientnerf.sampling.strategies import Efficient
 from efficientnerf.training.batch import DrawnRays, drawn_rays, ray_batch
 from efficientnerf.training.device_pixels import DevicePixels, on_host
 from efficientnerf.training.exposure.model import Exposure, exposure_loss, places
@@ -64,11 +63,6 @@ def drawn_step(learner: Learner, sparse_depth: SparseDepthRays | None, count: in
     return StepInputs(rays, None if learner.exposure is None else places(on_host(learner.pixels), rays.pixel), aimed)
 
 
-def explored_of(m: Model, capacity: SampleCapacity | None, rng: np.random.Generator) -> Tensor | None:
-    """`StepInputs.explored`."""
-    return m.strategy.explored(capacity, rng, m.device) if isinstance(m.strategy, Efficient) else None
-
-
 def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: StepNumbers, rng: np.random.Generator) -> tuple[Tensor, RayOutputs]:
     """The step, but for `efficientnerf.training.occupancy_update.update_in_turn`: mean squared error of the fine colours, and the rays before the step.
 
@@ -89,7 +83,7 @@ def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: 
         loss = loss + exposure_loss(exposure)
     if m.space.unbounded:
         loss = loss + numbers.distortion * mean_over(outputs.distortion[:count], complete)
-    if m.space.scales_near_gradients:
+    if m.space.contracted:
         scale_gradients_by_distance(m, batch.origins, outputs)
     if aimed is not None:
         loss = loss + numbers.sparse_depth * sparse_depth_loss(outputs, aimed.distance, aimed.on_support, plan.samples_per_pivot, fitting)

@@ -9,11 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.model import UNSEEN, Model, RayOutputs, render_rays
-from efficientnerf.rendering.compositing import ray_of_sample
+from efficientnerf.model import UNSEEN, Model, render_rays
 from efficientnerf.training.pixels import Pixels
 
 # docs/experiments/wrong-cameras.md
@@ -25,7 +23,7 @@ LOW_CONTRAST = 0.5  # of the median contrast, which a photograph counts as havin
 NEIGHBOURS = 8
 ROWS_AT_A_TIME = 256  # of a photograph
 FAR = 1e4  # world units: where points are put that lie beyond all samples
-RAYS_AT_A_TIME, SAMPLES_AT_A_TIME = 4096, 2**19  # the latter where nothing is pruned
+RAYS_AT_A_TIME = 4096
 SPREAD = 0.2  # of the logarithm of neighbours' errors, at least: photographs of one thing differ by as much
 
 
@@ -77,19 +75,19 @@ def _averaged_in_bands(pixels: Pixels, view: int, background: np.ndarray, side: 
 
 @torch.no_grad()
 def shown(m: Model, bundle: np.ndarray, grey: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Renders of the field along rays (R, 8), origin, unit direction, near and far: colours (R, 3) and distances (R,) of the surface, float64.
+    """Renders of the field along rays (R, 8), origin, unit direction, near and far: colours (R, 3) and distances (R,) of the surface, float64; FAR without one.
 
     grey  whether that lies behind the scene; else what the model has there
     """
     colours, distances = [np.empty((0, 3))], [np.empty(0)]
-    block = RAYS_AT_A_TIME if m.prunes else max(64, SAMPLES_AT_A_TIME // (m.num_coarse_samples + m.settings.num_importance_samples))
+    block = m.rays_at_once(RAYS_AT_A_TIME)
     for begin in range(0, len(bundle), block):
         part = torch.from_numpy(np.ascontiguousarray(bundle[begin : begin + block], np.float32)).to(m.device)
         directions = part[:, 3:6]
         behind = torch.full_like(directions, UNSEEN) if grey else m.behind(directions)
         outputs = render_rays(m, part[:, :3], directions, part[:, 6], part[:, 7], torch.full_like(part[:, 6], 0.5), behind)
         colours.append(outputs.fine_colour.double().cpu().numpy())
-        distances.append(surface_distance(outputs).double().cpu().numpy())
+        distances.append(outputs.surface_distance(outputs.fine_ray).clamp(max=FAR).double().cpu().numpy())
     return np.concatenate(colours), np.concatenate(distances)
 
 
@@ -180,14 +178,3 @@ def standing_out(errors: np.ndarray, neighbours: np.ndarray, trusted: np.ndarray
             middles_of.append(middle)
         out[n], usual[n] = min(found), np.exp(max(middles_of))
     return out, usual
-
-
-def surface_distance(outputs: RayOutputs) -> Tensor:
-    """(R,) distance in the world at which half of a ray's light is gone; FAR where less is."""
-    first = outputs.fine.first
-    ray = ray_of_sample(first, len(outputs.fine.start))
-    gone = torch.cumsum(outputs.fine_weight.double(), dim=0)
-    gone = gone - torch.cat([gone.new_zeros(1), gone])[first[:-1]][ray]
-    middle = outputs.rays.world_distance(outputs.fine.start + outputs.fine.extent / 2, ray)
-    distance = torch.where(gone >= 0.5, middle, FAR)
-    return torch.full_like(outputs.fine_opacity, FAR).scatter_reduce(0, ray, distance, reduce="amin")
