@@ -45,7 +45,7 @@ def world_distance(along: Any, begin: Any, ds_dt: Any, dlogz_dt: Any) -> Any:
     """World distance from a ray's own origin of points at distance `along` its warped ray; infinity from the far plane on. Arrays of one shape."""
     rest = ds_dt - dlogz_dt * along
     finite = rest > 1e-6 * ds_dt
-    return _where(finite, begin + along / _where(finite, rest, _one(rest)), np.inf)
+    return _where(finite, begin + along / _where(finite, rest, 1.0), np.inf)
 
 
 def ndc_distance(distance: Any, begin: Any, ds_dt: Any, dlogz_dt: Any) -> Any:
@@ -98,8 +98,8 @@ class Ndc:
         x, y, z = self._camera(world, directions=False)
         a, b = self.slopes
         ahead = z > 1e-6 * self.near
-        z = _where(ahead, z, _one(z))
-        return _stack([_where(ahead, a * x / z, _one(z) * 0), _where(ahead, b * y / z, _one(z) * 0), _where(ahead, 1 - 2 * self.near / z, BEYOND)])
+        z = _where(ahead, z, 1.0)
+        return _stack([_where(ahead, a * x / z, 0.0), _where(ahead, b * y / z, 0.0), _where(ahead, 1 - 2 * self.near / z, BEYOND)])
 
     def world(self, ndc: Any) -> Any:
         """The inverse of `points`, for z' < 1."""
@@ -131,19 +131,17 @@ class Ndc:
         x, y, z = self._camera(origins, directions=False)
         dx, dy, dz = self._camera(directions, directions=True)
         ahead = dz > 1e-9
-        steep = _where(ahead, dz, _one(dz))
-        begin = _where(z < self.near, _where(ahead, (self.near - z) / steep, _one(z) * np.inf), _one(z) * 0)
+        begin = _where(z < self.near, _where(ahead, (self.near - z) / _where(ahead, dz, 1.0), np.inf), 0.0)
         meets = begin < np.inf
-        begin = _where(meets, begin, _one(z) * 0)
+        begin = _where(meets, begin, 0.0)
         x, y = x + begin * dx, y + begin * dy
-        z = _where(meets, _at_least(z + begin * dz, self.near), _one(z) * self.near)
+        z = _where(meets, _at_least(z + begin * dz, self.near), self.near)
         jx, jy, jz = a * (dx * z - x * dz) / z**2, b * (dy * z - y * dz) / z**2, 2 * self.near * dz / z**2
         ds_dt = (jx * jx + jy * jy + jz * jz) ** 0.5
         nowhere = ~meets | (ds_dt < 1e-12)
-        divisor = _where(nowhere, _one(z), ds_dt)
-        zero, one = _one(z) * 0, _one(z)
-        start = _stack([_where(nowhere, zero, a * x / z), _where(nowhere, zero, b * y / z), _where(nowhere, one * BEYOND, 1 - 2 * self.near / z)])
-        along = _stack([_where(nowhere, zero, jx / divisor), _where(nowhere, zero, jy / divisor), _where(nowhere, one, jz / divisor)])
+        divisor = _where(nowhere, 1.0, ds_dt)
+        start = _stack([_where(nowhere, 0.0, a * x / z), _where(nowhere, 0.0, b * y / z), _where(nowhere, BEYOND, 1 - 2 * self.near / z)])
+        along = _stack([_where(nowhere, 0.0, jx / divisor), _where(nowhere, 0.0, jy / divisor), _where(nowhere, 1.0, jz / divisor)])
         return NdcRays(start, along, begin, divisor, dz / z)
 
     def world_normals(self, ndc: Any, normals: Any) -> Any:
@@ -159,7 +157,7 @@ class Ndc:
         local = _stack([nx, ny, (nz - x * nx - y * ny) / z])
         world = local @ _like(self.world_from_camera[:3, :3].T.copy(), ndc)
         length = (world * world).sum(-1) ** 0.5
-        return world / _where(length > 0, length, _one(length))[..., None]
+        return world / _where(length > 0, length, 1.0)[..., None]
 
 
 class WorldFrame:
@@ -191,10 +189,6 @@ def _like(constant: np.ndarray, value: Any) -> Any:
     from efficientnerf.backends import transfer  # finding cameras needs no torch
 
     return transfer.constant(constant, value)
-
-
-def _one(value: Any) -> Any:
-    return value * 0 + 1
 
 
 def _where(condition: Any, yes: Any, no: Any) -> Any:
