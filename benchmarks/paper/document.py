@@ -8,21 +8,18 @@ A row is a mapping from column to value; a column that ends in PAPER holds what 
 from a Request to a Result, and TABLES says which; what trains keeps its runs under OUT/runs, so that a table that was interrupted goes on where it was.
 """
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import hardware
 from benchmarks.paper import tables
-from benchmarks.paper.result import PAPER, Request, Result, Table
+from benchmarks.paper.result import Request, Table
 from benchmarks.paper.table7 import structures
 from pipeline.errors import BadInput, UsageError
-from pipeline.files import write_atomically
+from pipeline.files import write_atomically, write_json
 from pipeline.manifest import tool_versions
 from stages.figures.plots import curve, with_palette
-
-__all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
 
 TABLES: dict[str, Table] = {
     "1": Table("Shares of valid and of pivotal samples", True, tables.shares),
@@ -54,11 +51,11 @@ def make(number: str, request: Request, tables: Mapping[str, Table] = TABLES) ->
         "rows": [dict(row) for row in result.rows],
         "notes": list(result.notes),
         "hardware": hardware(request.device),
-        "versions": versions(),
+        "versions": {name: version for name, version in tool_versions() if name in ("efficientnerf", "torch", "numba")},
     }
     written = {"markdown": request.out / f"table_{number}.md", "json": request.out / f"table_{number}.json"}
-    _write(written["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
-    _write(written["markdown"], in_markdown(document))
+    write_json(written["json"], document)
+    write_atomically(written["markdown"], in_markdown(document).encode("utf-8"))
     if result.curves:
         written["plot"] = request.out / f"table_{number}.png"
         curve(written["plot"], result.curves, x_label="seconds of training", y_label="PSNR of test views / dB", title=f"Table {number}")
@@ -89,11 +86,3 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}"
     return str(value)
-
-
-def versions() -> dict[str, str]:
-    return {name: version for name, version in tool_versions() if name in ("efficientnerf", "torch", "numba")}
-
-
-def _write(path: Path, text: str) -> None:
-    write_atomically(path, text.encode("utf-8"))

@@ -5,11 +5,11 @@ ones, with density voxels that are swept before the first step. Finetunings are 
 """
 
 import json
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ import torch
 from benchmarks.paper.ibrnet import IbrNet
 from benchmarks.paper.mvsnerf import MvsNerf
 from benchmarks.paper.result import PAPER, Request, Result
+from benchmarks.paper.runs import run_to
 from benchmarks.paper.source_views import source_views
 from efficientnerf.evaluation.metrics import psnr
 from efficientnerf.geometry.spaces import BoundedSpace
@@ -28,14 +29,11 @@ from efficientnerf.training import loop
 from efficientnerf.training.occupancy_update import update_at_cells
 from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
-from pipeline.run import NAME, Run
-from pipeline.runner import run_stages
 from stages.evaluate.views import evaluation_views, evenly_spaced, ground_truth, subsample_camera
 from stages.io import scene
 from stages.io.field_file import digest_of, read_tensors, space_of
 from stages.io.scene import View
 from stages.train.data import depth_range, pixels_of
-from workflows import asset
 
 SourceViewNetwork = IbrNet | MvsNerf
 NETWORKS: dict[str, type[IbrNet] | type[MvsNerf]] = {"ibrnet": IbrNet, "mvsnerf": MvsNerf}
@@ -104,10 +102,7 @@ def finetuning_settings(train: dict[str, Any], sampling: Sampling, seed: int) ->
 def finetuned(request: Request, data: Path, method: str, sampling: Sampling, settings: dict[str, dict[str, Any]], seed: int) -> Finetuned:
     """Finetune on a scene, or read what an earlier call found. `settings` are those of the other rows."""
     folder = request.out / "runs" / data.name / "pretrained"
-    run = Run.open(folder) if (folder / NAME).exists() else Run.create(folder, data.resolve(), settings, device=request.device)
-    with run.locked():
-        run.update(source=data.resolve(), settings=settings)
-        run_stages(run, [stage for stage in asset.STAGES if stage.name == "poses"], device=request.device, report=request.report)
+    run, _ = run_to(request, folder, data, settings, ("poses",))
     train = finetuning_settings(settings["train"], sampling, seed)
     network = pretrained_network(method)
     key = {"weights": digest_of(dict(network.state_dict())), "settings": asdict(train)}
@@ -207,14 +202,10 @@ def rows(request: Request, data: Sequence[Path], settings: dict[str, dict[str, A
             some = [pair[k] for pair in pairs]
             hours, decibels = PRINTED[method, sampling]
             table.append(
-                {"method": method, "sampling": sampling, "training, hours": _mean([f.seconds[-1] / 3600 for f in some]), "training, hours" + PAPER: hours}
-                | {"s/iteration": _mean([f.step for f in some]), "mean s/iteration": _mean([f.seconds[-1] / steps for f in some])}
-                | {"coarse samples/ray": _mean([f.coarse for f in some]), "fine samples/ray": _mean([f.fine for f in some])}
-                | {EQUAL: _mean([pair[k] for pair in equal]), "PSNR": _mean([f.psnr[-1] for f in some]), "PSNR" + PAPER: decibels}
+                {"method": method, "sampling": sampling, "training, hours": fmean([f.seconds[-1] / 3600 for f in some]), "training, hours" + PAPER: hours}
+                | {"s/iteration": fmean([f.step for f in some]), "mean s/iteration": fmean([f.seconds[-1] / steps for f in some])}
+                | {"coarse samples/ray": fmean([f.coarse for f in some]), "fine samples/ray": fmean([f.fine for f in some])}
+                | {EQUAL: fmean([pair[k] for pair in equal]), "PSNR": fmean([f.psnr[-1] for f in some]), "PSNR" + PAPER: decibels}
             )
             curves[f"{method}, {sampling}"] = (some[0].seconds, some[0].psnr)
     return Result([], table, notes, curves)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values)

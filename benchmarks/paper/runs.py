@@ -133,12 +133,8 @@ def measured(request: Request, scene: Path, row: Row) -> Figures:
     """Train a row on a scene, or resume its run, and measure it."""
     folder = request.out / "runs" / scene.name / row.name
     settings = settings_of(row, request.scale)
-    run = Run.open(folder) if (folder / NAME).exists() else Run.create(folder, scene.resolve(), settings, preset=PRESET, device=request.device)
-    stages = [stage for stage in asset.STAGES if stage.name in (("poses", "train", "bake") if row.bakes else ("poses", "train"))]
-    with run.locked():
-        run.update(source=scene.resolve(), settings=settings, preset=PRESET)
-        request.say(f"{scene.name}, {row.name}: training {settings['train']['iterations']} steps")
-        outcomes = run_stages(run, stages, device=request.device, report=request.report)
+    request.say(f"{scene.name}, {row.name}: training {settings['train']['iterations']} steps")
+    run, outcomes = run_to(request, folder, scene, settings, ("poses", "train", "bake") if row.bakes else ("poses", "train"))
     request.say(f"{scene.name}, {row.name}: measuring")
     quality = _quality(run, str(outcomes[1].digest), settings, request.device)
     lines = [json.loads(line) for line in TrainOutputs.of_run(run.path).log.read_text(encoding="utf-8").splitlines()]
@@ -146,6 +142,15 @@ def measured(request: Request, scene: Path, row: Row) -> Figures:
         **{name: quality[name] for name in ("psnr", "ssim", "valid", "pivotal")}, **_pace(lines),
         tree=_tree_figures(run, _count(settings["evaluate"]["field_views"]), request.device) if row.bakes else None,
     )  # fmt: skip
+
+
+def run_to(request: Request, folder: Path, source: Path, settings: dict[str, dict[str, Any]], names: Sequence[str]) -> tuple[Run, list[Any]]:
+    """A run in a folder, made or resumed, and the outcomes of these stages of it."""
+    run = Run.open(folder) if (folder / NAME).exists() else Run.create(folder, source.resolve(), settings, preset=PRESET, device=request.device)
+    stages = [stage for stage in asset.STAGES if stage.name in names]
+    with run.locked():
+        run.update(source=source.resolve(), settings=settings, preset=PRESET)
+        return run, run_stages(run, stages, device=request.device, report=request.report)
 
 
 def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -236,12 +241,10 @@ def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
         truth = ground_truth(run.folder("poses"), view, s.background).colour
         decibels.append(psnr(np.clip(image, 0, 1), truth))
         similarities.append(ssim(np.clip(image, 0, 1), truth))
-    size = BakeOutputs.of_run(run.path).asset.stat().st_size
     camera = drawn[0].camera
     return {
         "psnr": float(np.mean(decibels)),
         "ssim": float(np.mean(similarities)),
         "fps": 1 / float(np.median(seconds)),
         "frame": f"{camera.width}x{camera.height}",
-        "mib": size / 2**20,
     }

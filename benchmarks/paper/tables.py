@@ -1,8 +1,8 @@
 """Tables 1 to 6 of the paper: the trainings that each compares, the figures printed in the paper, and the columns of ours."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
+from statistics import fmean
 from typing import Any
 
 from benchmarks.paper import pretrained
@@ -32,7 +32,7 @@ def shares(request: Request) -> Result:
     columns = ["scene", "method", "valid %", "valid %" + PAPER, "pivotal %", "pivotal %" + PAPER, "PSNR"]
     cases = [Row("nerf", NERF), Row("n4")]
     rows, curves = [], {}
-    for scene in scenes(_data(request)):
+    for scene in scenes(request.data):
         printed = next((SHARES[name] for name in SHARES if scene.name.lower().startswith(name)), (None, None))
         for row, method in zip(cases, ("NeRF", "EfficientNeRF"), strict=True):
             figures = measured(request, scene, row)
@@ -56,13 +56,13 @@ def quality(request: Request) -> Result:
     tree = [figures.tree for figures in ours if figures.tree is not None]
 
     def of(figures: Sequence[Figures], name: str) -> float:
-        return _mean(getattr(each, name) for each in figures)
+        return fmean(getattr(each, name) for each in figures)
 
     table = [
         ["NeRF", of(nerf, "psnr"), 31.01, of(nerf, "ssim"), 0.947, of(nerf, "hours"), 56.0, None, 0.023, None],
         ["EfficientNeRF, network", of(ours, "psnr"), None, of(ours, "ssim"), None, of(ours, "hours"), 6.0, None, None, None],
-        ["EfficientNeRF, NerfTree", _mean(t["psnr"] for t in tree), 31.68, _mean(t["ssim"] for t in tree), 0.954, None, None,
-         _mean(t["fps"] for t in tree), 238.46, tree[0]["frame"]],
+        ["EfficientNeRF, NerfTree", fmean(t["psnr"] for t in tree), 31.68, fmean(t["ssim"] for t in tree), 0.954, None, None,
+         fmean(t["fps"] for t in tree), 238.46, tree[0]["frame"]],
     ]  # fmt: skip
     notes = [
         "The paper's figures are means of the eight synthetic scenes at 800x800; LPIPS stands in metrics.json of `enerf run` where its weights are given.",
@@ -80,8 +80,8 @@ def versions(request: Request) -> Result:
     table = []
     for (name, (coarse, fine, psnr, fps)), figures in zip(printed.items(), means, strict=True):
         tree = [each.tree for each in figures if each.tree is not None]
-        cells = [name.upper(), coarse, fine, _mean(f.psnr for f in figures), _mean(t["psnr"] for t in tree), psnr, _mean(t["fps"] for t in tree), fps]
-        table.append(dict(zip(columns, [*cells, tree[0]["frame"], _mean(f.steady for f in figures)], strict=True)))
+        cells = [name.upper(), coarse, fine, fmean(f.psnr for f in figures), fmean(t["psnr"] for t in tree), psnr, fmean(t["fps"] for t in tree), fps]
+        table.append(dict(zip(columns, [*cells, tree[0]["frame"], fmean(f.steady for f in figures)], strict=True)))
     notes = ["The tree is marched at half a voxel, whatever N_c and N_s: its frames/s depend on them only through what was baked.", FIT, TIMED]
     return Result(columns, table, [*notes, *_notes(request, rows)], curves)
 
@@ -98,7 +98,7 @@ def networks(request: Request) -> Result:
     rows = [Row("nerf" if changes is NERF else f"nerf-{coarse}-{fine}", changes) for coarse, fine, changes, *_ in cases]
     means, curves = _means(request, rows)
     table = [
-        {"coarse MLP": coarse, "fine MLP": fine, **_pace(figures, seconds), "PSNR": _mean(f.psnr for f in figures), "PSNR" + PAPER: psnr}
+        {"coarse MLP": coarse, "fine MLP": fine, **_pace(figures, seconds), "PSNR": fmean(f.psnr for f in figures), "PSNR" + PAPER: psnr}
         for (coarse, fine, _, seconds, psnr), figures in zip(cases, means, strict=True)
     ]
     return Result(columns, table, _notes(request, rows), curves)
@@ -116,16 +116,16 @@ def modules(request: Request) -> Result:
     columns = ["method", "PSNR", "PSNR" + PAPER, *PACE, "less time %", "less time %" + PAPER]
     rows = [Row(name, changes) for _, name, changes, *_ in cases]
     means, curves = _means(request, rows)
-    base = _mean(f.steady for f in means[0])
+    base = fmean(f.steady for f in means[0])
     table = []
     for (title, _, _, psnr, seconds), figures in zip(cases, means, strict=True):
-        less = 100 * (1 - _mean(f.steady for f in figures) / base)
+        less = 100 * (1 - fmean(f.steady for f in figures) / base)
         table.append(
-            {"method": title, "PSNR": _mean(f.psnr for f in figures), "PSNR" + PAPER: psnr, **_pace(figures, seconds)}
+            {"method": title, "PSNR": fmean(f.psnr for f in figures), "PSNR" + PAPER: psnr, **_pace(figures, seconds)}
             | {"less time %": less, "less time %" + PAPER: 100 * (1 - seconds / 0.184)}
         )
     first, last = means[0], means[-1]
-    faster, overall = (_mean(getattr(f, name) for f in first) / _mean(getattr(f, name) for f in last) for name in ("steady", "step"))
+    faster, overall = (fmean(getattr(f, name) for f in first) / fmean(getattr(f, name) for f in last) for name in ("steady", "step"))
     notes = [
         f"All modules: {faster:.1f} times as fast as NeRF per iteration in the steady state (median of the last fifth of the run), {overall:.1f} times over the"
         " whole run, warm-up included; the paper: 8.8.",
@@ -148,11 +148,11 @@ def strategies(request: Request) -> Result:
     rows = [Row(name, changes) for _, _, name, changes, *_ in cases]
     means, curves = _means(request, rows)
     table = [
-        {"method": field, "sampling": sampling, "training, hours": _mean(f.hours for f in figures), "training, hours" + PAPER: hours}
-        | {"PSNR": _mean(f.psnr for f in figures), "PSNR" + PAPER: psnr, **{name: _pace(figures, None)[name] for name in pace}}
+        {"method": field, "sampling": sampling, "training, hours": fmean(f.hours for f in figures), "training, hours" + PAPER: hours}
+        | {"PSNR": fmean(f.psnr for f in figures), "PSNR" + PAPER: psnr, **{name: _pace(figures, None)[name] for name in pace}}
         for (field, sampling, _, _, hours, psnr), figures in zip(cases, means, strict=True)
     ]
-    finetuned = pretrained.rows(request, scenes(_data(request)), settings_of(Row("pretrained"), request.scale))
+    finetuned = pretrained.rows(request, scenes(request.data), settings_of(Row("pretrained"), request.scale))
     notes = [
         "Uniform: 64 + 128 even samples through the fine network alone, the number that the paper's times imply (41 h to 56 h as 192 to 256 evaluations).",
         "Our sampling is N4 with the lightweight coarse network.",
@@ -166,22 +166,21 @@ PACE = ["s/iteration", "s/iteration" + PAPER, "mean s/iteration", "coarse sample
 
 def _pace(figures: Sequence[Figures], printed: float | None) -> dict[str, Any]:
     """The columns of PACE: steady state, the paper's, mean over the run, samples that went through the networks."""
-    values = [_mean(f.steady for f in figures), printed, _mean(f.step for f in figures), _mean(f.coarse for f in figures), _mean(f.fine for f in figures)]
+    values = [fmean(f.steady for f in figures), printed, fmean(f.step for f in figures), fmean(f.coarse for f in figures), fmean(f.fine for f in figures)]
     return dict(zip(PACE, values, strict=True))
 
 
 def _means(request: Request, rows: Sequence[Row]) -> tuple[list[list[Figures]], dict[str, tuple[Sequence[float], Sequence[float]]]]:
     """The figures of each row on each scene, and the curves of the first scene."""
-    found = scenes(_data(request))
+    found = scenes(request.data)
     figures = [[measured(request, scene, row) for scene in found] for row in rows]
     return figures, {row.name: of[0].curve for row, of in zip(rows, figures, strict=True)}
 
 
 def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
     """Notes of every table that trains."""
-    found = scenes(_data(request))
-    train = settings_of(rows[-1], request.scale)["train"]
-    poses = settings_of(rows[-1], request.scale)["poses"]
+    found, settings = scenes(request.data), settings_of(rows[-1], request.scale)
+    train, poses = settings["train"], settings["poses"]
     sizes = f"{train['num_layers']}x{train['hidden_dim']} and {train['coarse_num_layers']}x{train['coarse_hidden_dim']}"
     notes = [
         f"Scenes: {', '.join(scene.name for scene in found)}; images of at most {poses['max_image_size']} pixels, {train['iterations']} iterations of"
@@ -197,14 +196,3 @@ def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
         )  # fmt: skip
         notes.append(verdict)
     return notes
-
-
-def _data(request: Request) -> Any:
-    if request.data is None:
-        raise ValueError("a table that trains needs data")
-    return request.data
-
-
-def _mean(values: Any) -> float:
-    values = list(values)
-    return math.fsum(values) / len(values)

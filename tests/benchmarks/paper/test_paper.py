@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.paper.__main__ import main
-from benchmarks.paper.document import PAPER, Request, Result, Table, make
+from benchmarks.paper.document import make
+from benchmarks.paper.result import PAPER, Request, Result, Table
 from pipeline.errors import BadInput, UsageError
 
 

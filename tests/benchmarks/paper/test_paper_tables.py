@@ -9,8 +9,8 @@ import pytest
 from benchmarks.paper import document as paper
 from benchmarks.paper import pretrained, tables
 from benchmarks.paper.__main__ import main
-from benchmarks.paper.document import PAPER, Request
 from benchmarks.paper.pretrained import Finetuned
+from benchmarks.paper.result import PAPER, Request
 from benchmarks.paper.runs import Figures, Row, _pace, settings_of
 from tests.benchmarks.paper.scenes import ball
 
@@ -44,7 +44,7 @@ def test_the_pace_is_that_of_the_log() -> None:
 
 
 def made_up(steady: float, psnr: float) -> Figures:
-    tree = {"psnr": psnr - 0.5, "ssim": 0.9, "fps": 20.0, "frame": "100x100", "mib": 3.0}
+    tree = {"psnr": psnr - 0.5, "ssim": 0.9, "fps": 20.0, "frame": "100x100"}
     return Figures(psnr, 0.95, 2 * steady, steady, 1.0, 12.0, 24.0, 0.1, 0.04, ([1.0, 2.0], [20.0, psnr]), tree)
 
 
