@@ -55,6 +55,7 @@ class Model:
     strategy: Strategy
     sky: Sky
     background: tuple[float, float, float] | None  # constant colour behind the scene, or None: then `sky` is
+    num_coarse_samples: int  # N_c
     step: float  # length of a coarse interval in the box, world units
     max_intervals: int  # intervals on a ray at most
 
@@ -67,13 +68,6 @@ class Model:
         """Of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean of `RayOutputs.distortion`; fraction of the schedule, 0 to 1."""
         stated = resolved(self.settings.distortion_loss_weight)
         return self.space.distortion_schedule(fraction) * (self.space.distortion_loss_weight if stated is None else stated)
-
-    @property
-    def num_coarse_samples(self) -> int:
-        """N_c, which `model` settles."""
-        count = resolved(self.settings.num_coarse_samples)
-        assert count is not None
-        return count
 
     @property
     def device(self) -> torch.device:
@@ -168,7 +162,8 @@ def model(
     voxels = _voxels(settings, space, step, device)
     intervals = Intervals(space, voxels, step, space.max_intervals(step), coarse_samples, span is not None, settings.field != "hash")
     strategy = _strategy(settings, intervals)
-    return Model(space, settings, coarse.to(device), fine.to(device), voxels, strategy, Sky().to(device), background, step, intervals.max_intervals)
+    fields = (coarse.to(device), fine.to(device))
+    return Model(space, settings, *fields, voxels, strategy, Sky().to(device), background, coarse_samples, step, intervals.max_intervals)
 
 
 def _fields(settings: TrainSettings, generator: torch.Generator) -> tuple[Field, Field]:

@@ -29,7 +29,6 @@ MODELS: dict[str, tuple[str, ...]] = {
 
 # What a model with one focal length becomes when width and height are scaled by different amounts; the new parameters are zero.
 _TWO_FOCAL_LENGTHS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
-_OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 POINTS_AT_ONCE = 2**16  # that are projected: more would go through memory in each of some twenty operations
 
 
@@ -249,12 +248,10 @@ def rotated_clockwise(camera: Camera) -> Camera:
 
 def pose_from_opengl(world_from_camera: np.ndarray) -> np.ndarray:
     """(4, 4) of Blender, NeRF, nerfstudio, glTF (x right, y up, looking along -z) -> (4, 4) with the project's axes. Its own inverse."""
-    return np.asarray(world_from_camera, np.float64) @ _OPENGL_AXES
+    return np.asarray(world_from_camera, np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def opengl_from_pose(world_from_camera: np.ndarray) -> np.ndarray:
-    """(4, 4) with the project's axes -> (4, 4) with x right, y up, looking along -z."""
-    return np.asarray(world_from_camera, np.float64) @ _OPENGL_AXES
+opengl_from_pose = pose_from_opengl
 
 
 def pose_from_llff(matrix: np.ndarray) -> np.ndarray:

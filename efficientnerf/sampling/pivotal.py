@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.geometry.spaces import Space
+from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.sampling.samples import Samples
 
 
@@ -14,8 +15,7 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: i
     nearer is kept. (The authors' release drops a random subset.)
     """
     pivotal = weight > threshold
-    counts = first[1:] - first[:-1]
-    ray = torch.repeat_interleave(torch.arange(len(counts), device=weight.device), counts, output_size=len(weight))
+    ray = ray_of_sample(first, len(weight))
     order = torch.argsort(weight, descending=True, stable=True)
     order = order[torch.argsort(ray[order], stable=True)]  # ray by ray, heaviest first
     rank = torch.empty_like(order)
@@ -28,15 +28,13 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
 
     pivotal  (N,) bool, which coarse samples are pivotal (their weight exceeds epsilon)
     """
-    rays = len(origins)
-    counts = coarse.first[1:] - coarse.first[:-1]
-    ray = torch.repeat_interleave(torch.arange(rays, device=origins.device), counts, output_size=len(pivotal))[pivotal]
+    ray = ray_of_sample(coarse.first, len(pivotal))[pivotal]
     part = torch.arange(per_pivot, device=origins.device)
     extent = (coarse.extent[pivotal] / per_pivot)[:, None].expand(-1, per_pivot)
     start = coarse.start[pivotal][:, None] + part * extent
     length = (coarse.length[pivotal] / per_pivot)[:, None].expand(-1, per_pivot)
     at = start + offset[ray][:, None] * extent
     point = space.grid(origins[ray][:, None] + at[..., None] * directions[ray][:, None])
-    per_ray = torch.zeros(rays, dtype=torch.int64, device=origins.device).index_add(0, ray, torch.full_like(ray, per_pivot))
+    per_ray = torch.zeros(len(origins), dtype=torch.int64, device=origins.device).index_add(0, ray, torch.full_like(ray, per_pivot))
     first = torch.cat([per_ray.new_zeros(1), per_ray.cumsum(dim=0)])
     return Samples(first, start.reshape(-1), extent.reshape(-1), length.reshape(-1), point.reshape(-1, 3), coarse.tried)

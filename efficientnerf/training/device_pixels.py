@@ -6,7 +6,7 @@ from torch import Tensor
 
 from efficientnerf.backends import dispatch
 from efficientnerf.backends.layout import PixelTables
-from efficientnerf.backends.transfer import sent, to_device
+from efficientnerf.backends.transfer import sent
 from efficientnerf.training.pixels import Pixels
 
 MEMORY_FRACTION = 0.5  # of the device's free memory: photographs that would take more stay on the host
@@ -42,22 +42,13 @@ class DevicePixels:
         """See `Pixels.choose`."""
         return self.pixels.choose(count, rng, middle=middle)
 
-    def to_device(self, values: np.ndarray) -> Tensor:
-        """An array on the device; nothing waits for it."""
-        return to_device(torch.from_numpy(np.ascontiguousarray(values)), self.device)
-
-    def rays(self, index: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        """`Pixels.rays` on the device."""
-        origins, directions, _, _, colours = self.bundle(index)
-        return origins, directions, colours
-
     def colours_to_send(self, index: np.ndarray) -> np.ndarray | None:
         """(R, 3 or 4) uint8 of pixels whose images stay on the host; None where they are here."""
         return np.ascontiguousarray(self.pixels.images[index]) if self.images is None else None
 
     def bundle(self, index: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """`Pixels.bundle` on the device."""
-        return self.bundle_at(self.to_device(index), sent(self.colours_to_send(index), self.device))
+        return self.bundle_at(*sent((np.ascontiguousarray(index), self.colours_to_send(index)), self.device))
 
     def bundle_at(self, at: Tensor, colour: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The same of indices on the device, and `colours_to_send` there."""

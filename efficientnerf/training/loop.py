@@ -54,10 +54,6 @@ class Progress:
     fine: int
     left_out: int = 0  # rays whose samples did not fit, and that the loss leaves out; on CUDA alone
 
-    @property
-    def psnr(self) -> float:
-        return -10 * math.log10(max(self.loss, 1e-10))
-
 
 @dataclass
 class Trainer:

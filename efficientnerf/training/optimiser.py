@@ -66,13 +66,10 @@ class Adam:
                 grad = group.gradient(name)
                 if grad is None:
                     continue
-                self._update(p, grad, *self.moments[name], size, sparse=group.sparse)
+                numbers = (size.learning_rate, BETA1, self.beta2, size.correction1, size.correction2, self.epsilon)
+                # numba's kernel, the only one that fills gradient buffers, clears the gradient, too.
+                dispatch.adam(p.detach(), grad, *self.moments[name], *numbers, skip_zeros=group.sparse)
                 if grad is p.grad:
                     p.grad = None
                 else:
                     group.buffers[name].mark_cleared()
-
-    def _update(self, p: nn.Parameter, grad: Tensor, first: Tensor, second: Tensor, size: StepSize, *, sparse: bool) -> None:
-        """One parameter and its moments, in place. numba's kernel, the only one that fills gradient buffers, clears the gradient, too."""
-        corrections = size.correction1, size.correction2
-        dispatch.adam(p.detach(), grad, first, second, size.learning_rate, BETA1, self.beta2, *corrections, self.epsilon, skip_zeros=sparse)

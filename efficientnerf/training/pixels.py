@@ -202,11 +202,6 @@ class Pixels:
         origins, directions, near, far = (t.numpy() for t in dispatch.pixel_rays(tables, self.stride, torch.from_numpy(index)))
         return origins, directions, near, far, self.images[index].astype(np.float32) / np.float32(255)
 
-    def rays(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """origins, directions and colours of `bundle`."""
-        origins, directions, _, _, colours = self.bundle(index)
-        return origins, directions, colours
-
     @property
     def tables(self) -> PixelTables:
         """What rays are made of, as arrays."""

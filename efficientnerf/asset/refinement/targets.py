@@ -69,8 +69,8 @@ class Targets:
 
         constant_background  objects are compared over the background of the scene, not over a random one
         """
-        bundle: tuple[Any, ...] = self.pixels.rays(index)
-        origins, directions, colour = bundle
+        bundle: tuple[Any, ...] = self.pixels.bundle(index)
+        origins, directions, _, _, colour = bundle
         ones = colour[:, 0] * 0 + 1
         truth = colour[:, :3]
         if self.background is None:

@@ -117,14 +117,14 @@ def check(c: ViewChecks, m: Model, pixels: Pixels, observed: Observations | None
     c.done += 1
     if last and not c.left_out.any():
         return False
-    before = c.left_out.copy(), c.cameras
-    now = _Look.at(c, m, pixels)
+    left_out, cameras = c.left_out.copy(), c.cameras
+    now = _compare(c, m, pixels)
     for view in np.flatnonzero(c.left_out):
         _judge_again(c, now, int(view), pixels)
     if not last:
         _leave_out(c, now, pixels, observed, number)
-    same = all(np.array_equal(a.world_from_camera, b.world_from_camera) for a, b in zip(before[1], c.cameras, strict=True))
-    return not (same and np.array_equal(before[0], c.left_out))
+    same = all(np.array_equal(a.world_from_camera, b.world_from_camera) for a, b in zip(cameras, c.cameras, strict=True))
+    return not (same and np.array_equal(left_out, c.left_out))
 
 
 def follow_checks(c: ViewChecks, pixels: Pixels) -> None:
@@ -134,7 +134,7 @@ def follow_checks(c: ViewChecks, pixels: Pixels) -> None:
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Comparison:
     """What the field shows at a check. trusted (C,): not left out; errors (C, 2) and outlying (C, 2) by columns as one picture and inside tiles; usual (C,):
     errors of the neighbours inside tiles."""
 
@@ -145,16 +145,6 @@ class _Look:
     errors: np.ndarray
     outlying: np.ndarray
     usual: np.ndarray
-
-    @staticmethod
-    def at(c: ViewChecks, m: Model, pixels: Pixels) -> _Look:
-        background = np.full(3, 0.5) if m.background is None else np.array(m.background)
-        grey = m.background is None and pixels.images.shape[1] == 4
-        cells, cameras = cells_of(pixels, background), c.cameras
-        renders = rendered(m, cameras, pixels.near, pixels.far, cells.size, grey)
-        search = Search(m, cameras, renders, float(pixels.near.min()), float(pixels.far.max()), grey)
-        errors, trusted = view_errors(cells, renders), ~c.left_out
-        return _Look(search, cells, background, trusted, errors, *outlying_of(cameras, errors, trusted))
 
     @property
     def suspects(self) -> np.ndarray:
@@ -171,6 +161,16 @@ class _Look:
         return float(errors[view, 1]), outlying_of(cameras, errors, self.trusted)[0][view]
 
 
+def _compare(c: ViewChecks, m: Model, pixels: Pixels) -> _Comparison:
+    background = np.full(3, 0.5) if m.background is None else np.array(m.background)
+    grey = m.background is None and pixels.images.shape[1] == 4
+    cells, cameras = cells_of(pixels, background), c.cameras
+    renders = rendered(m, cameras, pixels.near, pixels.far, cells.size, grey)
+    search = Search(m, cameras, renders, float(pixels.near.min()), float(pixels.far.max()), grey)
+    errors, trusted = view_errors(cells, renders), ~c.left_out
+    return _Comparison(search, cells, background, trusted, errors, *outlying_of(cameras, errors, trusted))
+
+
 def outlying_of(cameras: Sequence[Camera], errors: np.ndarray, trusted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(C, 2) how far errors (C, 2) stand out, and (C,) what the second one usually is: see `standing_out`."""
     neighbours = neighbours_of(cameras)
@@ -178,7 +178,7 @@ def outlying_of(cameras: Sequence[Camera], errors: np.ndarray, trusted: np.ndarr
     return np.stack([whole[0], inside], axis=1), usual
 
 
-def _judge_again(c: ViewChecks, now: _Look, view: int, pixels: Pixels) -> None:
+def _judge_again(c: ViewChecks, now: _Comparison, view: int, pixels: Pixels) -> None:
     """Train on a view again where the field, which has not seen it, explains it as it does its neighbours: by its own camera, or else by the one found."""
     if not now.suspects[view]:
         c.left_out[view] = c.replaced[view] = False
@@ -197,7 +197,7 @@ def _judge_again(c: ViewChecks, now: _Look, view: int, pixels: Pixels) -> None:
         c.left_out[view], c.replaced[view] = False, True
 
 
-def _leave_out(c: ViewChecks, now: _Look, pixels: Pixels, observed: Observations | None, number: int) -> None:
+def _leave_out(c: ViewChecks, now: _Comparison, pixels: Pixels, observed: Observations | None, number: int) -> None:
     """Leave out the suspects with further evidence against them, the worst first, as many as may be."""
     room = min(int(MOST * len(c.given)), len(c.given) - MIN_VIEWS) - int(c.left_out.sum())
     for_view, against, few = point_evidence(now.search.cameras, now.cells, observed, now.trusted)

@@ -113,21 +113,16 @@ def rendered(m: Model, cameras: Sequence[Camera], near: np.ndarray, far: np.ndar
     return [part.reshape(*shape, 3) for part, (_, shape) in zip(np.split(shown(m, bundle, grey)[0], ends), at, strict=True)]
 
 
-def _unexplained(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """The mean square left of cells (N, 3) with weights (N,) after a fit of gain >= 0 and offset of each channel, and the variance."""
+def global_error(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """The mean square left of cells (H, W, 3) with weights (H, W) after a fit of gain >= 0 and offset of each channel, and the variance."""
     total = weight.sum()
     if total <= 0:
         return 0.0, 0.0
-    w = (weight / total)[:, None]
-    p, r = photograph - (w * photograph).sum(0), render - (w * render).sum(0)
+    p, r, w = photograph.reshape(-1, 3), render.reshape(-1, 3), (weight / total).reshape(-1, 1)
+    p, r = p - (w * p).sum(0), r - (w * r).sum(0)
     variance, covariance, own = (w * p * p).sum(0), (w * p * r).sum(0), (w * r * r).sum(0)
     left = variance - np.maximum(covariance, 0) ** 2 / (own + NOISE**2)
     return float(left.sum()), float(variance.sum())
-
-
-def global_error(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Mean square left of a view (H, W, 3), and variance."""
-    return _unexplained(photograph.reshape(-1, 3), render.reshape(-1, 3), weight.reshape(-1))
 
 
 def local_error(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray, tile: int = TILE) -> float:
@@ -136,7 +131,7 @@ def local_error(photograph: np.ndarray, render: np.ndarray, weight: np.ndarray, 
     for y in range(0, photograph.shape[0], tile):
         for x in range(0, photograph.shape[1], tile):
             at = slice(y, y + tile), slice(x, x + tile)
-            left, variance = _unexplained(photograph[at].reshape(-1, 3), render[at].reshape(-1, 3), weight[at].reshape(-1))
+            left, variance = global_error(photograph[at], render[at], weight[at])
             shares.append(left / (variance + 3 * NOISE**2))
             worth.append(variance * weight[at].sum())
     order = np.argsort(shares, kind="stable")
