@@ -23,10 +23,9 @@ from efficientnerf.backends import dispatch
 from efficientnerf.backends.transfer import to_device
 from efficientnerf.geometry.spaces import RayBundle, Space
 from efficientnerf.rendering.compositing import ray_of_sample
-from efficientnerf.sampling.importance import importance_samples
+from efficientnerf.sampling.hierarchical import importance_samples, stratified_samples
 from efficientnerf.sampling.occupancy import DensityVoxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples
-from efficientnerf.sampling.stratified import stratified_samples
 
 
 class SamplingRequest(NamedTuple):

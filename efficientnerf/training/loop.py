@@ -24,7 +24,6 @@ from efficientnerf.backends.transfer import sent
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import Model, RayOutputs
 from efficientnerf.sampling.strategies import Efficient
-from efficientnerf.training.batch import ray_count
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure.model import Exposure, is_learned
 from efficientnerf.training.occupancy_update import update_in_turn
@@ -33,7 +32,7 @@ from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.readback import AsyncReadback, StepCounts, counts_of
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.sparse_depth import SparseDepthRays, sparse_depth_weight
-from efficientnerf.training.step import Learner, StepInputs, StepNumbers, StepPlan, drawn_step, step_on_rays
+from efficientnerf.training.step import Learner, StepInputs, StepNumbers, StepPlan, drawn_step, ray_count, step_on_rays
 from efficientnerf.training.step_graphs import StepGraphs
 from efficientnerf.training.view_checks.checks import ViewChecks, follow_checks
 

@@ -9,14 +9,25 @@ from torch import Tensor
 
 from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.sampling.samples import SampleCapacity, complete_rays
-from efficientnerf.training.batch import DrawnRays, drawn_rays, ray_batch
 from efficientnerf.training.device_pixels import DevicePixels, on_host
 from efficientnerf.training.exposure.model import Exposure, exposure_loss, places
 from efficientnerf.training.losses import colour_losses, mean_over, scale_gradients_by_distance
 from efficientnerf.training.occupancy_update import update_on_rays
 from efficientnerf.training.optimiser import Adam, StepSize
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import RAYS_PER_RAY, AimedRays, SparseDepthRays, aimed_rays, sparse_depth_loss
+
+MIN_RAYS = 64  # of a step
+
+
+class DrawnRays(NamedTuple):
+    """What the rays of a step are made from: arrays of the host, or tensors of a device."""
+
+    pixel: Any  # (R,) int64 indices
+    offset: Any  # (R,) float32 of samples in their intervals
+    behind: Any = None  # (R, 3) float32 random colours behind the scene, where there are
+    colour: Any = None  # (R, 3 or 4) uint8, where images are not on the device
 
 
 class StepInputs(NamedTuple):
@@ -56,11 +67,44 @@ class Learner:
     exposure: Exposure | None
 
 
+def ray_count(settings: TrainSettings, samples_per_ray: float) -> int:
+    """Rays of a step: as many as have about `train.sample_batch_size` samples."""
+    if settings.sample_batch_size == "off":
+        return settings.max_rays_per_batch
+    return int(min(settings.max_rays_per_batch, max(MIN_RAYS, settings.sample_batch_size / samples_per_ray)))
+
+
+def drawn_rays(m: Model, pixels: Pixels | DevicePixels, count: int, rng: np.random.Generator, *, crop: bool) -> DrawnRays:
+    """`count` random pixels; with `crop`, of the middle of the images."""
+    pixel, offset = pixels.choose(count, rng, middle=crop), rng.random(count, np.float32)
+    behind, channels = None, on_host(pixels).images.shape[1]
+    if m.space.reaches_infinity and m.background is None:
+        # Behind a space that reaches to infinity nothing lies: a random colour for each ray keeps the field from staying half transparent.
+        behind = rng.random((count, 3), np.float32)
+    if channels == 4 and (m.settings.background_color == "random" or m.background is None):
+        # Behind an object with alpha anything may lie: a random colour for each ray keeps the field from learning one.
+        behind = rng.random((count, 3), np.float32)
+    return DrawnRays(pixel, offset, behind, pixels.colours_to_send(pixel) if isinstance(pixels, DevicePixels) else None)
+
+
 def drawn_step(learner: Learner, sparse_depth: SparseDepthRays | None, count: int, rng: np.random.Generator, *, crop: bool) -> StepInputs:
     """Rays through `count` pixels, with `crop` of the middle of the images, and rays to sparse points, where there are some."""
     rays = drawn_rays(learner.model, learner.pixels, count, rng, crop=crop)
     aimed = None if sparse_depth is None else aimed_rays(sparse_depth, max(1, count // RAYS_PER_RAY), rng)
     return StepInputs(rays, None if learner.exposure is None else places(on_host(learner.pixels), rays.pixel), aimed)
+
+
+def build_rays(m: Model, pixels: Pixels | DevicePixels, drawn: DrawnRays) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Of `drawn`, which is on the model's device: origins (R, 3), directions (R, 3), near (R,), far (R,), offset (R,) and the colours behind (R, 3) for
+    `render_rays`; and the colours (R, 3) of the photographs, over the latter where they have alpha."""
+    if isinstance(pixels, DevicePixels):
+        origins, directions, near, far, colour = pixels.bundle_at(drawn.pixel, drawn.colour)
+    else:
+        origins, directions, near, far, colour = (torch.as_tensor(a, device=m.device) for a in pixels.bundle(drawn.pixel.cpu().numpy()))
+    behind = m.behind(directions) if drawn.behind is None else drawn.behind
+    if colour.shape[1] == 4:
+        colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
+    return (origins, directions, near, far, drawn.offset, behind), colour
 
 
 def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: StepNumbers, rng: np.random.Generator) -> tuple[Tensor, RayOutputs]:
@@ -70,21 +114,22 @@ def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: 
     rng     of strategies that draw as they sample
     """
     m = learner.model
-    batch = ray_batch(m, learner.pixels, inputs.rays)
-    count, aimed = len(batch.origins), inputs.aimed
-    bundle = batch[:6] if aimed is None else tuple(torch.cat(pair) for pair in zip(batch[:6], aimed.bundle, strict=True))
+    bundle, colour = build_rays(m, learner.pixels, inputs.rays)
+    origins, aimed = bundle[0], inputs.aimed
+    count = len(origins)
+    bundle = bundle if aimed is None else tuple(torch.cat(pair) for pair in zip(bundle, aimed.bundle, strict=True))
     outputs = render_rays(m, *bundle, prune=plan.prune, rng=rng, capacity=plan.capacity, samples_per_pivot=plan.samples_per_pivot, explored=inputs.explored)
     fitting = complete_rays(outputs.coarse, outputs.fine)
     complete = None if fitting is None else fitting[:count]
     exposure = learner.exposure if learner.exposure is None or plan.learns_exposure else learner.exposure.detached
-    fine_loss, coarse_loss = colour_losses(outputs, batch.colour, complete, inputs.place, exposure)
+    fine_loss, coarse_loss = colour_losses(outputs, colour, complete, inputs.place, exposure)
     loss = fine_loss if coarse_loss is None else fine_loss + coarse_loss  # weighted equally, as in the authors' release
     if exposure is not None:
         loss = loss + exposure_loss(exposure)
     if m.space.unbounded:
         loss = loss + numbers.distortion * mean_over(outputs.distortion[:count], complete)
     if m.space.contracted:
-        scale_gradients_by_distance(m, batch.origins, outputs)
+        scale_gradients_by_distance(m, origins, outputs)
     if aimed is not None:
         loss = loss + numbers.sparse_depth * sparse_depth_loss(outputs, aimed.distance, aimed.on_support, plan.samples_per_pivot, fitting)
     loss.backward()

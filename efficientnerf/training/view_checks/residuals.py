@@ -147,10 +147,10 @@ def view_errors(cells: Cells, renders: list[np.ndarray]) -> np.ndarray:
     return np.stack([left / np.maximum(np.maximum(variance, LOW_CONTRAST**2 * np.median(variance)), 3 * NOISE**2), inside], axis=1)
 
 
-def neighbours_of(cameras: Sequence[Camera], count: int = NEIGHBOURS) -> np.ndarray:
+def neighbours_of(cameras: Sequence[Camera]) -> np.ndarray:
     """(C, K) the cameras nearest to each in place and direction; both count by the distance to the K-th nearest, the median over the cameras."""
     centre, forward = np.stack([c.centre for c in cameras]), np.stack([c.forward for c in cameras])
-    k = min(count, len(cameras) - 1)
+    k = min(NEIGHBOURS, len(cameras) - 1)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1)
     angle = np.arccos(np.clip(forward @ forward.T, -1, 1))
     both = sum((d / max(float(np.median(np.sort(d, axis=1)[:, k])), 1e-9)) ** 2 for d in (apart, angle))

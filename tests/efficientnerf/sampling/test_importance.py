@@ -9,10 +9,9 @@ import torch
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
 from efficientnerf.rendering.field_renderer import valid_count
-from efficientnerf.sampling.importance import IMPORTANCE_FLOOR, importance_samples
+from efficientnerf.sampling.hierarchical import IMPORTANCE_FLOOR, importance_samples, stratified_samples
 from efficientnerf.sampling.pivotal import pivotal_samples
 from efficientnerf.sampling.samples import Samples
-from efficientnerf.sampling.stratified import stratified_samples
 from efficientnerf.sampling.valid import valid_samples
 from efficientnerf.training.optimiser import parameter_groups
 from tests.efficientnerf.balls import pixels, untrained
