@@ -96,7 +96,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     fine = sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2)
     samples = len(fine.start)
     field: Any = m.fine
-    table, levels = field.table, len(field.sides)
+    table, levels = field.table, len(field.hash_levels.sides)
     encode = lambda: hash_grid.encode(fine.point, table, field.hash_levels)  # noqa: E731
     features = encode()
     grad_features = torch.randn(features.shape, generator=generator).to(device)

@@ -43,10 +43,9 @@ class HashField(BakeableField):
         super().__init__()
         self.degree = degree
         sides, counts = level_sizes(levels, log2_table, coarsest, finest)
-        self.sides = np.array(sides, np.int64)
-        self.dense = np.array([side**3 <= 2**log2_table for side in sides])
-        self.starts = np.array([0, *np.cumsum(counts)[:-1]], np.int64)
-        self.mask = np.uint32(2**log2_table - 1)
+        dense = np.array([side**3 <= 2**log2_table for side in sides])
+        starts = np.array([0, *np.cumsum(counts)[:-1]], np.int64)
+        self.hash_levels = HashLevels(np.array(sides, np.int64), dense, starts, np.uint32(2**log2_table - 1))
         self.table = nn.Parameter((torch.rand(sum(counts), FEATURES, generator=generator) * 2 - 1) * 1e-4)
         self.table_gradient = GradientBuffer()
         widths = [levels * FEATURES, *[hidden] * layers, 1 + 3 * harmonics_count(degree)]
@@ -68,10 +67,6 @@ class HashField(BakeableField):
 
     def density(self, points: Tensor) -> Tensor:
         return self._network(points, self.weights[-1][:1])[:, 0]
-
-    @property
-    def hash_levels(self) -> HashLevels:
-        return HashLevels(self.sides, self.dense, self.starts, self.mask)
 
     def encode(self, points: Tensor) -> Tensor:
         """Features (N, 2L) at points (N, 3) in grid coordinates; differentiable in the table."""

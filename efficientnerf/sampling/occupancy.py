@@ -52,8 +52,6 @@ def density_voxels(
     side: int, rule: str, *, initial: float = 10.0, beta: float = 0.1, decay: float = 0.95, threshold: float = 0.0, device: str = "cpu"
 ) -> DensityVoxels:
     """Fresh voxels; all are valid."""
-    if rule not in ("momentum", "maximum"):
-        raise ValueError(f"density voxels updated by {rule!r}: expected 'momentum' or 'maximum'")
     # A maximum that starts at twice the threshold decays below it after some fourteen updates, by when every cell has been queried.
     start = initial if rule == "momentum" else 2 * threshold
     return DensityVoxels(torch.full((side, side, side), start, device=device), rule, beta, decay, threshold, start)
