@@ -77,13 +77,6 @@ def test_training_explores_intervals_without_a_pivot_and_rendering_does_not() ->
     assert int(none.pivotal.sum()) <= int((none.coarse_weight > m.settings.pivotal_threshold).sum())
 
 
-@pytest.mark.parametrize("field", ["hash", "mlp"])
-def test_the_same_settings_give_the_same_numbers(field: str) -> None:
-    first, again, other = untrained(field=field), untrained(field=field), untrained(field=field, seed=1)
-    assert all(torch.equal(a, b) for a, b in zip(state_of(first).values(), state_of(again).values(), strict=True))
-    assert not torch.equal(dict(first.parameters())["fine.weights.0"], dict(other.parameters())["fine.weights.0"])
-
-
 def test_states_are_restored_and_what_does_not_fit_is_named() -> None:
     m, other = untrained(seed=0), untrained(seed=5)
     other.voxels.values.uniform_(generator=torch.Generator().manual_seed(0))

@@ -14,11 +14,12 @@ import torch
 
 from efficientnerf.asset.format import FormatError, describe, load
 from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.hostile import HOSTILE, filled
 from tests.efficientnerf.tree_reference import render_reference
-from tests.efficientnerf.trees import looking, random_tree, uniform_tree
+from tests.efficientnerf.trees import looking, random_cascades, random_tree, uniform_tree
 
 FAR = [1e9, 1e15, 1e18, 1e25, 1e200]
 
@@ -35,11 +36,13 @@ def test_rays_from_far_away_end(lookup: str, distance: float) -> None:
     assert torch.isfinite(reference[0]).all()
 
 
-def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
-    tree = random_tree(0)
+@pytest.mark.parametrize("tree", [random_tree(0), random_cascades(0, count=3)], ids=["one box", "cascades"])
+def test_rays_of_numbers_that_are_not_finite_see_nothing(tree: NerfTree) -> None:
     origins, directions = np.full((4, 3), 0.5), np.full((4, 3), 0.5)
     origins[0, 1], origins[1, 2], directions[2, 0], directions[3] = np.nan, np.inf, np.nan, np.inf
-    assert not render_rays(tree, origins, directions).opacity.any()
+    found = render_rays(tree, origins, directions)
+    assert not found.opacity.any()
+    assert np.isfinite(found.colour).all()
 
 
 @pytest.mark.parametrize("lookup", ["trilinear", "nearest"])

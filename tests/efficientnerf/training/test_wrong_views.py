@@ -1,5 +1,7 @@
 """Cameras that are wrong are found by the field, photographs that merely look different are not."""
 
+import copy
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -62,26 +64,34 @@ def rotated(n: int, degrees: float, axis: tuple[float, float, float] = (0.6, 0.7
     return replace(CAMERAS[n], world_from_camera=pose)
 
 
-def trained(cameras: list[Camera], pictures: list[np.ndarray], steps: int = 300) -> tuple[Trainer, Pixels]:
-    """A trainer after some steps of 3000."""
-    t = trainer(balls.untrained(iterations=3000, num_levels=6, sample_batch_size=12288, finest_resolution=64), cameras=cameras)
-    pixels = pixels_of(cameras, pictures)
-    steps_of = loop.train(t, pixels)
-    for _ in range(steps):
-        next(steps_of)
-    return t, pixels
+def train(t: Trainer, pixels: Pixels) -> None:
+    for _ in itertools.islice(loop.train(t, pixels), 300):
+        pass
+
+
+def untrained(cameras: list[Camera]) -> Trainer:
+    """Of 3000 steps."""
+    return trainer(balls.untrained(iterations=3000, num_levels=6, sample_batch_size=12288, finest_resolution=64), cameras=cameras)
 
 
 @pytest.fixture(scope="module")
-def field() -> Model:
-    """A field of the true cameras."""
-    return trained(CAMERAS, PICTURES)[0].model
+def fields() -> tuple[Model, Model]:
+    """A field of the true cameras after some steps, and after twice as many."""
+    t, pixels = untrained(CAMERAS), pixels_of(CAMERAS, PICTURES)
+    train(t, pixels)
+    early = copy.deepcopy(t.model)
+    train(t, pixels)
+    return early, t.model
 
 
-@pytest.fixture(scope="module")
-def settled() -> Model:
-    """The same after twice the steps."""
-    return trained(CAMERAS, PICTURES, 600)[0].model
+@pytest.fixture
+def field(fields: tuple[Model, Model]) -> Model:
+    return fields[0]
+
+
+@pytest.fixture
+def settled(fields: tuple[Model, Model]) -> Model:
+    return fields[1]
 
 
 def angle(a: Camera, b: Camera) -> float:
@@ -259,7 +269,8 @@ def test_training_finds_wrong_cameras_and_draws_none_of_their_pixels() -> None:
     cameras = list(CAMERAS)
     for n, degrees in ((2, 10), (13, 45)):
         cameras[n] = rotated(n, degrees)
-    t, pixels = trained(cameras, PICTURES)
+    t, pixels = untrained(cameras), pixels_of(cameras, PICTURES)
+    train(t, pixels)
     assert check(t.checks, t.model, pixels, None, 300)
     assert np.flatnonzero(t.checks.left_out).tolist() == [2, 13]
     follow_checks(t.checks, pixels)
