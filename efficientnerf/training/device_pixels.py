@@ -38,10 +38,6 @@ class DevicePixels:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def choose(self, count: int, rng: np.random.Generator, *, middle: bool = False) -> np.ndarray:
-        """See `Pixels.choose`."""
-        return self.pixels.choose(count, rng, middle=middle)
-
     def colours_to_send(self, index: np.ndarray) -> np.ndarray | None:
         """(R, 3 or 4) uint8 of pixels whose images stay on the host; None where they are here."""
         return np.ascontiguousarray(self.pixels.images[index]) if self.images is None else None

@@ -85,7 +85,7 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
-    """All that a resumed run needs besides its schedule, by name."""
+    """All that a resumed run needs besides its schedule, by name; in the memory of what is trained, but for "progress"."""
     moments = {f"adam.{k}.{name}": pair[k] for name, pair in t.adam.moments.items() for k in (0, 1)}
     progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
     exposure = {} if t.exposure is None else {name: values.detach() for name, values in t.exposure.parameters.items()}
@@ -95,23 +95,15 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
 
 def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     """Put `state_of`'s tensors back; ValueError names what does not fit, and then nothing has changed."""
-    step, samples_per_ray = _check(t, state)
-    models.restore(t.model, state)
-    if t.exposure is not None:
-        for name, learned in t.exposure.parameters.items():
-            learned.data.copy_(state[name])
-    if t.checks is not None:
-        for name, values in t.checks.state.items():
-            values[...] = state[f"checks.{name}"].numpy()
-    for name, pair in t.adam.moments.items():
-        for k in (0, 1):
-            pair[k].copy_(state[f"adam.{k}.{name}"])
+    own = state_of(t)
+    step, samples_per_ray = _check(own, state)
+    for name, tensor in own.items():
+        tensor.copy_(state[name])  # in the memory of what is trained
     t.step, t.samples_per_ray = step, samples_per_ray
 
 
-def _check(t: Trainer, state: dict[str, Tensor]) -> tuple[int, float]:
+def _check(wanted: dict[str, Tensor], state: dict[str, Tensor]) -> tuple[int, float]:
     """The step and the samples on a ray of a state; ValueError where a tensor is missing, unknown or of another type or shape, or a number impossible."""
-    wanted = state_of(t)
     models.check_tensors(state, wanted)
     if unknown := sorted(state.keys() - wanted.keys()):
         raise ValueError(f"tensor '{unknown[0]}' is of no part of the model")

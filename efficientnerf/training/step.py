@@ -76,12 +76,12 @@ def ray_count(settings: TrainSettings, samples_per_ray: float) -> int:
 
 def drawn_rays(m: Model, pixels: Pixels | DevicePixels, count: int, rng: np.random.Generator, *, crop: bool) -> DrawnRays:
     """`count` random pixels; with `crop`, of the middle of the images."""
-    pixel, offset = pixels.choose(count, rng, middle=crop), rng.random(count, np.float32)
-    behind, channels = None, on_host(pixels).images.shape[1]
+    host, behind = on_host(pixels), None
+    pixel, offset = host.choose(count, rng, middle=crop), rng.random(count, np.float32)
     if m.space.reaches_infinity and m.background is None:
         # Behind a space that reaches to infinity nothing lies: a random colour for each ray keeps the field from staying half transparent.
         behind = rng.random((count, 3), np.float32)
-    if channels == 4 and (m.settings.background_color == "random" or m.background is None):
+    if host.images.shape[1] == 4 and (m.settings.background_color == "random" or m.background is None):
         # Behind an object with alpha anything may lie: a random colour for each ray keeps the field from learning one.
         behind = rng.random((count, 3), np.float32)
     return DrawnRays(pixel, offset, behind, pixels.colours_to_send(pixel) if isinstance(pixels, DevicePixels) else None)

@@ -222,7 +222,6 @@ def test_rays_of_pixels_are_those_of_the_host(stride: int, monkeypatch: pytest.M
     assert host.stride == stride
     index = host.choose(400, np.random.default_rng(3))
     there = DevicePixels(host, DEVICE)
-    assert np.array_equal(there.choose(400, np.random.default_rng(3)), index)
     for ours, theirs in zip(there.bundle(index), host.bundle(index), strict=True):
         np.testing.assert_allclose(ours.cpu().numpy(), theirs, rtol=1e-5, atol=1e-6)
     there.images = None  # as where they are too many for the device
