@@ -192,11 +192,11 @@ def rows(request: Request, data: Sequence[Path], settings: dict[str, dict[str, A
         cases = [(each, seed) for each in data for seed in SEEDS]
         pairs = [[finetuned(request, each, method.lower(), sampling, settings, seed) for sampling in BOTH] for each, seed in cases]
         equal = [[each.seconds_to(min(one.psnr[-1] for one in pair)) for each in pair] for pair in pairs]
-        said = [
+        each_case = [
             f"{first.psnr[-1]:.2f} and {second.psnr[-1]:.2f} dB, {one:.0f} and {other:.0f} s to equal PSNR"
             for (first, second), (one, other) in zip(pairs, equal, strict=True)
         ]
-        notes.append(f"{method}, uniform and ours, of each scene and seed: {'; '.join(said)}. Before the first step: {pairs[0][0].psnr[0]:.2f} and"
+        notes.append(f"{method}, uniform and ours, of each scene and seed: {'; '.join(each_case)}. Before the first step: {pairs[0][0].psnr[0]:.2f} and"
                      f" {pairs[0][1].psnr[0]:.2f} dB.")  # fmt: skip
         for k, sampling in enumerate(("uniform", "ours")):
             some = [pair[k] for pair in pairs]

@@ -113,9 +113,9 @@ class Ndc:
 
         With W = (1 - z') / (2 n) a point is R (x'/a, y'/b, 1) / W + t, for the camera's rotation R and position t; times W, less the eye, it is linear.
         """
-        rotation, beside = self.world_from_camera[:3, :3], (self.world_from_camera[:3, 3] - eye) / (2 * self.near)
+        rotation, offset = self.world_from_camera[:3, :3], (self.world_from_camera[:3, 3] - eye) / (2 * self.near)
         a, b = self.slopes
-        return np.stack([rotation[:, 0] / a, rotation[:, 1] / b, -beside, rotation[:, 2] + beside], axis=1)
+        return np.stack([rotation[:, 0] / a, rotation[:, 1] / b, -offset, rotation[:, 2] + offset], axis=1)
 
     @cached_property
     def world_from_ndc(self) -> np.ndarray:

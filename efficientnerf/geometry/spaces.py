@@ -154,7 +154,7 @@ class ContractedSpace(BoundedSpace):
         return near, far
 
     def max_intervals(self, step: float) -> int:
-        # In front of the box and behind it: the contracted distance from the edge of space to the box and back, in steps, with some room
+        # In front of the box and behind it: the contracted distance from the edge of space to the box and back, in steps, with some more
         # for rays that run slantwise through the shell.
         return super().max_intervals(step) + math.ceil(4 * (1 - FARTHEST) * float(self.half.max()) * math.sqrt(3) / step)
 

@@ -19,8 +19,8 @@ class DevicePixels:
     def __init__(self, pixels: Pixels, device: str | torch.device) -> None:
         self.pixels, self.device = pixels, torch.device(device)
         self.tables = PixelTables(*map(self._to_device, pixels.tables))
-        room = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else np.inf
-        self.images = self._images_to_device() if pixels.images.nbytes <= MEMORY_FRACTION * room else None
+        free = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else np.inf
+        self.images = self._images_to_device() if pixels.images.nbytes <= MEMORY_FRACTION * free else None
 
     def _to_device(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)

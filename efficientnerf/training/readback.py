@@ -20,7 +20,7 @@ from efficientnerf.sampling.samples import SampleCapacity, complete_rays
 LAG = 8  # steps; the device is hardly ever further behind
 EXACT_STEPS = 64  # steps at the beginning, and when pruning begins, that are counted exactly, which the host waits for
 MARGIN = 1.3
-ENOUGH, MOST = 1.2, 1.5  # a capacity of so many times as many stays, so that steps have few different ones
+MIN_HELD, MAX_HELD = 1.2, 1.5  # a capacity of so many times as many stays, so that steps have few different ones
 GRANULARITY = 4096  # samples: the allocator finds arrays of few different sizes again
 
 
@@ -62,7 +62,7 @@ class AsyncReadback:
         if self.steps < self.exact_steps:
             return None
         means, size = (self.valid_per_ray, self.fine_per_ray), self.granularity
-        if not all(ENOUGH * mean * rays <= held <= size + MOST * mean * rays for mean, held in zip(means, self.held, strict=True)):
+        if not all(MIN_HELD * mean * rays <= held <= size + MAX_HELD * mean * rays for mean, held in zip(means, self.held, strict=True)):
             self.held = SampleCapacity(*(max(size, -(-int(MARGIN * mean * rays) // size) * size) for mean in means))
         return self.held
 

@@ -40,7 +40,7 @@ from efficientnerf.training.view_checks.residuals import (
 
 # docs/experiments/wrong-cameras.md
 MIN_VIEWS = 14  # that are left at least: of fewer, each shows what no other does
-MOST = 0.15  # of the views that may be left out
+MAX_LEFT_OUT = 0.15  # share of the views
 # Checks: from LOWEST steps on, after a share of the schedule, or at HIGHEST steps at the latest. At the last one nothing new is left out.
 SHARES, LOWEST, HIGHEST = (0.1, 0.2, 0.35, 0.5), (300, 500, 700, 900), (600, 1200, 2000, 3000)
 TOO_LATE = 0.6  # of the schedule
@@ -199,13 +199,13 @@ def _judge_again(c: ViewChecks, now: _Comparison, view: int, pixels: Pixels) -> 
 
 def _leave_out(c: ViewChecks, now: _Comparison, pixels: Pixels, observed: Observations | None, number: int) -> None:
     """Leave out the suspects with further evidence against them, the worst first, as many as may be."""
-    room = min(int(MOST * len(c.given)), len(c.given) - MIN_VIEWS) - int(c.left_out.sum())
+    rest = min(int(MAX_LEFT_OUT * len(c.given)), len(c.given) - MIN_VIEWS) - int(c.left_out.sum())
     for_view, against, few = point_evidence(now.search.cameras, now.cells, observed, now.trusted)
     suspects = now.trusted & now.suspects & ~for_view
     order = [int(view) for view in np.argsort(-now.outlying[:, 1], kind="stable") if suspects[view]]
     believed = now.trusted & ~suspects
-    for view in order[: max(0, 2 * room)]:
-        if room <= 0:
+    for view in order[: max(0, 2 * rest)]:
+        if rest <= 0:
             break
         image, usable = photograph(pixels, view, now.background)
         camera, error = find_pose(now.search, view, image, usable, now.cells.size[view], believed)
@@ -219,7 +219,7 @@ def _leave_out(c: ViewChecks, now: _Comparison, pixels: Pixels, observed: Observ
         c.evidence[view] = number, now.errors[view, 1], now.usual[view], error, moved, evidence
         c.left_out[view], c.replaced[view] = True, elsewhere
         c.pose[view] = camera.world_from_camera if elsewhere else c.given[view].world_from_camera
-        room -= 1
+        rest -= 1
 
 
 def picture_moved(s: Search, before: Camera, after: Camera, side: int) -> float:

@@ -16,8 +16,8 @@ from efficientnerf.training.loop import Trainer, restore, state_of, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.view_checks import checks, residuals
 from efficientnerf.training.view_checks.checks import (
+    MAX_LEFT_OUT,
     MIN_VIEWS,
-    MOST,
     Observations,
     ViewChecks,
     check,
@@ -175,7 +175,7 @@ def test_photographs_that_merely_look_different_stay(field: Model, change: Calla
 
 
 def test_no_more_than_a_share_is_left_out_and_of_few_views_none(field: Model) -> None:
-    most = int(MOST * COUNT)
+    most = int(MAX_LEFT_OUT * COUNT)
     cameras = [rotated(n, 30) if n % 4 == 0 else each for n, each in enumerate(CAMERAS)]  # 6 of 24
     assert 0 < found(field, cameras, PICTURES).left_out.sum() <= most
     few = ViewChecks.none([rotated(0, 30), *CAMERAS[1:MIN_VIEWS]])
