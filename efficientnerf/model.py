@@ -23,6 +23,7 @@ from efficientnerf.training.settings import TrainSettings
 
 SKY_DEGREE = 2
 SKY_LEAST = 0.01  # of a channel that the sky begins with, and of what is left to 1: from 0 or 1 nothing would ever change it
+SAMPLES_AT_ONCE = 2**19  # that are rendered where nothing is pruned
 UNSEEN = 0.5  # grey: drawn behind a space that reaches to infinity, where nothing can lie
 
 
@@ -75,7 +76,7 @@ class Model:
 
     def rays_at_once(self, most: int) -> int:
         """How many rays to render at once, at most `most`: without pruning a ray has all samples."""
-        return most if self.prunes else min(most, max(64, 2**19 // (self.num_coarse_samples + self.settings.num_importance_samples)))
+        return most if self.prunes else min(most, max(64, SAMPLES_AT_ONCE // (self.num_coarse_samples + self.settings.num_importance_samples)))
 
     def snapped_points(self, points: Tensor) -> Tensor:
         """Points (N, 3) in grid coordinates at which the fields are queried: these, or with `train.discretise` the centres of their voxels."""
@@ -113,11 +114,12 @@ class RayOutputs(NamedTuple):
     pivotal: Tensor
     fine: Samples
     fine_raw: Tensor
+    # what the fine samples composite to, in the order of `Composite`; the distortion is that of both stages
     fine_colour: Tensor
     fine_opacity: Tensor
+    distortion: Tensor
     fine_weight: Tensor
     fine_rgb: Tensor
-    distortion: Tensor
 
     @property
     def fine_ray(self) -> Tensor:
@@ -219,14 +221,14 @@ def render_rays(
         fine_raw, out = _composited(m, m.fine, directions, fine, behind)
         none = Samples(torch.zeros_like(fine.first), *(column[:0] for column in fine[1:5]), fine.tried)
         pivotal = torch.zeros(0, dtype=torch.bool, device=m.device)
-        return RayOutputs(rays, none, fine_raw[:0], out.weight[:0], None, pivotal, fine, fine_raw, *out[:2], *out[3:], out.distortion)
+        return RayOutputs(rays, none, fine_raw[:0], out.weight[:0], None, pivotal, fine, fine_raw, *out)
     stage = m.strategy.coarse(request)
     coarse = stage.samples
     coarse_raw, coarse_out = _composited(m, m.coarse, directions, coarse, behind)
     pivotal, fine = m.strategy.fine(request, stage, coarse_out.weight.detach())
     fine_raw, out = _composited(m, m.fine, directions, fine, behind)
-    distortion = out.distortion + coarse_out.distortion
-    return RayOutputs(rays, coarse, coarse_raw, coarse_out.weight, coarse_out.colour, pivotal, fine, fine_raw, *out[:2], *out[3:], distortion)
+    out = out._replace(distortion=out.distortion + coarse_out.distortion)
+    return RayOutputs(rays, coarse, coarse_raw, coarse_out.weight, coarse_out.colour, pivotal, fine, fine_raw, *out)
 
 
 def _composited(m: Model, field: Field, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:
