@@ -219,7 +219,8 @@ def render_rays(
     if isinstance(m.strategy, Uniform):
         fine = m.strategy.samples(request)
         fine_raw, out = _composited(m, m.fine, directions, fine, behind)
-        none = Samples(torch.zeros_like(fine.first), *(column[:0] for column in fine[1:5]), fine.tried)
+        nothing = fine.start[:0]
+        none = Samples(torch.zeros_like(fine.first), nothing, nothing, nothing, fine.point[:0], fine.tried)
         pivotal = torch.zeros(0, dtype=torch.bool, device=m.device)
         return RayOutputs(rays, none, fine_raw[:0], out.weight[:0], None, pivotal, fine, fine_raw, *out)
     stage = m.strategy.coarse(request)

@@ -112,9 +112,9 @@ class FieldRenderer:
                 found.append(opacity_nearer(outputs, torch.as_tensor(stated, dtype=torch.float32, device=m.device)))
             parts.append([part.cpu().numpy() for part in found])
         shape = (camera.height, camera.width)
-        columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-        images = [column.reshape(*shape, *column.shape[1:]) for column in columns]
-        return FieldRendering(*images[:6], counts, *images[6:])
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        colour, opacity, depth, before, behind, inside, within, *nearer = (column.reshape(*shape, *column.shape[1:]) for column in columns)
+        return FieldRendering(colour, opacity, depth, before, behind, inside, counts, within, nearer[0] if nearer else None)
 
     def _blocks(self, camera: Camera, progress: Callable[..., Any] | None) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, RayOutputs]]:
         """Rays of an image, some at a time: origins, directions, their cosine to the view axis, the colour behind all samples, and what they meet."""
